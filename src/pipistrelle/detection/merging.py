@@ -63,7 +63,7 @@ def scan_of(rows: Scan, strategy: Strategy) -> Scan:
     own, others = LISTENS_TO[strategy]
     if rows.direct.size:  # rows without labels: nothing is merged
         return rows_of(rows, np.where(rows.caller == OWN, own, others))
-    return _fused(rows, own=own, others=others, labels_only=False)
+    return _fused(rows, rows.landmark, own=own, others=others, labels_only=False)
 
 
 def labelled(scan: Scan, label: Int[np.ndarray, " m"]) -> Scan:
@@ -89,16 +89,17 @@ def labelled(scan: Scan, label: Int[np.ndarray, " m"]) -> Scan:
     if label is scan.landmark and settled(label, scan.bearing):
         return scan
     label = _checked(scan, np.asarray(label))
-    named = replace(scan, landmark=label)
     if scan.direct.size:
-        named = with_callers(named, np.append(label, UNLABELLED)[scan.direct])  # -1: not heard
-    return _fused(named, own=True, others=True, labels_only=True)
+        scan = with_callers(scan, np.append(label, UNLABELLED)[scan.direct])  # -1: not heard
+    return _fused(scan, label, own=True, others=True, labels_only=True)
 
 
-def _fused(scan: Scan, *, own: bool, others: bool, labels_only: bool) -> Scan:
-    """Select the rows of some callers and merge those of each landmark into one."""
+def _fused(
+    scan: Scan, label: Int[np.ndarray, " m"], *, own: bool, others: bool, labels_only: bool
+) -> Scan:
+    """Select the rows of some callers and merge those of each label into one."""
     numbers = np.ascontiguousarray(scan.numbers)
-    landmark, caller, numbers = _fuse(scan.landmark, scan.caller, numbers, own, others, labels_only)
+    landmark, caller, numbers = _fuse(label, scan.caller, numbers, own, others, labels_only)
     return replace(scan, landmark=landmark, caller=caller, numbers=numbers)
 
 

@@ -14,13 +14,14 @@ from dataclasses import dataclass
 from typing import Any, Protocol, TypeVar
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 
 from pipistrelle.config import InputError
 from pipistrelle.detection.scans import NO_CALLERS, Scan
 from pipistrelle.estimation.beliefs import B, Belief, JointGaussian
 from pipistrelle.estimation.measurement import excess_path_slopes, observe
 from pipistrelle.geometry import wrap_angle
+from pipistrelle.jit import kernel
 
 KNOWN = "known"
 """The method that takes the labels that come with a scan (Bradley & Abaid, Sec. III-B)."""
@@ -156,6 +157,22 @@ def expected(
     unknown = np.isnan(difference)
     S[unknown], S[:, :, unknown] = np.nan, np.nan
     return Candidates(difference=difference, covariance=S)
+
+
+@kernel
+def is_among(label: Int[np.ndarray, " m"], labels: Int[np.ndarray, " n"]) -> Bool[np.ndarray, " m"]:
+    """Return a mask of labels that are among some others: of few, sooner than `np.isin`."""
+    among = np.zeros(label.size, np.bool_)
+    for m in range(label.size):
+        for other in labels:
+            among[m] |= label[m] == other
+    return among
+
+
+@kernel
+def how_many_among(label: Int[np.ndarray, " m"], labels: Int[np.ndarray, " n"]) -> int:
+    """Return how many labels are among some others."""
+    return int(np.count_nonzero(is_among(label, labels)))
 
 
 def edited(belief: B, remove: Sequence[int] = (), merge: Sequence[tuple[int, int]] = ()) -> B:

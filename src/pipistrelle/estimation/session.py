@@ -16,7 +16,13 @@ from pipistrelle.config import InputError
 from pipistrelle.detection.merging import labelled
 from pipistrelle.detection.noise import ConstantNoise
 from pipistrelle.detection.scans import UNLABELLED, Scan
-from pipistrelle.estimation.association import Assignment, Association, edited
+from pipistrelle.estimation.association import (
+    Assignment,
+    Association,
+    edited,
+    how_many_among,
+    is_among,
+)
 from pipistrelle.estimation.beliefs import (
     AcceptsMap,
     B,
@@ -36,7 +42,7 @@ Leg = tuple[Float[np.ndarray, "k c"], Float[np.ndarray, " k"]]
 """Control steps and how long they take [s]."""
 
 
-@dataclass(slots=True, kw_only=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class _Heard:
     """A scan that an association may think of again."""
 
@@ -172,8 +178,8 @@ class Session(Generic[B]):
         landmarks = self.belief.landmarks()
         if not hasattr(self._association, "tentative"):
             return landmarks
-        tentative = self._association.tentative(self._memory)
-        return some_of(landmarks, ~np.isin(landmarks.landmark, list(tentative)))
+        tentative = np.array([*self._association.tentative(self._memory)], np.int64)
+        return some_of(landmarks, ~is_among(landmarks.landmark, tentative))
 
     def state(self) -> SessionState:
         """Return all that the session knows now; what it hears later does not change it."""
@@ -277,29 +283,37 @@ class Session(Generic[B]):
         """Remove landmarks, with all of their rows that are remembered."""
         past = [*self._past]
         labels = (*labels, *(gone for one in past for kept, gone in one.merge if kept in labels))
-        heard = [n for n, one in enumerate(past) if _names(one, labels)]
+        named = np.array(labels)
+        rows = [how_many_among(one.label, named) for one in past]
+        callers = [how_many_among(one.scan.callers, named) for one in past]
+        heard = [n for n in range(len(past)) if rows[n] or callers[n]]
         first = heard[0] if heard else len(past)
-        again = [replace(one) for one in past[first:]]
-        self._past = deque((*past[:first], *again), maxlen=REMEMBERED)
-        before = again[0].belief if again else self.belief
+        before = past[first].belief if heard else self.belief
         self._dropped.update(labels)
-        if len(heard) == 1 and not _held(before, labels) and _rows(again[0], labels) == len(labels):
+        for n in heard:
+            past[n] = _without(past[n], named)
+        if len(heard) == 1 and not _held(before, labels) and rows[first] == len(labels):
             # What was heard once has told nothing of anything else.
             self.belief = edited(self.belief, remove=_held(self.belief, labels))
-            again[0].label = _without(again[0].label, labels)
-            self.labels[again[0].number - self._first] = again[0].label
-            return
-        self.belief = edited(before, remove=_held(before, [*self._dropped]))
-        for one in again:
-            if one is not again[0]:
-                self._go(one.legs)
-            one.belief, one.label = self.belief, _without(one.label, labels)
-            one.scan = replace(one.scan, callers=_without(one.scan.callers, labels))
-            held = _held(self.belief, [label for pair in one.merge for label in pair])
-            one.merge = tuple(pair for pair in one.merge if {*pair} <= {*held})
-            self._use(one)
-        if again:
-            self._go(self._legs)
+            self.labels[past[first].number - self._first] = past[first].label
+        else:
+            self.belief = edited(before, remove=_held(before, [*self._dropped]))
+            for n in range(first, len(past)):
+                if n > first:
+                    self._go(past[n].legs)
+                past[n] = self._as_held(past[n])
+                self._use(past[n])
+            if heard:
+                self._go(self._legs)
+        self._past = deque(past, maxlen=REMEMBERED)
+
+    def _as_held(self, heard: _Heard) -> _Heard:
+        """Return a scan to be heard after the present belief; what that lacks is not merged."""
+        merge = heard.merge
+        if merge:
+            held = _held(self.belief, [label for pair in merge for label in pair])
+            merge = tuple(pair for pair in merge if {*pair} <= {*held})
+        return replace(heard, belief=self.belief, merge=merge)
 
     def _hear_again(self, news: Any) -> None:
         """Associate all scans that are remembered anew, by what has become known."""
@@ -354,28 +368,18 @@ def joined_poses(parts: Sequence[Gaussian]) -> Gaussian:
     )
 
 
-def _names(heard: _Heard, labels: Sequence[int]) -> bool:
-    """Tell whether a scan has rows, or a caller, of some labels."""
-    return not {*heard.label.tolist(), *heard.scan.callers.tolist()}.isdisjoint(labels)
-
-
 def _held(belief: Belief, labels: Sequence[int]) -> list[int]:
     """Return which of some landmarks a belief holds; all, where it does not say."""
     held = {*belief.labels()} if hasattr(belief, "labels") else {*labels}
     return [label for label in labels if label in held]
 
 
-def _rows(heard: _Heard, labels: Sequence[int]) -> int:
-    """Return how many rows of a scan have some labels."""
-    return sum(int(np.count_nonzero(heard.label == label)) for label in labels)
-
-
-def _without(label: Int[np.ndarray, " m"], labels: Sequence[int]) -> Int[np.ndarray, " m"]:
-    """Return labels without some."""
-    left = label.copy()
-    for one in labels:
-        left[left == one] = UNLABELLED
-    return left
+def _without(heard: _Heard, labels: Int[np.ndarray, " n"]) -> _Heard:
+    """Return a scan without some labels, of its rows and of its callers."""
+    label, callers = (
+        np.where(is_among(of, labels), UNLABELLED, of) for of in (heard.label, heard.scan.callers)
+    )
+    return replace(heard, label=label, scan=replace(heard.scan, callers=callers))
 
 
 def check_poses(method: str, poses: Gaussian, size: int) -> None:

@@ -63,12 +63,14 @@ def associated(
     ({1: 7, 2: 9}, 1.0)
     """
     votes: dict[int, Counter[int]] = defaultdict(Counter)
+    pairs: Counter[tuple[int, int]] = Counter()
     scans: Counter[int] = Counter()
     for label, cause in zip(labels, causes, strict=True):
-        for a, c in zip(label.tolist(), cause.tolist(), strict=True):
-            if a != UNLABELLED:
-                votes[a][c] += 1
+        pairs.update(zip(label.tolist(), cause.tolist(), strict=True))
         scans.update({*cause.tolist()} - {UNLABELLED})
+    for (label, cause), count in pairs.items():
+        if label != UNLABELLED:
+            votes[label][cause] = count
     names = {label: of.most_common(1)[0][0] for label, of in votes.items()}
     rows = {label: of.total() for label, of in votes.items()}
     right = sum(votes[label][name] for label, name in names.items() if name != UNLABELLED)

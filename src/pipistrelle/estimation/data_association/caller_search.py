@@ -208,13 +208,14 @@ def misfit(
     """Return the misfit of all rows, were the caller at these places [squared deviations]."""
     tracks, scans = table.shape[0], table.shape[1]
     turn, off = np.zeros(scans), np.full((tracks, scans), np.nan)
-    points, total = np.empty((scans, 5)), 0.0
-    for number in range(PASSES):
-        total = 0.0
+    points, total = np.empty((scans, 6)), 0.0
+    for _ in range(PASSES - 1):
         for t in range(tracks):
-            total += _of_track(places, poses, table[t], turn, points, off[t])
-        if number < PASSES - 1:
-            _correct_headings(off, turn)
+            _write_off(places, poses, table[t], turn, points, off[t])
+        _correct_headings(off, turn)
+    for t in range(tracks):
+        point = _write_off(places, poses, table[t], turn, points, off[t])
+        total += _of_track(places, poses, table[t], points, off[t], point)
     for k in range(scans):
         if not math.isnan(direct[k]):
             towards = math.atan2(places[k, 1] - poses[k, 1], places[k, 0] - poses[k, 0])
@@ -226,15 +227,15 @@ def misfit(
 
 
 @no_alloc
-def _of_track(
+def _write_off(
     places: Float[np.ndarray, "k 2"],
     poses: Float[np.ndarray, "k 3"],
     rows: Float[np.ndarray, "k 4"],
     turn: Float[np.ndarray, " k"],
-    points: Float[np.ndarray, "k 5"],
+    points: Float[np.ndarray, "k 6"],
     off: Float[np.ndarray, " k"],
-) -> float:
-    """Return the misfit of a track; write how far its bearings are off.
+) -> tuple[float, float]:
+    """Return the point of a track; write how far its bearings are off.
 
     ``points``: room for each row's point, its direction and its variances along and across.
     """
@@ -242,22 +243,37 @@ def _of_track(
     for k in range(rows.shape[0]):
         _write_point(places[k], poses[k], rows[k], turn[k], points[k])
         if not math.isnan(points[k, 0]):
-            share = 1.0 / (points[k, 3] + points[k, 4] + 4e-4)
+            share = 1.0 / (points[k, 4] + points[k, 5] + 4e-4)
             x, y, weight = x + share * points[k, 0], y + share * points[k, 1], weight + share
     for number in range(1 + WEIGHINGS if weight > 0.0 else 0):
         x, y = _weighed(points, x, y) if number else (x / weight, y / weight)
-    total = 0.0
+    for k in range(rows.shape[0]):
+        if not math.isnan(points[k, 0]):
+            towards = math.atan2(y - poses[k, 1], x - poses[k, 0])
+            off[k] = wrap_angle(rows[k, 0] + turn[k] - towards)
+    return x, y
+
+
+@no_alloc
+def _of_track(
+    places: Float[np.ndarray, "k 2"],
+    poses: Float[np.ndarray, "k 3"],
+    rows: Float[np.ndarray, "k 4"],
+    points: Float[np.ndarray, "k 6"],
+    off: Float[np.ndarray, " k"],
+    point: tuple[float, float],
+) -> float:
+    """Return the misfit of a track at its point."""
+    total, (x, y) = 0.0, point
     for k in range(rows.shape[0]):
         if math.isnan(rows[k, 0]):
             continue
         if math.isnan(points[k, 0]):
             total += CAP
             continue
-        dx, dy = x - poses[k, 0], y - poses[k, 1]
         straight = math.hypot(places[k, 0] - poses[k, 0], places[k, 1] - poses[k, 1])
         onward = math.hypot(x - places[k, 0], y - places[k, 1])
-        off[k] = wrap_angle(rows[k, 0] + turn[k] - math.atan2(dy, dx))
-        path = onward + math.hypot(dx, dy) - straight
+        path = onward + math.hypot(x - poses[k, 0], y - poses[k, 1]) - straight
         across = off[k] / math.hypot(rows[k, 2], LEAST_BEARING_STD)
         along = (rows[k, 1] - path) / math.hypot(rows[k, 3], LEAST_WAY_STD)
         total += min(across * across + along * along, CAP)
@@ -265,17 +281,17 @@ def _of_track(
 
 
 @no_alloc
-def _weighed(points: Float[np.ndarray, "k 5"], x: float, y: float) -> tuple[float, float]:
+def _weighed(points: Float[np.ndarray, "k 6"], x: float, y: float) -> tuple[float, float]:
     """Return the mean of points, of which those far from another mean count less."""
     sx, sy, weight = 0.0, 0.0, 0.0
     for k in range(points.shape[0]):
         if math.isnan(points[k, 0]):
             continue
-        c, s = math.cos(points[k, 2]), math.sin(points[k, 2])
+        c, s = points[k, 2], points[k, 3]
         dx, dy = points[k, 0] - x, points[k, 1] - y
         along, across = c * dx + s * dy, c * dy - s * dx
-        squared = along * along / points[k, 3] + across * across / (points[k, 4] + 1e-4)
-        share = 1.0 / ((points[k, 3] + points[k, 4] + 4e-4) * (1.0 + 0.25 * squared))
+        squared = along * along / points[k, 4] + across * across / (points[k, 5] + 1e-4)
+        share = 1.0 / ((points[k, 4] + points[k, 5] + 4e-4) * (1.0 + 0.25 * squared))
         sx, sy, weight = sx + share * points[k, 0], sy + share * points[k, 1], weight + share
     return sx / weight, sy / weight
 
@@ -286,7 +302,7 @@ def _write_point(
     pose: Float[np.ndarray, "3"],
     row: Float[np.ndarray, "4"],
     turn: float,
-    point: Float[np.ndarray, "5"],
+    point: Float[np.ndarray, "6"],
 ) -> None:
     """Write a row's point, direction and variances along and across; NaN where there is none."""
     point[0], angle = math.nan, row[0] + turn
@@ -305,9 +321,9 @@ def _write_point(
     by_range = max(1.0 + (fx * c + fy * s) / onward, 0.02)
     by_bearing = far * (c * fy - s * fx) / onward
     along = by_bearing / by_range * row[2], math.hypot(row[3], 0.03) / by_range
-    point[0], point[1], point[2] = pose[0] + far * c, pose[1] + far * s, angle
-    point[3] = along[0] * along[0] + along[1] * along[1]
-    point[4] = (far * math.hypot(row[2], LEAST_BEARING_STD)) ** 2
+    point[0], point[1], point[2], point[3] = pose[0] + far * c, pose[1] + far * s, c, s
+    point[4] = along[0] * along[0] + along[1] * along[1]
+    point[5] = (far * math.hypot(row[2], LEAST_BEARING_STD)) ** 2
 
 
 @kernel

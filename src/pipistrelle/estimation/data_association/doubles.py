@@ -21,6 +21,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from pipistrelle.estimation.beliefs import JointGaussian
+from pipistrelle.estimation.data_association.existence import Known
 from pipistrelle.jit import Whole, kernel, no_alloc
 
 DENSEST = 0.05
@@ -37,7 +38,34 @@ GATE = 13.8
 LEAST_STD = 0.15
 """Least deviation of a difference along each axis [m]: how far filters are off that are sure."""
 
+ASKED = (4, 6, 8, 12, 16, 24, 32, 64)
+"""In how many scans a landmark was heard when it is asked whether it is on the map twice."""
+BOTH = 0.1
+"""Two landmarks are two if in more than this share of the scans of either both were heard."""
+
 Pairs = list[tuple[int, int]]
+
+
+@kernel
+def asked_of(
+    columns: tuple[np.ndarray, ...], at: Int[np.ndarray, " l"], now: Whole
+) -> tuple[Int[np.ndarray, " o"], Bool[np.ndarray, "o o"], Int[np.ndarray, " a"]]:
+    """Return known landmarks that stand on the map, which of them are two, and who is asked now.
+
+    ``columns``: of `existence.Known`; ``at``: where each stands in the joint mean, or -1; ``now``:
+    number of the scan. Who is asked is told as numbers of those that stand.
+    """
+    known = Known(*columns)
+    old = np.flatnonzero((at >= 0) & (known.born < now))
+    asked, apart = np.zeros(old.size, np.bool_), np.ones((old.size, old.size), np.bool_)
+    for i in range(old.size):
+        a = old[i]
+        asked[i] = known.heard[a] == now and known.count[a] in ASKED
+        for j in range(i):
+            b = old[j]
+            rarer = min(known.count[a], known.count[b])
+            apart[i, j] = apart[j, i] = known.together[a, b] > BOTH * rarer
+    return old, apart, np.flatnonzero(asked)
 
 
 def doubles(
@@ -59,9 +87,8 @@ def doubles(
         Numbers of landmarks of which a pair must hold one, for a group to be grown from it.
     """
     best: tuple[float, list[list[int]]] = 0.0, []
-    prior = 2.0 * math.log(_density(joint, at))
     for number in asked.tolist():
-        groups = _groups(joint, at, apart, number, prior)
+        groups = _groups(joint, at, apart, number)
         if not groups:
             continue
         cost, group = min(groups)
@@ -83,16 +110,32 @@ def _groups(
     at: Int[np.ndarray, " l"],
     apart: Bool[np.ndarray, "l l"],
     number: int,
-    prior: float,
 ) -> list[tuple[float, list[list[int]]]]:
     """Return the cost and the pairs of each group that grows from a pair of one landmark."""
-    pairs, groups = np.empty((at.size, 2), np.int64), []
-    for other in np.flatnonzero(~apart[number]).tolist():
-        first = max(number, other), min(number, other)
-        cost, size = grown(joint.mean, joint.covariance, at, apart, first, prior, pairs)
-        if size:
-            groups.append((cost, pairs[:size].tolist()))
+    mean, covariance, pairs = joint.mean, joint.covariance, np.empty((at.size, 2), np.int64)
+    firsts, groups = begun(mean, covariance, at, apart, number).tolist(), []
+    prior = 2.0 * math.log(_density(joint, at)) if firsts else 0.0
+    for first in firsts:
+        cost, size = grown(mean, covariance, at, apart, tuple(first), prior, pairs)
+        groups.append((cost, pairs[:size].tolist()))
     return groups
+
+
+@kernel
+def begun(
+    mean: Float[np.ndarray, " d"],
+    covariance: Float[np.ndarray, "d d"],
+    at: Int[np.ndarray, " l"],
+    apart: Bool[np.ndarray, "l l"],
+    number: Whole,
+) -> Int[np.ndarray, "p 2"]:
+    """Return the pairs of one landmark that a group may grow from, the higher number first."""
+    pairs, size = np.empty((at.size, 2), np.int64), 0
+    for other in range(at.size):
+        a, b = max(number, other), min(number, other)
+        if not (apart[a, b] or math.isinf(_cost(mean, covariance, at[a], at[b], 0.0))):
+            pairs[size, 0], pairs[size, 1], size = a, b, size + 1
+    return pairs[:size]
 
 
 def _lower_first(pairs: list[list[int]]) -> Pairs:
@@ -126,8 +169,6 @@ def grown(
     """
     a, b = pair
     cost = _cost(mean, covariance, at[a], at[b], prior)
-    if math.isinf(cost):
-        return cost, 0
     mean, P, apart = mean.copy(), covariance.copy(), apart.copy()
     total, size = 0.0, 0
     while True:

@@ -18,6 +18,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int, UInt8
 
 from pipistrelle.detection.scans import OWN
+from pipistrelle.estimation.association import is_among
 from pipistrelle.estimation.measurement import excess_path_slopes
 from pipistrelle.geometry import wrap_angle
 from pipistrelle.jit import Whole, kernel, no_alloc
@@ -75,23 +76,32 @@ def nobody(callers: int) -> Known:
 
 def with_new(known: Known, labels: list[int], scan: int, callers: int) -> Known:
     """Return known landmarks with new ones, that are heard in a scan for the first time."""
-    size, more = len(labels), callers - known.source.shape[1]
-    if size == 0 and more <= 0:
+    callers = max(callers, known.source.shape[1])
+    if not labels and callers == known.source.shape[1]:
         return known
-    source = known.source
-    if more > 0:
-        source = np.hstack([source, np.full((len(source), more), np.nan)])
-    now = np.full(size, scan)
-    return Known(
-        label=np.append(known.label, np.array(labels, np.int64)),
-        born=np.append(known.born, now),
-        heard=np.append(known.heard, now),
-        count=np.append(known.count, np.zeros(size, np.int64)),
-        odds=np.append(known.odds, np.full(size, -HEARD)),
-        confirmed=np.append(known.confirmed, np.zeros(size, np.bool_)),
-        source=np.vstack([source, np.full((size, source.shape[1]), np.nan)]),
-        aim=np.append(known.aim, np.full(size, np.nan)),
-        together=np.pad(known.together, (0, size)),
+    return Known(*_with_new(tuple(known), np.array(labels, np.int64), scan, callers))
+
+
+@kernel
+def _with_new(
+    columns: tuple[np.ndarray, ...], labels: Int[np.ndarray, " n"], scan: Whole, callers: Whole
+) -> tuple[np.ndarray, ...]:
+    """Return the columns of known landmarks with new ones."""
+    known, new = Known(*columns), np.ones(labels.size, np.int64)
+    old, size = known.label.size, known.label.size + labels.size
+    source, together = np.full((size, callers), np.nan), np.zeros((size, size), np.uint8)
+    source[:old, : known.source.shape[1]] = known.source
+    together[:old, :old] = known.together
+    return (
+        np.append(known.label, labels),
+        np.append(known.born, scan * new),
+        np.append(known.heard, scan * new),
+        np.append(known.count, 0 * new),
+        np.append(known.odds, -HEARD * new),
+        np.append(known.confirmed, new < 0),
+        source,
+        np.append(known.aim, np.nan * new),
+        together,
     )
 
 
@@ -114,7 +124,7 @@ def merged(known: Known, pairs: Sequence[tuple[int, int]]) -> Known:
             column[a] = max(column[a], column[b])
         both = np.maximum(after.together[a], after.together[b])
         after.together[a], after.together[:, a] = both, both
-    return some(after, ~np.isin(after.label, [gone for _, gone in pairs]))
+    return some(after, ~is_among(after.label, np.array([gone for _, gone in pairs])))
 
 
 Heard = tuple[
@@ -144,8 +154,24 @@ def judged(
 
     ``near``: whether a row may have been of the landmark; then it was not missed.
     """
-    after = Known(*(column.copy() for column in known))
-    _judge(tuple(after), rows, place, near, scan, sight)
+    return Known(*_after(tuple(known), rows, place, near, scan, sight))
+
+
+@kernel
+def _after(
+    columns: tuple[np.ndarray, ...],
+    rows: Heard,
+    there: Place,
+    near: Bool[np.ndarray, " l"],
+    scan: Whole,
+    sight: Sight,
+) -> tuple[np.ndarray, ...]:
+    """Return a copy of the columns of `Known` that is judged."""
+    label, born, heard, count, odds, confirmed, source, aim, together = columns
+    heard, count, odds, confirmed = heard.copy(), count.copy(), odds.copy(), confirmed.copy()
+    changed = source.copy(), aim.copy(), together.copy()
+    after = (label, born, heard, count, odds, confirmed, *changed)
+    _judge(after, rows, there, near, scan, sight)
     return after
 
 

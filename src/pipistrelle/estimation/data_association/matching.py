@@ -13,6 +13,7 @@ until they stay, and the probability is
 Williams & Lau, IEEE Transactions on Aerospace and Electronic Systems 50 (2014).
 """
 
+import math
 from collections.abc import Callable
 
 import numpy as np
@@ -96,7 +97,7 @@ def probabilities(costs: Float[np.ndarray, "m n"]) -> Float[np.ndarray, "m n"]:
     >>> probabilities(np.array([[0.0]]))
     array([[0.5]])
     """
-    weight, (rows, landmarks) = np.exp(np.minimum(-0.5 * costs, LARGEST)), costs.shape
+    weight, (rows, landmarks) = _weights(costs), costs.shape
     to_row = np.ones((landmarks, rows))
     for _ in range(MESSAGES):
         moved, total = 0.0, np.ones(landmarks)
@@ -124,3 +125,14 @@ def probabilities(costs: Float[np.ndarray, "m n"]) -> Float[np.ndarray, "m n"]:
         for j in range(landmarks):
             shares[i, j] = weight[i, j] * to_row[j, i] / sum_
     return shares
+
+
+@kernel
+def _weights(costs: Float[np.ndarray, "m n"]) -> Float[np.ndarray, "m n"]:
+    """Return the weight of each pair; most are beyond the gate, and have none."""
+    weight = np.zeros(costs.shape)
+    for i in range(costs.shape[0]):
+        for j in range(costs.shape[1]):
+            if costs[i, j] < np.inf:
+                weight[i, j] = math.exp(min(-0.5 * costs[i, j], LARGEST))
+    return weight

@@ -73,23 +73,23 @@ def pair_costs(
     """
     heard, made = Rows(*rows), Chances(*chances)
     costs = np.full((heard.bearing.size, at.size), np.inf)
-    H, index, S = np.zeros((2, 7)), np.zeros(7, np.int64), np.zeros((2, 2))
+    H, index = np.zeros((2, 7)), np.zeros(7, np.int64)
     for n in range(at.size):
         if at[n] == caller:
             continue
         bearing, way = _expected(mean, at[n], caller, H, index)
-        _spread(covariance, H, index, 5 if caller < 0 else 7, S)
-        if caller == OWN_CALL and S[0, 0] * S[1, 1] - S[0, 1] * S[1, 0] > VAGUE * VAGUE:
+        across, b, along = _spread(covariance, H, index, 5 if caller < 0 else 7)
+        if caller == OWN_CALL and across * along - b * b > VAGUE * VAGUE:
             continue
         for m in range(heard.bearing.size):
             nu = wrap_angle(heard.bearing[m] - bearing)
-            a = S[0, 0] + heard.bearing_std[m] ** 2
+            a = across + heard.bearing_std[m] ** 2
             if math.isnan(heard.way[m]) or caller == UNPLACED:
                 squared, size = nu * nu / a, 2.0 * math.pi * a
                 density = made.bearing_clutter
             else:
                 off = heard.way[m] - way
-                b, c = S[0, 1], S[1, 1] + heard.way_std[m] ** 2
+                c = along + heard.way_std[m] ** 2
                 det = a * c - b * b
                 squared = (c * nu * nu - 2.0 * b * nu * off + a * off * off) / det
                 size, density = (2.0 * math.pi) ** 2 * det, made.clutter
@@ -170,17 +170,16 @@ def _spread(
     H: Float[np.ndarray, "2 7"],
     index: Int[np.ndarray, "7"],
     size: Whole,
-    S: Float[np.ndarray, "2 2"],
-) -> None:
-    """Write H P H^T."""
-    S[:] = 0.0
+) -> tuple[float, float, float]:
+    """Return the three numbers of H P H^T."""
+    across, both, along = 0.0, 0.0, 0.0
     for a in range(size):
         for b in range(size):
             covariance = P[index[a], index[b]]
-            S[0, 0] += H[0, a] * covariance * H[0, b]
-            S[0, 1] += H[0, a] * covariance * H[1, b]
-            S[1, 1] += H[1, a] * covariance * H[1, b]
-    S[1, 0] = S[0, 1]
+            across += H[0, a] * covariance * H[0, b]
+            both += H[0, a] * covariance * H[1, b]
+            along += H[1, a] * covariance * H[1, b]
+    return across, both, along
 
 
 def with_point(
@@ -197,16 +196,31 @@ def with_point(
     (array([2., 0.]), array([[0.04, 0.  ],
            [0.  , 0.08]]))
     """
-    x, y, heading = joint.mean[:3]
-    c, s = math.cos(heading + bearing), math.sin(heading + bearing)
-    G = np.zeros((2, joint.mean.size))
-    G[0, 0] = G[1, 1] = 1.0
-    G[0, 2], G[1, 2] = -distance * s, distance * c
-    W = np.array([[-distance * s, c], [distance * c, s]]) * np.array(stds)
-    cross = np.einsum("ad,de->ae", G, joint.covariance)
-    own = np.einsum("ad,bd->ab", cross, G) + np.einsum("ae,be->ab", W, W)
-    return JointGaussian(
-        landmark=np.append(joint.landmark, label),
-        mean=np.append(joint.mean, (x + distance * c, y + distance * s)),
-        covariance=np.block([[joint.covariance, cross.T], [cross, own]]),
-    )
+    point = bearing, distance, *stds
+    mean, covariance = _with_point(joint.mean, joint.covariance, point)
+    landmark = np.append(joint.landmark, label)
+    return JointGaussian(landmark=landmark, mean=mean, covariance=covariance)
+
+
+@kernel
+def _with_point(
+    mean: Float[np.ndarray, " d"],
+    covariance: Float[np.ndarray, "d d"],
+    point: tuple[float, float, float, float],
+) -> tuple[Float[np.ndarray, " d+2"], Float[np.ndarray, "d+2 d+2"]]:
+    """Return mean and covariance with a point more: bearing, range and their deviations."""
+    d, (bearing, distance, bearing_std, range_std) = mean.size, point
+    towards = math.cos(mean[2] + bearing), math.sin(mean[2] + bearing)
+    turn = -distance * towards[1], distance * towards[0]
+    more, P = np.empty(d + 2), np.empty((d + 2, d + 2))
+    more[:d], P[:d, :d] = mean, covariance
+    for a in range(2):
+        more[d + a] = mean[a] + distance * towards[a]
+        for i in range(d):
+            P[d + a, i] = P[i, d + a] = covariance[a, i] + turn[a] * covariance[2, i]
+    for a in range(2):
+        for b in range(2):
+            across = (turn[a] * bearing_std) * (turn[b] * bearing_std)
+            along = (towards[a] * range_std) * (towards[b] * range_std)
+            P[d + a, d + b] = P[d + a, b] + P[d + a, 2] * turn[b] + (across + along)
+    return more, P

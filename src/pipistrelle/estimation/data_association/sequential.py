@@ -17,7 +17,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float, Int
 
 from pipistrelle.detection.scans import (
     BEARING,
@@ -29,13 +29,13 @@ from pipistrelle.detection.scans import (
     Scan,
     with_callers,
 )
-from pipistrelle.estimation.association import Assignment
+from pipistrelle.estimation.association import Assignment, is_among
 from pipistrelle.estimation.beliefs import Belief, JointGaussian
 from pipistrelle.estimation.data_association.caller_search import (
     find_caller,
     find_moving_caller,
 )
-from pipistrelle.estimation.data_association.doubles import doubles
+from pipistrelle.estimation.data_association.doubles import asked_of, doubles
 from pipistrelle.estimation.data_association.existence import (
     GONE,
     Known,
@@ -44,7 +44,7 @@ from pipistrelle.estimation.data_association.existence import (
     some,
     with_new,
 )
-from pipistrelle.estimation.data_association.matching import Innovate, Match
+from pipistrelle.estimation.data_association.matching import Innovations, Match
 from pipistrelle.estimation.data_association.memory import Caller, CallerPlace, Memory
 from pipistrelle.estimation.data_association.pairs import (
     OWN_CALL,
@@ -54,9 +54,18 @@ from pipistrelle.estimation.data_association.pairs import (
     pair_innovations,
     with_point,
 )
+from pipistrelle.estimation.data_association.rows import (
+    Joint,
+    bearing_fits,
+    compared,
+    place_of,
+    places_of,
+    rows_of_scan,
+    settled,
+)
 from pipistrelle.estimation.data_association.tracks import Tracks, followed
 from pipistrelle.estimation.data_association.turns import turned
-from pipistrelle.geometry import wrap, wrap_angle
+from pipistrelle.geometry import wrap_angle
 
 FIRST_SEARCH, FIRST_SEARCH_MOVING = 8, 10
 """Scans of a caller that stands, and of one that moves, after which its place is searched for, at
@@ -73,17 +82,6 @@ PROBATION = 40
 TRIAL, SETTLING, LEAST_SHARE, LEAST_ROWS = 9, 3, 0.4, 10
 """A caller is where it was found if of the sure rows of so many scans, the first left out, this
 share is of landmarks, new ones not counted; at least so many rows must tell."""
-BESIDE, ASIDE = 0.96, 0.5
-"""A row begins no landmark beside a louder one, within such a way [m] and bearing [rad]."""
-OVERLAP_STD, OVERLAP_GATE = 0.7, 9.0
-"""Deviation of the way of an echo that overlaps with another [m], and largest squared distance."""
-ASKED = frozenset((4, 6, 8, 12, 16, 24, 32, 64))
-"""In how many scans a landmark was heard when it is asked whether it is on the map twice."""
-SURE_SHARE, ASSUMED = 0.65, 0.75
-"""A row is as sure as any up to this share of the limit of its bearing's deviation; how sure one is
-whose deviation is only assumed."""
-BOTH = 0.1
-"""Two landmarks are two if in more than this share of the scans of either both were heard."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -169,21 +167,17 @@ class _Work:
     def __init__(self, stage: Sequential, memory: Memory, belief: Belief, scan: Scan) -> None:
         self.stage, self.memory, self.scan = stage, memory, scan
         self.joint: JointGaussian = belief.joint()  # pyrefly: ignore[missing-attribute]
-        self.pose, there = self.joint.mean[:3], self.joint.landmark.tolist()
-        self.place = {label: 3 + 2 * n for n, label in enumerate(there)}
+        self.pose, limits = self.joint.mean[:3], stage.limits
         self.label = np.full(scan.landmark.size, UNLABELLED)
         self.labels, self.callers = memory.labels, dict(memory.callers)
         self.numbers, self.named = scan.numbers, np.full(scan.direct.size, UNLABELLED)
-        self.moving = [c.label for number, c in self.callers.items() if number in scan.moving]
-        own, limits = scan.caller == OWN, stage.limits
-        self.way = np.where(own, scan.range, scan.excess_path)
-        self.way_std = np.where(own, scan.range_std, scan.excess_path_std)
-        bare, sure = np.isnan(self.way), self._within(scan.bearing_std, limits.bearing_std)
-        self.usable = sure & (bare | self._within(self.way_std, limits.way_std))
-        self.with_way = self.usable & ~bare
-        self.sure = self._within(self.way_std, limits.birth_way_std)
+        self.moves = {*scan.moving.tolist()}
+        moving = [self.callers[number].label for number in self.moves & self.callers.keys()]
+        self.moving = np.array(moving, np.int64)
+        most = limits.bearing_std, limits.way_std, limits.birth_way_std
+        self.rows = rows_of_scan(scan, most, limits.assumed)
         self.new: list[int] = []
-        self.near: set[int] = set()
+        self.near = np.zeros(self.joint.landmark.size + scan.landmark.size, np.bool_)
 
     def search_callers(self) -> dict[int, CallerPlace]:
         """Follow the rows of callers that are not found, and return where some now are."""
@@ -201,9 +195,11 @@ class _Work:
 
     def _refined(self, number: int, caller: Caller) -> dict[int, CallerPlace]:
         """Return the place of a caller on the map, once that is worth more than what was found."""
-        at, done = self._where(caller.label), caller.place is not None and caller.place.refined
-        moves = number in self.scan.moving
-        if moves or done or self.memory.scan != caller.since + REFINED_AFTER or at < 0:
+        done = caller.place is not None and caller.place.refined
+        if number in self.moves or done or self.memory.scan != caller.since + REFINED_AFTER:
+            return {}
+        at = self._where(caller.label)
+        if at < 0:
             return {}
         way, P = self.joint.mean[at : at + 2] - self.pose[:2], self.joint.covariance
         u = np.array([*-way, *way]) / float(way @ way)
@@ -214,11 +210,11 @@ class _Work:
 
     def _searched(self, number: int, caller: Caller, row: int) -> dict[int, CallerPlace]:
         """Follow a caller's rows, and return its place if that is found."""
-        rows = self._rows(self.with_way & (self.scan.caller == number))
+        rows = self._some(self.rows.with_way & (self.scan.caller == number))
         direct = self.scan.bearing[row] if row >= 0 else math.nan
         tracks = followed(caller.tracks, self.scan.time, self.pose, direct, rows)
         self.callers[number] = replace(caller, tracks=tracks)
-        moves = number in self.scan.moving
+        moves = number in self.moves
         first = FIRST_SEARCH_MOVING if moves else FIRST_SEARCH
         if len(tracks.poses) < first or len(tracks.poses) % 2:
             return {}
@@ -226,36 +222,39 @@ class _Work:
         return {number: found.place} if found is not None and found.sure else {}
 
     def match(self, number: int) -> None:
-        """Label the rows of one caller."""
+        """Label the rows of one caller, and begin landmarks with those that are near no other."""
         at = OWN_CALL if number == OWN else self._heard_from(number)
         if at is None:
             return
-        rows = np.flatnonzero(self.scan.caller == number)
-        rows = rows[rows != self._direct(number)]
-        there = 3 + 2 * np.arange(self.joint.landmark.size)
-        if number in self.scan.moving and at >= 0:
-            self._follow_turn(number, rows, at)
-        costs = self._costs(rows, there, at, self.stage.chances)
-        if self.moving:
-            costs[:, np.isin(self.joint.landmark, self.moving)] = np.inf
-        usable = (self.usable if at == UNPLACED else self.with_way)[rows]
-        gated = np.isfinite(costs)
-        telling = self.scan.bearing_std[rows] <= 2.0 * self.stage.limits.bearing_std
-        self.near |= {*self.joint.landmark[gated[telling].any(axis=0)].tolist()}
-        used = rows[usable]
-        found = self.stage.match(costs[usable], self._innovate(used, there, at))
-        self.label[used] = np.append(self.joint.landmark, UNLABELLED)[found]
-        self._judge_caller(number, used)
-        if at != UNPLACED:
-            self._bear(number, used[~gated[usable].any(axis=1)], at)
+        caller = number, self._direct(number), at
+        if number in self.moves and at >= 0:
+            self._follow_turn(number, at)
+        rows, chances, known = tuple(self.rows), self.stage.chances, self.memory.known
+        used, costs, near = compared(
+            rows,
+            self._joint(),
+            self.moving,
+            self.near,
+            caller,
+            chances,
+            2.0 * self.stage.limits.bearing_std,
+        )
+        found = self.stage.match(costs, lambda row, of: self._innovations(used, at, (row, of)))
+        matched = used, found, near
+        confirmed = known.label[known.confirmed]
+        begun, count = settled(self.label, rows, self._joint(), confirmed, matched, caller, chances)
+        self._judge_caller(number, count)
+        for row in begun.tolist():
+            self._bear(number, row)
 
-    def _follow_turn(self, number: int, rows: Int[np.ndarray, " r"], at: int) -> None:
+    def _follow_turn(self, number: int, at: int) -> None:
         """Take a caller that moves for where its rows fit, if they do not where it was expected."""
-        rows, direct = rows[self.with_way[rows]], self._direct(number)
+        direct, rows = self._direct(number), self.rows.with_way & (self.scan.caller == number)
         if direct < 0:
             return
-        joint, stand = self.joint, ~np.isin(self.joint.landmark, self.moving)
-        there, columns = 3 + 2 * np.flatnonzero(stand), tuple(self._rows(rows))
+        rows[direct] = False
+        joint, stand = self.joint, ~is_among(self.joint.landmark, self.moving)
+        there, columns = 3 + 2 * np.flatnonzero(stand), tuple(self._some(rows))
 
         def costs(mean: Float[np.ndarray, " d"]) -> Float[np.ndarray, "r n"]:
             return pair_costs(columns, mean, joint.covariance, there, at, self.stage.chances)
@@ -277,13 +276,18 @@ class _Work:
 
     def finished(self) -> tuple[Memory, Assignment]:
         """Return the memory after the scan, and the assignment."""
-        memory, scan, known = self.memory, self.scan, self._judged()
+        memory, scan, (known, at) = self.memory, self.scan, self._judged()
         gone = {*known.label[known.odds < GONE].tolist(), *self._lost(known)}
+        remove, merge = (), ()
         if gone:
-            known = some(known, ~np.isin(known.label, list(gone)))
-            self.label[np.isin(self.label, list(gone))] = UNLABELLED
-            self.named[np.isin(self.named, list(gone))] = UNLABELLED
-        merge = () if gone else self._doubles(known)
+            left = np.array([*gone])
+            known = some(known, ~is_among(known.label, left))
+            for labels in (self.label, self.named):
+                labels[is_among(labels, left)] = UNLABELLED
+            before = {*memory.known.label.tolist(), *(c.label for c in memory.callers.values())}
+            remove = tuple(sorted(gone & before))
+        else:
+            merge = self._doubles(known, at)
         for kept, other in merge:
             self.label[self.label == other] = kept
         after = Memory(
@@ -292,47 +296,34 @@ class _Work:
             known=merged(known, merge),
             callers=self.callers,
         )
-        stated = with_callers(replace(scan, numbers=self.numbers), self.named)
-        before = {*memory.known.label.tolist(), *(c.label for c in memory.callers.values())}
-        return after, Assignment(
-            label=self.label,
-            remove=tuple(sorted(gone & before)),
-            merge=merge,
-            scan=stated if scan.direct.size else None,
-        )
+        if self.numbers is not scan.numbers:
+            scan = replace(scan, numbers=self.numbers)
+        stated = with_callers(scan, self.named) if scan.direct.size else None
+        return after, Assignment(label=self.label, remove=remove, merge=merge, scan=stated)
 
-    def _judged(self) -> Known:
-        """Return all landmarks, new ones too, after what was heard of them and what was not."""
-        memory, scan = self.memory, self.scan
+    def _judged(self) -> tuple[Known, Int[np.ndarray, " l"]]:
+        """Return all landmarks, new ones too, after what was heard of them and what was not.
+
+        And where they stand in the joint mean; -1: nowhere.
+        """
+        memory, scan, rows = self.memory, self.scan, self.rows
         size = max(1 + scan.caller.max(initial=0), scan.direct.size, memory.known.source.shape[1])
         known = with_new(memory.known, self.new, memory.scan, size)
         callers = np.full(size, UNPLACED)
         for number, caller in self.callers.items():
             callers[number] = self._where(caller.label)
-        heard = self.label, scan.caller, self.way, scan.level_db, scan.bearing, self._surety()
-        place = self.joint.mean, self._places(known), callers
-        near = np.array([label in self.near for label in known.label.tolist()], np.bool_)
-        return judged(known, heard, place, near, memory.scan, self.stage.limits.sight)
+        heard = self.label, rows.caller, rows.way, rows.level_db, rows.bearing, rows.surety
+        at, near = places_of(known.label, self.joint.landmark, self.near)
+        place = self.joint.mean, at, callers
+        return judged(known, heard, place, near, memory.scan, self.stage.limits.sight), at
 
-    def _doubles(self, known: Known) -> tuple[tuple[int, int], ...]:
+    def _doubles(self, known: Known, at: Int[np.ndarray, " l"]) -> tuple[tuple[int, int], ...]:
         """Return pairs of landmarks that are one, the older first; asked now and then."""
-        now = self.memory.scan
-        heard = (known.heard == now) & (known.born < now)
-        counted = zip(known.label[heard].tolist(), known.count[heard].tolist(), strict=True)
-        due = {label for label, count in counted if count in ASKED}
-        if not due:
+        old, apart, asked = asked_of(tuple(known), at, self.memory.scan)
+        if not asked.size:
             return ()
-        known = some(known, (self._places(known) >= 0) & (known.born < now))
-        label = known.label.tolist()
-        asked = np.array([n for n, a in enumerate(label) if a in due], np.int64)
-        rarer = np.minimum(known.count[:, np.newaxis], known.count)
-        apart = (known.together > BOTH * rarer) | np.eye(len(rarer), dtype=bool)
-        pairs = doubles(self.joint, self._places(known), apart, asked)
-        return tuple((label[a], label[b]) for a, b in pairs)
-
-    def _places(self, known: Known) -> Int[np.ndarray, " l"]:
-        """Return where known landmarks stand in the joint mean; -1: nowhere."""
-        return np.array([self._where(label) for label in known.label.tolist()], np.int64)
+        label = known.label[old].tolist()
+        return tuple((label[a], label[b]) for a, b in doubles(self.joint, at[old], apart, asked))
 
     def _another(self) -> int:
         """Return a new label."""
@@ -341,54 +332,30 @@ class _Work:
 
     def _where(self, label: int) -> int:
         """Return where a landmark stands in the joint mean, or -1."""
-        return self.place.get(label, -1)
+        return place_of(label, self.joint.landmark)
 
     def _direct(self, number: int) -> int:
         """Return the row of a caller's direct call, or -1."""
         return int(self.scan.direct[number]) if number < self.scan.direct.size else -1
 
-    def _surety(self) -> Float[np.ndarray, " m"]:
-        """Return how sure rows are, from 0 to 1."""
-        std, limit = self.scan.bearing_std, self.stage.limits.bearing_std
-        sure = np.fmin(SURE_SHARE * limit / std, 1.0)
-        return np.where(self._is_assumed(std), ASSUMED, sure)
+    def _joint(self) -> Joint:
+        """Return what kernels take of the joint Gaussian."""
+        return self.joint.landmark, self.joint.mean, self.joint.covariance
 
-    def _within(self, std: Float[np.ndarray, " r"], limit: float) -> Bool[np.ndarray, " r"]:
-        """Return a mask of deviations that are within a limit, or that were only assumed."""
-        return (std <= limit) | self._is_assumed(std)
-
-    def _is_assumed(self, std: Float[np.ndarray, " r"]) -> Bool[np.ndarray, " r"]:
-        """Return a mask of deviations that were only assumed."""
-        mask = np.zeros(std.shape, np.bool_)
-        for assumed in self.stage.limits.assumed:
-            mask |= std == assumed
-        return mask
-
-    def _rows(self, rows: np.ndarray) -> Rows:
+    def _some(self, rows: np.ndarray) -> Rows:
         """Return some rows."""
-        scan = self.scan
-        return Rows(scan.bearing[rows], scan.bearing_std[rows], self.way[rows],
-                    self.way_std[rows], scan.level_db[rows])  # fmt: skip
+        return Rows(*(column[rows] for column in self.rows[1:6]))
 
-    def _costs(
+    def _innovations(
         self,
         rows: Int[np.ndarray, " r"],
-        there: Int[np.ndarray, " n"],
         caller: int,
-        chances: tuple[float, float, float, float],
-    ) -> Float[np.ndarray, "r n"]:
-        """Return the costs of rows of a caller and landmarks (`pair_costs`)."""
-        joint, columns = self.joint, tuple(self._rows(rows))
-        return pair_costs(columns, joint.mean, joint.covariance, there, caller, chances)
-
-    def _innovate(
-        self, rows: Int[np.ndarray, " r"], there: Int[np.ndarray, " n"], caller: int
-    ) -> Innovate:
-        """Return what tells the innovations of pairs of these rows and landmarks."""
-        joint = self.joint
-        return lambda row, landmark: pair_innovations(
-            tuple(self._rows(rows)), joint.mean, joint.covariance, there, caller, (row, landmark)
-        )
+        pairs: tuple[Int[np.ndarray, " p"], Int[np.ndarray, " p"]],
+    ) -> Innovations:
+        """Return the innovations of pairs of these rows and landmarks."""
+        mean, covariance = self.joint.mean, self.joint.covariance
+        there, columns = 3 + 2 * np.arange(self.joint.landmark.size), tuple(self._some(rows))
+        return pair_innovations(columns, mean, covariance, there, caller, pairs)
 
     def _tell(self, number: int, caller: Caller) -> None:
         """State the place of a caller that was found as a range of its direct call."""
@@ -413,55 +380,27 @@ class _Work:
         row = self._direct(number)
         if row < 0:
             return
-        if at >= 0 and number not in self.scan.moving:
-            chances = (DIRECT_GATE, *self.stage.chances[1:])
-            cost = self._costs(np.array([row]), np.array([at]), UNPLACED, chances)
-            if np.isinf(cost[0, 0]):
+        if at >= 0 and number not in self.moves:
+            gated = (DIRECT_GATE, *self.stage.chances[1:])
+            if not bearing_fits(tuple(self.rows), row, self._joint(), at, gated):
                 return
         self.label[row] = label
 
-    def _bear(self, number: int, rows: Int[np.ndarray, " r"], at: int) -> None:
-        """Begin landmarks with rows that are sure and near no other."""
-        way, scan, rows = self.way, self.scan, rows[self.sure[rows]]
-        rows = rows[~self._overlapped(number, rows, at)] if rows.size else rows
-        factor, same = (2.0 if number == OWN else 1.0), scan.caller == number
-        for row in sorted(rows.tolist(), key=lambda row: -scan.level_db[row]):
-            beside = same & (factor * np.abs(way - way[row]) < BESIDE)
-            beside &= np.abs(wrap(scan.bearing - scan.bearing[row])) < ASIDE
-            if np.any(beside & (scan.level_db > scan.level_db[row])):
-                continue
-            label = self._another()
-            self.label[row] = label
-            self.new.append(label)
-            if number == OWN:
-                stds = scan.bearing_std[row], self.way_std[row]
-                self.place[label] = self.joint.mean.size
-                self.joint = with_point(self.joint, label, scan.bearing[row], way[row], stds)
+    def _bear(self, number: int, row: int) -> None:
+        """Begin a landmark with a row."""
+        label, rows = self._another(), self.rows
+        self.label[row] = label
+        self.new.append(label)
+        if number == OWN:
+            stds = rows.bearing_std[row], rows.way_std[row]
+            self.joint = with_point(self.joint, label, rows.bearing[row], rows.way[row], stds)
 
-    def _overlapped(
-        self, number: int, rows: Int[np.ndarray, " r"], at: int
-    ) -> Bool[np.ndarray, " r"]:
-        """Return a mask of rows that may be of a landmark which was not heard by itself.
-
-        Of two echoes that overlap comes one row, with the bearing of one and the way of the other.
-        """
-        known, joint = self.memory.known, self.joint
-        silent = known.label[known.confirmed & ~np.isin(known.label, self.label)].tolist()
-        there = np.array([self.place[label] for label in silent if label in self.place], np.int64)
-        heard = self._rows(rows)
-        spread = OVERLAP_STD / (2.0 if number == OWN else 1.0)
-        columns = tuple(heard._replace(way_std=np.hypot(heard.way_std, spread)))
-        chances = (OVERLAP_GATE, *self.stage.chances[1:])
-        costs = pair_costs(columns, joint.mean, joint.covariance, there, at, chances)
-        return np.any(np.isfinite(costs), axis=1)
-
-    def _judge_caller(self, number: int, rows: Int[np.ndarray, " r"]) -> None:
-        """Count how many of a caller's sure rows are of landmarks."""
-        if number not in self.callers or self._where(self.callers[number].label) < 0:
-            return
-        caller, sure = self.callers[number], rows[self.sure[rows]]
-        told = (int(np.count_nonzero(self.label[sure] != UNLABELLED)), sure.size)
-        self.callers[number] = replace(caller, trial=(*caller.trial[1 - TRIAL :], told))
+    def _judge_caller(self, number: int, count: tuple[int, int]) -> None:
+        """Remember how many of a caller's sure rows are of landmarks, and how many there are."""
+        caller = self.callers.get(number)
+        if caller is not None and self._where(caller.label) >= 0:
+            trial = (*caller.trial[1 - TRIAL :], count)
+            self.callers[number] = replace(caller, trial=trial)
 
     def _lost(self, known: Known) -> list[int]:
         """Return callers that are not where they were found, with what they alone have placed."""

@@ -18,6 +18,7 @@ from jaxtyping import Bool, Float, Int
 from pipistrelle.config import InputError
 from pipistrelle.estimation.ekf.caller_motion import is_standing, velocity_of
 from pipistrelle.estimation.ekf.gaussian import LINEAR, retract
+from pipistrelle.jit import kernel
 
 MERGED_STD = 1e-3
 """Standard deviation of the difference of two landmarks that are one, along each axis [m]."""
@@ -32,20 +33,24 @@ State = tuple[
 them."""
 
 
+@kernel
 def is_placed(landmark: Int[np.ndarray, " h"]) -> Bool[np.ndarray, " h"]:
     """Return a mask of the members that are a landmark's or a caller's only one.
 
     >>> is_placed(np.array([4, 7, 7, 51, -53]))
     array([ True, False, False,  True, False])
     """
-    another = landmark[1:] != landmark[:-1]  # the members of a landmark are neighbours
-    return np.append(True, another) & np.append(another, True) & (landmark >= 0)
+    placed = landmark >= 0
+    for n in range(1, landmark.size):
+        if landmark[n] == landmark[n - 1]:  # the members of a landmark are neighbours
+            placed[n - 1] = placed[n] = False
+    return placed
 
 
 def removed(state: State, label: int) -> State:
     """Return a state without the members of a landmark, and without its velocity if it moves."""
     mean, covariance, landmark, weight = state
-    gone = np.isin(landmark, [_present(landmark, label), int(velocity_of(label))])
+    gone = (landmark == _present(landmark, label)) | (landmark == velocity_of(label))
     kept = np.concatenate((np.ones(3, bool), np.repeat(~gone, 2)))
     return mean[kept], covariance[np.ix_(kept, kept)], landmark[~gone], weight[~gone]
 

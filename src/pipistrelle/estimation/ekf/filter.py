@@ -46,7 +46,7 @@ from pipistrelle.estimation.ekf.delayed_initialization import WAITING_WEIGHT
 from pipistrelle.estimation.ekf.editing import is_placed, merged, removed
 from pipistrelle.estimation.ekf.gaussian import INVARIANT, LINEAR, propagate
 from pipistrelle.estimation.ekf.invariant_error import (
-    linear_covariance,
+    linear_part,
     propagate_invariant,
     rotated_left,
     shifted_covariance,
@@ -102,31 +102,25 @@ class EkfBelief:
 
     def rows(self, kept: Bool[np.ndarray, " h"]) -> Landmarks:
         """Return some members with the covariance of the linear error, a landmark's together."""
-        at = (3 + 2 * np.flatnonzero(kept)[:, np.newaxis] + np.arange(2)).ravel()
-        mean, covariance = self.mean[at].reshape(-1, 2), self.covariance[np.ix_(at, at)]
-        if self.error == INVARIANT:
-            heading = self.covariance[2, at], self.covariance[2, 2]
-            covariance = linear_covariance(rotated_left(mean), covariance, *heading)
-            mean = mean + self.origin
-        return _map_of(self.landmark[kept], self.weight[kept], mean, covariance)
+        mean, covariance = self._linear(kept, with_pose=False)
+        return _map_of(self.landmark[kept], self.weight[kept], mean.reshape(-1, 2), covariance)
 
     def joint(self) -> JointGaussian:
         """Return pose and placed landmarks together, callers that move among them."""
-        placed = np.flatnonzero(is_placed(self.landmark))
-        at = np.concatenate(([0, 1, 2], (3 + 2 * placed[:, np.newaxis] + np.arange(2)).ravel()))
-        mean, covariance = self.mean[at], self.covariance[np.ix_(at, at)]
-        if self.error == INVARIANT:
-            points = np.concatenate((mean[:2], mean[3:])).reshape(-1, 2)
-            left = rotated_left(points)
-            rotated = np.concatenate((left[:2], [0.0], left[2:]))
-            covariance = linear_covariance(rotated, covariance, covariance[2], covariance[2, 2])
-            points += self.origin
-            mean = np.concatenate((points[0], mean[2:3], points[1:].ravel()))
+        placed = is_placed(self.landmark)
+        mean, covariance = self._linear(placed, with_pose=True)
         return JointGaussian(landmark=self.landmark[placed], mean=mean, covariance=covariance)
+
+    def _linear(
+        self, kept: Bool[np.ndarray, " h"], *, with_pose: bool
+    ) -> tuple[Float[np.ndarray, " k"], Float[np.ndarray, "k k"]]:
+        """Return mean and covariance of the linear error of some members (`linear_part`)."""
+        invariant = self.error == INVARIANT
+        return linear_part(self.mean, self.covariance, self.origin, kept, with_pose, invariant)
 
     def labels(self) -> list[int]:
         """Return the labels of all landmarks and callers, placed or not."""
-        return np.unique(self.landmark[~is_velocity(self.landmark)]).tolist()
+        return sorted({*self.landmark[~is_velocity(self.landmark)].tolist()})
 
     def edited(self, remove: Sequence[int], merge: Sequence[tuple[int, int]]) -> "EkfBelief":
         """Return the belief without some landmarks, and with others as one (`editing`)."""

@@ -32,7 +32,7 @@ Robotics and Automation Letters 2 (2017).
 import math
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
 from pipistrelle.estimation.motion import MotionNumbers, propagate_pose
 from pipistrelle.jit import kernel, no_alloc
@@ -44,23 +44,36 @@ def rotated_left(points: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, " m"]:
 
 
 @kernel
-def linear_covariance(
-    rotated: Float[np.ndarray, " m"],
-    covariance: Float[np.ndarray, "m m"],
-    with_heading: Float[np.ndarray, " m"],
-    heading_variance: float,
-) -> Float[np.ndarray, "m m"]:
-    """Turn a covariance of invariant errors into that of the linear errors.
+def linear_part(
+    mean: Float[np.ndarray, " d"],
+    covariance: Float[np.ndarray, "d d"],
+    origin: Float[np.ndarray, "2"],
+    kept: Bool[np.ndarray, " h"],
+    with_pose: bool,
+    invariant: bool,
+) -> tuple[Float[np.ndarray, " k"], Float[np.ndarray, "k k"]]:
+    """Return mean and covariance of the linear errors of some members of a state.
 
-    `rotated`: of positions as `rotated_left` gives them, 0 of a heading; `with_heading`: the
-    covariance of each number with the heading.
+    ``with_pose``: whether the pose stands before them; ``invariant``: the state's error.
     """
-    linear = np.empty(covariance.shape)
-    for i in range(rotated.size):
-        for j in range(rotated.size):
-            lever = rotated[i] * with_heading[j] + rotated[j] * with_heading[i]
-            linear[i, j] = covariance[i, j] + lever + rotated[i] * rotated[j] * heading_variance
-    return linear
+    at, size = np.empty(mean.size, np.int64), 0
+    for i in range(mean.size):
+        if with_pose if i < 3 else kept[(i - 3) // 2]:
+            at[size], size = i, size + 1
+    part, linear, rotated = np.empty(size), np.empty((size, size)), np.zeros(size)
+    for k in range(size):
+        i = at[k]
+        along_x = i == 0 or (i > 2 and i % 2 == 1)
+        part[k] = mean[i] if i == 2 else mean[i] + origin[0 if along_x else 1]
+        if invariant and i != 2:
+            rotated[k] = -mean[i + 1] if along_x else mean[i - 1]
+    heading, variance = covariance[2][at[:size]], covariance[2, 2]
+    for k in range(size):
+        row = covariance[at[k]]
+        for j in range(size):
+            lever = rotated[k] * heading[j] + rotated[j] * heading[k]
+            linear[k, j] = row[at[j]] + lever + rotated[k] * rotated[j] * variance
+    return part, linear
 
 
 @no_alloc

@@ -122,31 +122,30 @@ class SmootherBelief:
     def joint(self) -> JointGaussian:
         """Return pose and placed landmarks together, callers that move among them."""
         solution, steps = self.solution, self.ahead.mean[:2] - self.at.mean[:2]
-        columns, d, n = solution.columns, len(solution.state), solution.beta.size
-        there = np.flatnonzero(columns)
-        labels = [self.history.placed[number] for number in there.tolist()]
-        border, size = (
-            solution.border[:n] + solution.beta,
-            3 + 2 * len(there) + 2 * len(self._callers()),
-        )
+        d, n, callers = len(solution.state), solution.beta.size, self._callers()
+        there = np.flatnonzero(solution.columns)
+        at, rows = solution.columns[there], 3 + 2 * np.arange(there.size)
+        first, seconds = 3 + 2 * there.size, self.odometry.seconds
+        size, guess = first + 2 * len(callers), self.guess()
         by_chain, by_border = np.zeros((size, d)), np.zeros((size, n))
         by_chain[:3, :3] = np.eye(3)
         by_chain[0, 2], by_chain[1, 2] = -steps[1], steps[0]
-        mean, i = [*self.ahead.mean], 3
-        for column in columns[there].tolist():
-            by_border[i, column] = by_border[i + 1, column + 1] = 1.0
-            mean, i = [*mean, *border[column : column + 2]], i + 2
-        first, guess, seconds = i, self.guess(), self.odometry.seconds
-        for label, at in self._callers():
-            by_chain[i, at] = by_chain[i + 1, at + 1] = 1.0
-            by_chain[i, at + 2] = by_chain[i + 1, at + 3] = seconds
-            mean, i, labels = [*mean, *guess[at : at + 2]], i + 2, [*labels, label]
+        by_border[rows, at] = by_border[rows + 1, at + 1] = 1.0
+        for i, (_, state) in zip(range(first, size, 2), callers, strict=True):
+            by_chain[i, state] = by_chain[i + 1, state + 1] = 1.0
+            by_chain[i, state + 2] = by_chain[i + 1, state + 3] = seconds
+        points = (solution.border[:n] + solution.beta)[at[:, np.newaxis] + np.arange(2)].ravel()
+        roving = [guess[state : state + 2] for _, state in callers]
         covariance = joint(solution.front, solution.factor, n, by_chain, by_border)
         covariance[:3, :3] = self.ahead.covariance
         strayed = self.noise[3] ** 2 * seconds**3 / 3.0
-        covariance[range(first, size), range(first, size)] += strayed
+        covariance[first:, first:] += strayed * np.eye(size - first)
+        labels = [self.history.placed[number] for number in there.tolist()]
+        labels += [label for label, _ in callers]
         return JointGaussian(
-            landmark=np.array(labels, np.int64), mean=np.array(mean), covariance=covariance
+            landmark=np.array(labels, np.int64),
+            mean=np.concatenate((self.ahead.mean, points, *roving)),
+            covariance=covariance,
         )
 
     def edited(self, remove: Sequence[int], merge: Sequence[tuple[int, int]]) -> "SmootherBelief":

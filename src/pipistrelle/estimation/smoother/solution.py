@@ -141,20 +141,24 @@ def joint(
     """Return the covariance of linear functions of the last state and the border together."""
     C, P, _ = front
     q, d = by_chain.shape
-    Z, covariance = by_border.copy(), np.empty((q, q))
+    Z, covariance, last = by_border.copy(), np.empty((q, q)), np.zeros(q, np.int64)
     for e in range(q):
         for a in range(d):
             if by_chain[e, a] != 0.0:
                 for j in range(n):
                     Z[e, j] += by_chain[e, a] * C[a, j]
         rooted(R, Z[e], n)
+        for j in range(n):
+            if Z[e, j] != 0.0:
+                last[e] = j
         for f in range(e + 1):
             total = 0.0
-            for j in range(n):
+            for j in range(min(last[e], last[f]) + 1):
                 total += Z[e, j] * Z[f, j]
             for a in range(d):
-                for b in range(d):
-                    total += by_chain[e, a] * P[a, b] * by_chain[f, b]
+                if by_chain[e, a] != 0.0:
+                    for b in range(d):
+                        total += by_chain[e, a] * P[a, b] * by_chain[f, b]
             covariance[e, f] = covariance[f, e] = total
     return covariance
 

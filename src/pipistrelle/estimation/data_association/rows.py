@@ -1,0 +1,269 @@
+"""A scan's rows as an association uses them, and what becomes of those of one caller.
+
+They are held against all landmarks (`compared`); how they are matched is the method's
+(`matching`). Sure rows that are near no landmark begin one, but not beside a louder row, nor where
+one may be two echoes that overlap: from these comes one row, with the bearing of one and the way
+of the other (`settled`).
+"""
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+from pipistrelle.detection.scans import (
+    BEARING,
+    BEARING_STD,
+    EXCESS_PATH,
+    EXCESS_PATH_STD,
+    LEVEL,
+    OWN,
+    RANGE,
+    RANGE_STD,
+    UNLABELLED,
+    Scan,
+)
+from pipistrelle.estimation.association import is_among
+from pipistrelle.estimation.data_association.matching import NOTHING
+from pipistrelle.estimation.data_association.pairs import UNPLACED, pair_costs
+from pipistrelle.geometry import wrap_angle
+from pipistrelle.jit import Flag, Whole, kernel, no_alloc
+
+BESIDE, ASIDE = 0.96, 0.5
+"""A row begins no landmark beside a louder one, within such a way [m] and bearing [rad]."""
+OVERLAP_STD, OVERLAP_GATE = 0.7, 9.0
+"""Deviation of the way of an echo that overlaps with another [m], and largest squared distance."""
+SURE_SHARE, ASSUMED = 0.65, 0.75
+"""A row is as sure as any up to this share of the limit of its bearing's deviation; how sure one is
+whose deviation is only assumed."""
+
+
+class ScanRows(NamedTuple):
+    """Rows of a scan."""
+
+    caller: Int[np.ndarray, " m"]
+    bearing: Float[np.ndarray, " m"]
+    bearing_std: Float[np.ndarray, " m"]
+    way: Float[np.ndarray, " m"]
+    """Range of the vehicle's own call, excess path of another's [m], or NaN."""
+    way_std: Float[np.ndarray, " m"]
+    level_db: Float[np.ndarray, " m"]
+    usable: Bool[np.ndarray, " m"]
+    with_way: Bool[np.ndarray, " m"]
+    """Usable, and with a way."""
+    sure: Bool[np.ndarray, " m"]
+    """Whether the way is sure enough to begin a landmark."""
+    surety: Float[np.ndarray, " m"]
+    """How sure a bearing is, from 0 to 1."""
+
+
+Joint = tuple[Int[np.ndarray, " n"], Float[np.ndarray, " d"], Float[np.ndarray, "d d"]]
+"""Labels, mean and covariance of a `JointGaussian`."""
+
+
+def rows_of_scan(
+    scan: Scan, limits: tuple[float, float, float], assumed: tuple[float, ...]
+) -> ScanRows:
+    """Return a scan's rows.
+
+    ``limits``: largest deviations of bearing and way, and of the way of what begins a landmark;
+    ``assumed``: deviations that are assumed of rows which state none: no limit holds for these.
+    """
+    numbers = np.ascontiguousarray(scan.numbers)
+    return ScanRows(*_read(scan.caller, numbers, limits, np.array(assumed, float)))
+
+
+@kernel
+def _read(
+    caller: Int[np.ndarray, " m"],
+    numbers: Float[np.ndarray, "8 m"],
+    limits: tuple[float, float, float],
+    assumed: Float[np.ndarray, " a"],
+) -> tuple[np.ndarray, ...]:
+    """Return the columns of `ScanRows`."""
+    size, (limit, way_limit, birth_limit) = caller.size, limits
+    bearing_std, way, way_std = numbers[BEARING_STD], np.empty(size), np.empty(size)
+    usable, with_way, sure = np.empty((3, size), np.bool_)
+    surety = np.full(size, ASSUMED)
+    for m in range(size):
+        own = caller[m] == OWN
+        way[m] = numbers[RANGE if own else EXCESS_PATH, m]
+        way_std[m] = numbers[RANGE_STD if own else EXCESS_PATH_STD, m]
+        bare, within = math.isnan(way[m]), _within(way_std[m], way_limit, assumed)
+        usable[m] = _within(bearing_std[m], limit, assumed) and (bare or within)
+        with_way[m] = usable[m] and not bare
+        sure[m] = _within(way_std[m], birth_limit, assumed)
+        if not _is_assumed(bearing_std[m], assumed):
+            share = SURE_SHARE * limit / bearing_std[m]
+            surety[m] = share if share < 1.0 else 1.0  # of none stated, too
+    bearing, level = numbers[BEARING], numbers[LEVEL]
+    return caller, bearing, bearing_std, way, way_std, level, usable, with_way, sure, surety
+
+
+@no_alloc
+def _within(std: float, limit: float, assumed: Float[np.ndarray, " a"]) -> Flag:
+    """Tell whether a deviation is within a limit, or was only assumed."""
+    return std <= limit or _is_assumed(std, assumed)
+
+
+@no_alloc
+def _is_assumed(std: float, assumed: Float[np.ndarray, " a"]) -> Flag:
+    """Tell whether a deviation was only assumed."""
+    found = False
+    for one in assumed:
+        found |= std == one
+    return found
+
+
+@kernel
+def place_of(label: Whole, landmark: Int[np.ndarray, " n"]) -> int:
+    """Return where a landmark stands in the joint mean, or -1."""
+    for n in range(landmark.size):
+        if landmark[n] == label:
+            return 3 + 2 * n
+    return -1
+
+
+@kernel
+def places_of(
+    labels: Int[np.ndarray, " l"], landmark: Int[np.ndarray, " n"], near: Bool[np.ndarray, " k"]
+) -> tuple[Int[np.ndarray, " l"], Bool[np.ndarray, " l"]]:
+    """Return where landmarks stand in the joint mean, -1: nowhere; and whether a row is near."""
+    at, close = np.empty(labels.size, np.int64), np.zeros(labels.size, np.bool_)
+    for n in range(labels.size):
+        at[n] = place_of(labels[n], landmark)
+        close[n] = at[n] >= 0 and near[(at[n] - 3) // 2]
+    return at, close
+
+
+@kernel
+def compared(
+    rows: tuple[np.ndarray, ...],
+    joint: Joint,
+    moving: Int[np.ndarray, " v"],
+    near: Bool[np.ndarray, " k"],
+    caller: tuple[Whole, Whole, Whole],
+    chances: tuple[float, float, float, float],
+    telling: float,
+) -> tuple[Int[np.ndarray, " r"], Float[np.ndarray, "r n"], Bool[np.ndarray, " r"]]:
+    """Return the usable rows of a caller, their costs, and whether any landmark is near each.
+
+    ``moving``: labels of landmarks that no row is of; ``near``: is set of those near a row with a
+    deviation up to ``telling``; ``caller``: its number, the row of its direct call, and where it
+    stands in the mean.
+    """
+    heard, (landmark, mean, covariance), (number, direct, at) = ScanRows(*rows), joint, caller
+    used = np.flatnonzero(heard.caller == number)
+    used = used[used != direct]
+    there, usable = 3 + 2 * np.arange(landmark.size), heard.usable
+    costs = pair_costs(_part(heard, used, 0.0), mean, covariance, there, at, chances)
+    for n in np.flatnonzero(is_among(landmark, moving)):
+        costs[:, n] = math.inf
+    if at != UNPLACED:
+        usable = heard.with_way
+    size, close = 0, np.zeros(used.size, np.bool_)
+    for k in range(used.size):
+        m, any_near = used[k], False
+        tells = heard.bearing_std[m] <= telling
+        for n in range(landmark.size):
+            costs[size, n] = costs[k, n]
+            if costs[k, n] < math.inf:
+                any_near = True
+                near[n] |= tells
+        used[size], close[size] = m, any_near
+        if usable[m]:
+            size += 1
+    return used[:size], costs[:size], close[:size]
+
+
+@kernel
+def bearing_fits(
+    rows: tuple[np.ndarray, ...],
+    row: Whole,
+    joint: Joint,
+    at: Whole,
+    chances: tuple[float, float, float, float],
+) -> bool:
+    """Tell whether the bearing of a row may be of the landmark that stands at a place."""
+    (_, mean, covariance), part = joint, _part(ScanRows(*rows), np.full(1, row), 0.0)
+    costs = pair_costs(part, mean, covariance, np.full(1, at), UNPLACED, chances)
+    return math.isfinite(costs[0, 0])
+
+
+@kernel
+def _part(heard: ScanRows, rows: Int[np.ndarray, " r"], spread: float) -> tuple[np.ndarray, ...]:
+    """Return columns of some rows (`pairs.Rows`); ``spread``: more deviation of the way."""
+    way_std = heard.way_std[rows]
+    for k in range(rows.size):
+        way_std[k] = math.hypot(way_std[k], spread)
+    bearing, bearing_std, level = heard.bearing, heard.bearing_std, heard.level_db
+    return bearing[rows], bearing_std[rows], heard.way[rows], way_std, level[rows]
+
+
+@kernel
+def settled(
+    label: Int[np.ndarray, " m"],
+    rows: tuple[np.ndarray, ...],
+    joint: Joint,
+    confirmed: Int[np.ndarray, " c"],
+    matched: tuple[Int[np.ndarray, " r"], Int[np.ndarray, " r"], Bool[np.ndarray, " r"]],
+    caller: tuple[Whole, Whole, Whole],
+    chances: tuple[float, float, float, float],
+) -> tuple[Int[np.ndarray, " b"], tuple[int, int]]:
+    """Label a caller's rows; return those that begin landmarks, the loudest first, and two counts.
+
+    ``confirmed``: labels of landmarks that are some; ``matched``: the rows, which landmark each is
+    of, and whether any is near. The counts are of sure rows: with a landmark, and all.
+    """
+    heard, (landmark, mean, covariance), (number, _, at) = ScanRows(*rows), joint, caller
+    (used, found, near), stray = matched, np.empty(label.size, np.int64)
+    right, sure, size = 0, 0, 0
+    for k in range(used.size):
+        row, known = used[k], found[k] != NOTHING
+        label[row] = landmark[found[k]] if known else UNLABELLED
+        if heard.sure[row]:
+            right, sure = right + (1 if known else 0), sure + 1
+            if not near[k] and at != UNPLACED:
+                stray[size], size = row, size + 1
+    if size == 0:
+        return stray[:0], (right, sure)
+    silent = np.full(confirmed.size, -1)
+    for n in range(confirmed.size):
+        if confirmed[n] not in label:
+            silent[n] = place_of(confirmed[n], landmark)
+    stray, gated = stray[:size], (OVERLAP_GATE, chances[1], chances[2], chances[3])
+    overlapping = _part(heard, stray, OVERLAP_STD / (2.0 if number == OWN else 1.0))
+    costs = pair_costs(overlapping, mean, covariance, silent[silent >= 0], at, gated)
+    size = 0
+    for k in range(stray.size):
+        if not np.isfinite(costs[k]).any() and not _is_beside(heard, stray[k]):
+            stray[size], size = stray[k], size + 1
+    return _loudest_first(stray[:size], heard.level_db), (right, sure)
+
+
+@no_alloc
+def _is_beside(heard: ScanRows, row: Whole) -> bool:
+    """Tell whether a row is beside a louder one of the same caller."""
+    own = heard.caller[row]
+    factor = 2.0 if own == OWN else 1.0
+    for m in range(heard.caller.size):
+        louder = heard.caller[m] == own and heard.level_db[m] > heard.level_db[row]
+        close = factor * abs(heard.way[m] - heard.way[row]) < BESIDE
+        if louder and close and abs(wrap_angle(heard.bearing[m] - heard.bearing[row])) < ASIDE:
+            return True
+    return False
+
+
+@kernel
+def _loudest_first(
+    rows: Int[np.ndarray, " r"], level_db: Float[np.ndarray, " m"]
+) -> Int[np.ndarray, " r"]:
+    """Return rows in the order of their levels; those of one level stay in theirs."""
+    ordered = rows.copy()
+    for k in range(1, ordered.size):
+        row, n = ordered[k], k
+        while n > 0 and level_db[row] > level_db[ordered[n - 1]]:
+            ordered[n], n = ordered[n - 1], n - 1
+        ordered[n] = row
+    return ordered
