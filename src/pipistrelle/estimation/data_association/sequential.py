@@ -59,8 +59,9 @@ from pipistrelle.geometry import wrap
 FIRST_SEARCH, FIRST_SEARCH_MOVING = 8, 10
 """Scans of a caller that stands, and of one that moves, after which its place is searched for, at
 every second one."""
-PLACE_SHARE = 0.12
-"""Deviation of the range at which a caller was found, as a share of it."""
+PLACE_SHARE, MOVING_SHARE = 0.12, 0.2
+"""Deviation of the range at which a caller that stands was found, and one that moves, as a share of
+it."""
 REFINED_AFTER, REFINED_SHARE = 24, 0.06
 """Scans after which the place on the map is taken instead, once, and the least share of its range
 that it may be off."""
@@ -396,7 +397,8 @@ class _Work:
         x, y = caller.place.at(self.scan.time)
         far = math.hypot(x - self.pose[0], y - self.pose[1])
         self.numbers = self.numbers.copy()
-        share = caller.place.refined or PLACE_SHARE
+        found = MOVING_SHARE if number in self.scan.moving else PLACE_SHARE
+        share = caller.place.refined or found
         self.numbers[RANGE, row], self.numbers[RANGE_STD, row] = far, share * far
         self.label[row] = self.named[number] = caller.label
         told = replace(caller, told=True, tracks=Tracks(), since=self.memory.scan)
