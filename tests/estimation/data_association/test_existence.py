@@ -113,20 +113,21 @@ def test_a_sensor_without_levels_misses_what_is_within_its_sight():
 
 
 @pytest.mark.parametrize(
-    ("why", "rows", "where", "sight"),
+    ("why", "rows", "where", "sight", "near"),
     [
-        ("its sight is not known", NONE, (4.0, 0.0), (0.0, 7.0)),
-        ("it is too far", NONE, (4.6, 0.0), LIDAR),
-        ("it is aside of the field of view", NONE, (2.2, 3.3), LIDAR),
-        ("it is behind", NONE, (-4.0, 0.1), LIDAR),
-        ("something stands before it", row(-1, 2.0, np.nan, 0.03), (4.0, 0.0), LIDAR),
-        ("others have levels", row(-1, 4.9, 30.0), (4.0, 0.0), LIDAR),
+        ("its sight is not known", NONE, (4.0, 0.0), (0.0, 7.0), False),
+        ("it is too far", NONE, (4.6, 0.0), LIDAR, False),
+        ("it is aside of the field of view", NONE, (2.2, 3.3), LIDAR, False),
+        ("it is behind", NONE, (-4.0, 0.1), LIDAR, False),
+        ("a row may have been its own", UNSEEN, (4.0, 0.0), LIDAR, True),
+        ("something stands before it", row(-1, 2.0, np.nan, 0.03), (4.0, 0.0), LIDAR, False),
+        ("others have levels", row(-1, 4.9, 30.0), (4.0, 0.0), LIDAR, False),
     ],
 )
-def test_a_sensor_without_levels_misses_nothing_where(why, rows, where, sight):
+def test_a_sensor_without_levels_misses_nothing_where(why, rows, where, sight, near):
     known = seen_so_often(3)
     there = (np.array([0.0, 0.0, 0.0, *where]), *THERE[1:])
-    after = judged(known, rows, there, np.array([False]), 3, sight)
+    after = judged(known, rows, there, np.array([near]), 3, sight)
     assert after.odds[0] == known.odds[0], why
 
 

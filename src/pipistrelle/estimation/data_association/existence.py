@@ -8,7 +8,7 @@ well above what is detected, and the vehicle's own call was sent towards it as b
 less where something as loud came at the same time, or a row that fits is another's: a landmark may
 be hidden, but what is hidden for a hundred scans is none. Of a sensor that tells no levels, a lidar
 or a camera, a landmark is expected within its range and field of view, if these are known, unless
-something nearer stands before it.
+something nearer stands before it or a row fits it.
 """
 
 import math
@@ -188,9 +188,9 @@ def _judge(
         else:
             missed = 0.0
             for c in range(callers.size):
-                here = _missed(known, n, c, far, bearing, rows, (mean, at, callers), sight)
+                here = _missed(known, n, c, far, bearing, rows, there, near[n], sight)
                 missed = max(missed, here)
-            known.odds[n] -= MISSED * min(missed, HIDDEN if near[n] else 1.0)
+            known.odds[n] -= MISSED * missed
             if not known.confirmed[n] and scan - known.heard[n] > PATIENCE:
                 known.odds[n] = -MOST
         if known.odds[n] >= CONFIRMED and known.count[n] >= LEAST_SCANS:
@@ -227,6 +227,7 @@ def _missed(
     bearing: float,
     rows: Heard,
     place: Place,
+    hidden: bool,
     sight: Sight,
 ) -> float:
     """Return how surely a caller's call should have been heard of a landmark: 1, `HIDDEN` or 0."""
@@ -234,7 +235,8 @@ def _missed(
     if math.isnan(far):
         return 0.0
     if math.isnan(known.source[n, c]):
-        return 1.0 if c == OWN and _in_sight(far, bearing, rows, sight) else 0.0
+        seen = c == OWN and not hidden and _in_sight(far, bearing, rows, sight)
+        return 1.0 if seen else 0.0
     loud = known.source[n, c] - _spreading(c, far)
     if loud < FAINTEST or (c == OWN and abs(wrap_angle(bearing - known.aim[n])) > AIMED):
         return 0.0
@@ -247,7 +249,7 @@ def _missed(
         if ahead < 1.2 * TOGETHER:
             return 0.0
     ahead, factor = (2.0 * ahead, 2.0) if c == OWN else (ahead, 1.0)
-    called, hidden = c == OWN, False
+    called = c == OWN
     for m in range(caller.size):
         if caller[m] != c:
             continue
