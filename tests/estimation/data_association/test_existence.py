@@ -7,6 +7,7 @@ from pipistrelle.estimation.data_association.existence import (
     CONFIRMED,
     GONE,
     HEARD,
+    HIDDEN,
     MISSED,
     PATIENCE,
     judged,
@@ -59,19 +60,37 @@ def test_a_landmark_that_should_have_been_heard_and_was_not_is_given_up():
 
 
 @pytest.mark.parametrize(
-    ("why", "rows", "there", "near"),
+    ("why", "rows", "there"),
     [
-        ("a row may have been its own", NONE, THERE, True),
-        ("too far to be loud", NONE, (np.array([0, 0, 0, 20.0, 0]), *THERE[1:]), False),
-        ("the call went elsewhere", NONE, (np.array([0, 0, 0, 0.0, 4.0]), *THERE[1:]), False),
-        ("something as loud came with it", row(label=-1, way=4.2), THERE, False),
-        ("it is not on the map", NONE, (AHEAD, np.array([-1]), np.array([-2])), False),
+        ("too far to be loud", NONE, (np.array([0, 0, 0, 20.0, 0]), *THERE[1:])),
+        ("the call went elsewhere", NONE, (np.array([0, 0, 0, 0.0, 4.0]), *THERE[1:])),
+        ("it is not on the map", NONE, (AHEAD, np.array([-1]), np.array([-2]))),
     ],
 )  # fmt: skip
-def test_nothing_is_expected_where(why, rows, there, near):
+def test_nothing_is_expected_where(why, rows, there):
     known = heard_so_often(3)
-    after = judged(known, rows, there, np.array([near]), 3)
+    after = judged(known, rows, there, np.array([False]), 3)
     assert after.odds[0] == known.odds[0], why
+
+
+@pytest.mark.parametrize(
+    ("why", "rows", "near"),
+    [
+        ("a row may have been its own", NONE, True),
+        ("something as loud came with it", row(label=-1, way=4.2), False),
+    ],
+)
+def test_silence_counts_less_where_a_landmark_may_be_hidden_until_it_is_none(why, rows, near):
+    known = heard_so_often(3)
+    after = judged(known, rows, THERE, np.array([near]), 3)
+    assert after.odds[0] == pytest.approx(known.odds[0] - HIDDEN * MISSED), why
+    for scan in range(4, 24):
+        after = judged(after, rows, THERE, np.array([near]), scan)
+    assert bool(after.confirmed[0])
+    assert after.odds[0] > GONE
+    for scan in range(24, 104):
+        after = judged(after, rows, THERE, np.array([near]), scan)
+    assert after.odds[0] < GONE
 
 
 LIDAR = (5.0, 2.0)

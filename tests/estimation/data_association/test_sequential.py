@@ -13,7 +13,7 @@ from pipistrelle.estimation.catalogue import entry
 from pipistrelle.estimation.data_association.existence import PATIENCE
 from pipistrelle.estimation.data_association.memory import Caller, CallerPlace, Memory
 from pipistrelle.estimation.data_association.methods import association_of
-from pipistrelle.estimation.data_association.sequential import REFINED_AFTER
+from pipistrelle.estimation.data_association.sequential import PLACE_SHARE, REFINED_AFTER
 from pipistrelle.estimation.motion import Motion
 from pipistrelle.estimation.session import Session
 from pipistrelle.experiments.runs.trial import run_mission
@@ -206,7 +206,7 @@ def test_associate_changes_nothing_that_it_is_given():
     assert (memory.scan, memory.labels, memory.known.label.size) == (0, 0, 0)
 
 
-@pytest.mark.parametrize(("std", "share"), [(0.1, 0.06), (1.0, 0.1), (5.0, 0.2)])
+@pytest.mark.parametrize(("std", "share"), [(0.1, 0.06), (1.0, 0.1), (5.0, PLACE_SHARE)])
 def test_a_callers_place_on_the_map_is_told_as_surely_as_the_map_has_its_range(std, share):
     # 10 m ahead; half of the variance is the vehicle's. What is aside of the line tells nothing.
     along, aside = 0.5 * std**2, 9.0

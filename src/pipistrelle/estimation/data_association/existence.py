@@ -4,10 +4,11 @@ Each landmark has log odds. They rise when it is heard, the more the surer the r
 is between two echoes that overlap comes back, too, but seldom as surely as one echo. They fall when
 the landmark is not heard, though it should have been: its level, as it was heard before, is
 expected at its present distance (spherical spreading, there and back of the vehicle's own call)
-well above what is detected; the vehicle's own call was sent towards it as before; and nothing as
-loud came at the same time. Of a sensor that tells no levels, a lidar or a camera, a landmark is
-expected within its range and field of view, if these are known, unless something nearer stands
-before it.
+well above what is detected, and the vehicle's own call was sent towards it as before. They fall
+less where something as loud came at the same time, or a row that fits is another's: a landmark may
+be hidden, but what is hidden for a hundred scans is none. Of a sensor that tells no levels, a lidar
+or a camera, a landmark is expected within its range and field of view, if these are known, unless
+something nearer stands before it or a row fits it.
 """
 
 import math
@@ -33,6 +34,8 @@ LEAST_SCANS, PATIENCE = 3, 25
 not yet one is none."""
 FAINTEST = 18.0
 """A landmark is expected from this level on [dB]."""
+HIDDEN = 0.2
+"""Share of the fall where something may hide the landmark."""
 AS_LOUD = 3.0
 """A row may hide a landmark that is at most so much louder [dB]."""
 TOGETHER = 1.0
@@ -152,7 +155,7 @@ def judged(
 ) -> Known:
     """Return landmarks after a scan, as known by what was heard and what was not.
 
-    ``near``: whether a row may have been of the landmark; then it was not missed.
+    ``near``: whether a row may have been of the landmark; then it was hidden at most.
     """
     return Known(*_after(tuple(known), rows, place, near, scan, sight))
 
@@ -209,10 +212,11 @@ def _judge(
             known.count[n] += 1
             known.heard[n] = scan
         else:
-            for c in range(0 if near[n] else callers.size):
-                if _expected(known, n, c, far, bearing, rows, (mean, at, callers), sight):
-                    known.odds[n] -= MISSED
-                    break
+            missed = 0.0
+            for c in range(callers.size):
+                here = _missed(known, n, c, far, bearing, rows, there, near[n], sight)
+                missed = max(missed, here)
+            known.odds[n] -= MISSED * missed
             if not known.confirmed[n] and scan - known.heard[n] > PATIENCE:
                 known.odds[n] = -MOST
         if known.odds[n] >= CONFIRMED and known.count[n] >= LEAST_SCANS:
@@ -241,7 +245,7 @@ def _spreading(caller: Whole, far: float) -> float:
 
 
 @no_alloc
-def _expected(
+def _missed(
     known: Known,
     n: Whole,
     c: Whole,
@@ -249,27 +253,29 @@ def _expected(
     bearing: float,
     rows: Heard,
     place: Place,
+    hidden: bool,
     sight: Sight,
-) -> bool:
-    """Tell whether a landmark should have been heard of a caller's call, and nothing hides it."""
+) -> float:
+    """Return how surely a caller's call should have been heard of a landmark: 1, `HIDDEN` or 0."""
     (_, caller, way, level, _, _), (mean, at, callers) = rows, place
     if math.isnan(far):
-        return False
+        return 0.0
     if math.isnan(known.source[n, c]):
-        return c == OWN and _in_sight(far, bearing, rows, sight)
+        seen = c == OWN and not hidden and _in_sight(far, bearing, rows, sight)
+        return 1.0 if seen else 0.0
     loud = known.source[n, c] - _spreading(c, far)
     if loud < FAINTEST or (c == OWN and abs(wrap_angle(bearing - known.aim[n])) > AIMED):
-        return False
+        return 0.0
     ahead = far
     if c != OWN:
         i, j = at[n], callers[c]
         if j < 0:
-            return False
+            return 0.0
         ahead = excess_path_slopes(mean[0], mean[1], mean[i], mean[i + 1], mean[j], mean[j + 1])[0]
         if ahead < 1.2 * TOGETHER:
-            return False
+            return 0.0
     ahead, factor = (2.0 * ahead, 2.0) if c == OWN else (ahead, 1.0)
-    called = False
+    called = c == OWN
     for m in range(caller.size):
         if caller[m] != c:
             continue
@@ -277,8 +283,10 @@ def _expected(
         if level[m] > loud - AS_LOUD:
             other = 0.0 if math.isnan(way[m]) else factor * way[m]
             if abs(other - ahead) < TOGETHER:
-                return False
-    return called or c == OWN
+                hidden = True
+    if hidden:
+        return HIDDEN
+    return 1.0 if called else 0.0
 
 
 @no_alloc

@@ -20,8 +20,6 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from pipistrelle.detection.scans import (
-    BEARING,
-    BEARING_STD,
     OWN,
     RANGE,
     RANGE_STD,
@@ -65,13 +63,13 @@ from pipistrelle.estimation.data_association.rows import (
 )
 from pipistrelle.estimation.data_association.tracks import Tracks, followed
 from pipistrelle.estimation.data_association.turns import turned
-from pipistrelle.geometry import wrap_angle
 
 FIRST_SEARCH, FIRST_SEARCH_MOVING = 8, 10
 """Scans of a caller that stands, and of one that moves, after which its place is searched for, at
 every second one."""
-PLACE_SHARE, PLACE_BEARING_STD = 0.2, 0.03
-"""Deviation of a caller's place that was found: of its range, as a share, and of its bearing."""
+PLACE_SHARE, MOVING_SHARE = 0.12, 0.2
+"""Deviation of the range at which a caller that stands was found, and one that moves, as a share of
+it."""
 REFINED_AFTER, REFINED_SHARE = 24, 0.06
 """Scans after which the place on the map is taken instead, once, and the least share of its range
 that it may be off."""
@@ -363,13 +361,10 @@ class _Work:
         if caller.place is None or row < 0 or self.scan.time < caller.place.since:
             return
         x, y = caller.place.at(self.scan.time)
-        dx, dy = x - self.pose[0], y - self.pose[1]
-        far = math.hypot(dx, dy)
+        far = math.hypot(x - self.pose[0], y - self.pose[1])
         self.numbers = self.numbers.copy()
-        if not (caller.place.refined or number in self.scan.moving):
-            self.numbers[BEARING, row] = wrap_angle(math.atan2(dy, dx) - self.pose[2])
-            self.numbers[BEARING_STD, row] = PLACE_BEARING_STD
-        share = caller.place.refined or PLACE_SHARE
+        found = MOVING_SHARE if number in self.moves else PLACE_SHARE
+        share = caller.place.refined or found
         self.numbers[RANGE, row], self.numbers[RANGE_STD, row] = far, share * far
         self.label[row] = self.named[number] = caller.label
         told = replace(caller, told=True, tracks=Tracks(), since=self.memory.scan)
