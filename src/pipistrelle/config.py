@@ -660,7 +660,10 @@ class RayConfig(Section):
     def _ordered(self) -> "RayConfig":
         _check_rising(*self.range_bounds)
         if self.spacing == "auto" and self.likelihood == "printed":
-            raise ValueError('spacing "auto" needs likelihood "normal", found "printed"')
+            raise ValueError(
+                'spacing "auto" needs likelihood "normal", found "printed"; '
+                'give spacing "paper", too'
+            )
         if self.spacing == "auto" and self.ranged not in ("anew", "bearing"):
             raise ValueError(
                 f'spacing "auto" needs ranged "anew" or "bearing", found "{self.ranged}"'
