@@ -157,25 +157,17 @@ def judged(
 
     ``near``: whether a row may have been of the landmark; then it was hidden at most.
     """
-    return Known(*_after(tuple(known), rows, place, near, scan, sight))
+    after = _copied(tuple(known))
+    _judge(after, rows, place, near, scan, sight)
+    return Known(*after)
 
 
 @kernel
-def _after(
-    columns: tuple[np.ndarray, ...],
-    rows: Heard,
-    there: Place,
-    near: Bool[np.ndarray, " l"],
-    scan: Whole,
-    sight: Sight,
-) -> tuple[np.ndarray, ...]:
-    """Return a copy of the columns of `Known` that is judged."""
+def _copied(columns: tuple[np.ndarray, ...]) -> tuple[np.ndarray, ...]:
+    """Return the columns of `Known`, of which those that a scan changes are copies."""
     label, born, heard, count, odds, confirmed, source, aim, together = columns
-    heard, count, odds, confirmed = heard.copy(), count.copy(), odds.copy(), confirmed.copy()
-    changed = source.copy(), aim.copy(), together.copy()
-    after = (label, born, heard, count, odds, confirmed, *changed)
-    _judge(after, rows, there, near, scan, sight)
-    return after
+    counts = heard.copy(), count.copy(), odds.copy(), confirmed.copy()
+    return (label, born, *counts, source.copy(), aim.copy(), together.copy())
 
 
 @kernel
