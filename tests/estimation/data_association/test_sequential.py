@@ -13,7 +13,7 @@ from pipistrelle.estimation.catalogue import entry
 from pipistrelle.estimation.data_association.existence import PATIENCE
 from pipistrelle.estimation.data_association.memory import Caller, CallerPlace, Memory
 from pipistrelle.estimation.data_association.methods import association_of
-from pipistrelle.estimation.data_association.sequential import PLACE_SHARE, REFINED_AFTER
+from pipistrelle.estimation.data_association.sequential import PLACE_SHARE
 from pipistrelle.estimation.motion import Motion
 from pipistrelle.estimation.session import Session
 from pipistrelle.experiments.runs.trial import run_mission
@@ -206,21 +206,18 @@ def test_associate_changes_nothing_that_it_is_given():
     assert (memory.scan, memory.labels, memory.known.label.size) == (0, 0, 0)
 
 
-@pytest.mark.parametrize(("std", "share"), [(0.1, 0.06), (1.0, 0.1), (5.0, PLACE_SHARE)])
-def test_a_callers_place_on_the_map_is_told_as_surely_as_the_map_has_its_range(std, share):
-    # 10 m ahead; half of the variance is the vehicle's. What is aside of the line tells nothing.
-    along, aside = 0.5 * std**2, 9.0
-    joint = JointGaussian(
-        landmark=np.array([1]), mean=np.array([0.0, 0.0, 0.0, 10.0, 0.0]),
-        covariance=np.diag([along, aside, 0.1, along, aside]),
-    )  # fmt: skip
-    belief = SimpleNamespace(joint=lambda: joint)
+def test_a_caller_that_was_found_is_told_by_its_range_and_its_own_bearing():
+    joint = JointGaussian(landmark=np.empty(0, int), mean=np.zeros(3), covariance=0.01 * np.eye(3))
     stage = association_of(Config(association=AssociationConfig(method="marginal")))
-    memory = Memory(scan=REFINED_AFTER, labels=1, callers={1: Caller(label=1, told=True)})
-    heard = make_scan(0.0, np.full(1, UNLABELLED), np.zeros(1), caller=np.ones(1, int), **STDS)
-    news = stage.associate(memory, belief, replace(heard, direct=np.array([-1, 0])))[1].again
-    assert news == {1: CallerPlace(10.0, 0.0, refined=pytest.approx(share))}
-    assert stage.informed(Memory(), news).callers[1].place == news[1]
+    memory = Memory(labels=1, callers={1: Caller(label=1, place=CallerPlace(6.0, 8.0))})
+    heard = make_scan(0.0, np.full(1, UNLABELLED), np.full(1, 0.9), caller=np.ones(1, int), **STDS)
+    scan = replace(heard, direct=np.array([-1, 0]))
+    _, assignment = stage.associate(memory, SimpleNamespace(joint=lambda: joint), scan)
+    told = assignment.scan
+    assert assignment.label.tolist() == [1]
+    assert told.range[0] == pytest.approx(10.0)
+    assert told.range_std[0] == pytest.approx(10.0 * PLACE_SHARE)
+    assert (told.bearing[0], told.bearing_std[0]) == (0.9, STDS["bearing_std"])
 
 
 @pytest.mark.slow

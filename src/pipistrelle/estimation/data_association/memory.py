@@ -15,8 +15,6 @@ class CallerPlace(NamedTuple):
     x: float
     y: float
     """Position [m]."""
-    refined: float = 0.0
-    """Standard deviation of the range, as a share of it, if the place is the map's; else 0."""
     motion: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 0.0)
     """Velocity [m/s], then acceleration [m/s^2], along x and y; 0 of one that stands."""
     time: float = 0.0

@@ -70,9 +70,6 @@ every second one."""
 PLACE_SHARE, MOVING_SHARE = 0.12, 0.2
 """Deviation of the range at which a caller that stands was found, and one that moves, as a share of
 it."""
-REFINED_AFTER, REFINED_SHARE = 24, 0.06
-"""Scans after which the place on the map is taken instead, once, and the least share of its range
-that it may be off."""
 DIRECT_GATE = 9.0
 """Largest squared distance of a caller's direct call."""
 PROBATION = 40
@@ -185,26 +182,9 @@ class _Work:
                 continue
             caller = self.callers.get(number) or Caller(label=self._another())
             self.callers[number] = caller
-            if caller.told:
-                news |= self._refined(number, caller)
-            elif caller.place is None:
+            if caller.place is None:
                 news |= self._searched(number, caller, row)
         return news
-
-    def _refined(self, number: int, caller: Caller) -> dict[int, CallerPlace]:
-        """Return the place of a caller on the map, once that is worth more than what was found."""
-        done = caller.place is not None and caller.place.refined
-        if number in self.moves or done or self.memory.scan != caller.since + REFINED_AFTER:
-            return {}
-        at = self._where(caller.label)
-        if at < 0:
-            return {}
-        way, P = self.joint.mean[at : at + 2] - self.pose[:2], self.joint.covariance
-        u = np.array([*-way, *way]) / float(way @ way)
-        there = [0, 1, at, at + 1]
-        off = math.sqrt(u @ P[np.ix_(there, there)] @ u)  # share of the range
-        x, y = self.joint.mean[at : at + 2].tolist()
-        return {number: CallerPlace(x, y, refined=min(max(off, REFINED_SHARE), PLACE_SHARE))}
 
     def _searched(self, number: int, caller: Caller, row: int) -> dict[int, CallerPlace]:
         """Follow a caller's rows, and return its place if that is found."""
@@ -363,8 +343,7 @@ class _Work:
         x, y = caller.place.at(self.scan.time)
         far = math.hypot(x - self.pose[0], y - self.pose[1])
         self.numbers = self.numbers.copy()
-        found = MOVING_SHARE if number in self.moves else PLACE_SHARE
-        share = caller.place.refined or found
+        share = MOVING_SHARE if number in self.moves else PLACE_SHARE
         self.numbers[RANGE, row], self.numbers[RANGE_STD, row] = far, share * far
         self.label[row] = self.named[number] = caller.label
         told = replace(caller, told=True, tracks=Tracks(), since=self.memory.scan)
