@@ -28,7 +28,8 @@ def built(tmp_path_factory):
     subprocess.run([*build, folder, "-t", "sdist"], cwd=ROOT, check=True, capture_output=True)
     (sources,) = folder.glob("*.tar.gz")
     with tarfile.open(sources) as archive:
-        archive.extractall(folder, filter="data")
+        archive.extraction_filter = getattr(tarfile, "data_filter", None)  # not in 3.11.2
+        archive.extractall(folder)
     unpacked = folder / sources.name.removesuffix(".tar.gz")
     subprocess.run([*build, folder, "-t", "wheel"], cwd=unpacked, check=True, capture_output=True)
     (wheel,) = folder.glob("*.whl")
