@@ -88,7 +88,7 @@ def test_silence_counts_less_where_a_landmark_may_be_hidden_until_it_is_none(why
         after = judged(after, rows, THERE, np.array([near]), scan)
     assert bool(after.confirmed[0])
     assert after.odds[0] > GONE
-    for scan in range(24, 104):
+    for scan in range(24, 54):
         after = judged(after, rows, THERE, np.array([near]), scan)
     assert after.odds[0] < GONE
 

@@ -6,7 +6,7 @@ the landmark is not heard, though it should have been: its level, as it was hear
 expected at its present distance (spherical spreading, there and back of the vehicle's own call)
 well above what is detected, and the vehicle's own call was sent towards it as before. They fall
 less where something as loud came at the same time, or a row that fits is another's: a landmark may
-be hidden, but what is hidden for a hundred scans is none. Of a sensor that tells no levels, a lidar
+be hidden, but what is hidden for forty scans is none. Of a sensor that tells no levels, a lidar
 or a camera, a landmark is expected within its range and field of view, if these are known, unless
 something nearer stands before it or a row fits it.
 """
