@@ -93,6 +93,18 @@ def test_silence_counts_less_where_a_landmark_may_be_hidden_until_it_is_none(why
     assert after.odds[0] < GONE
 
 
+def test_a_caller_that_did_not_call_tells_nothing_though_a_row_is_near():
+    mean = np.array([0.0, 0.0, 0.0, 4.0, 0.0, 0.0, 6.0])
+    there = mean, np.array([3]), np.array([-2, 5])
+    way = 4.0 + np.hypot(4.0, 6.0) - 6.0
+    heard = np.array([1]), np.array([1]), *(np.array([n]) for n in (way, 40.0, 0.0, 1.0))
+    known = with_new(nobody(2), [1], 0, 2)
+    for scan in range(3):
+        known = judged(known, heard, there, np.array([False]), scan)
+    after = judged(known, NONE, there, np.array([True]), 3)
+    assert after.odds[0] == known.odds[0]
+
+
 LIDAR = (5.0, 2.0)
 UNSEEN = row(label=-1, way=4.9, level=np.nan)
 

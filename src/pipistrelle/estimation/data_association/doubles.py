@@ -87,8 +87,9 @@ def doubles(
         Numbers of landmarks of which a pair must hold one, for a group to be grown from it.
     """
     best: tuple[float, list[list[int]]] = 0.0, []
+    prior = 2.0 * math.log(_density(joint, at))
     for number in asked.tolist():
-        groups = _groups(joint, at, apart, number)
+        groups = _groups(joint, at, apart, number, prior)
         if not groups:
             continue
         cost, group = min(groups)
@@ -110,12 +111,12 @@ def _groups(
     at: Int[np.ndarray, " l"],
     apart: Bool[np.ndarray, "l l"],
     number: int,
+    prior: float,
 ) -> list[tuple[float, list[list[int]]]]:
     """Return the cost and the pairs of each group that grows from a pair of one landmark."""
     mean, covariance, pairs = joint.mean, joint.covariance, np.empty((at.size, 2), np.int64)
-    firsts, groups = begun(mean, covariance, at, apart, number).tolist(), []
-    prior = 2.0 * math.log(_density(joint, at)) if firsts else 0.0
-    for first in firsts:
+    groups = []
+    for first in begun(mean, covariance, at, apart, number).tolist():
         cost, size = grown(mean, covariance, at, apart, tuple(first), prior, pairs)
         groups.append((cost, pairs[:size].tolist()))
     return groups

@@ -90,20 +90,20 @@ def _with_new(
     columns: tuple[np.ndarray, ...], labels: Int[np.ndarray, " n"], scan: Whole, callers: Whole
 ) -> tuple[np.ndarray, ...]:
     """Return the columns of known landmarks with new ones."""
-    known, new = Known(*columns), np.ones(labels.size, np.int64)
+    known, none = Known(*columns), np.zeros(labels.size, np.int64)
     old, size = known.label.size, known.label.size + labels.size
     source, together = np.full((size, callers), np.nan), np.zeros((size, size), np.uint8)
     source[:old, : known.source.shape[1]] = known.source
     together[:old, :old] = known.together
     return (
         np.append(known.label, labels),
-        np.append(known.born, scan * new),
-        np.append(known.heard, scan * new),
-        np.append(known.count, 0 * new),
-        np.append(known.odds, -HEARD * new),
-        np.append(known.confirmed, new < 0),
+        np.append(known.born, none + scan),
+        np.append(known.heard, none + scan),
+        np.append(known.count, none),
+        np.append(known.odds, np.full(labels.size, -HEARD)),
+        np.append(known.confirmed, np.zeros(labels.size, np.bool_)),
         source,
-        np.append(known.aim, np.nan * new),
+        np.append(known.aim, np.full(labels.size, np.nan)),
         together,
     )
 
@@ -276,9 +276,9 @@ def _missed(
             other = 0.0 if math.isnan(way[m]) else factor * way[m]
             if abs(other - ahead) < TOGETHER:
                 hidden = True
-    if hidden:
-        return HIDDEN
-    return 1.0 if called else 0.0
+    if not called:
+        return 0.0
+    return HIDDEN if hidden else 1.0
 
 
 @no_alloc
