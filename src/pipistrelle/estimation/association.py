@@ -9,8 +9,8 @@ What a row ought to be, were it of a landmark, and how surely, the belief's join
 (`expected`): of several rows at once, since all share the error of the pose.
 """
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from typing import Any, Protocol, TypeVar
 
 import numpy as np
@@ -47,6 +47,9 @@ class Assignment:
     again: Any = None
     """News about earlier scans, or None: all scans that the session remembers are associated again
     with memories that have it (`informed`)."""
+    earlier: Mapping[int, Scan] = field(default_factory=dict)
+    """Earlier scans, by their numbers from 0, with other labels or stated otherwise: the session
+    hears again those that it remembers, and all since, before it corrects by this one."""
 
 
 class Association(Protocol[M]):

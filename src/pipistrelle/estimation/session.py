@@ -251,6 +251,8 @@ class Session(Generic[B]):
         """Correct the belief with a scan, as an association labels it."""
         if assignment.remove:
             self._take_back(assignment.remove)
+        if assignment.earlier:
+            self._state_again(assignment.earlier)
         heard = _Heard(
             number=self._first + len(self.labels),
             legs=self._legs,
@@ -287,25 +289,40 @@ class Session(Generic[B]):
         rows = [how_many_among(one.label, named) for one in past]
         callers = [how_many_among(one.scan.callers, named) for one in past]
         heard = [n for n in range(len(past)) if rows[n] or callers[n]]
-        first = heard[0] if heard else len(past)
-        before = past[first].belief if heard else self.belief
         self._dropped.update(labels)
         for n in heard:
             past[n] = _without(past[n], named)
-        if len(heard) == 1 and not _held(before, labels) and rows[first] == len(labels):
-            # What was heard once has told nothing of anything else.
+        once = sum(rows) == len(labels) and len(heard) == 1
+        if heard and not (once and not _held(past[heard[0]].belief, labels)):
+            self._go_again(past, heard[0])
+        else:  # What was heard once has told nothing of anything else.
             self.belief = edited(self.belief, remove=_held(self.belief, labels))
-            self.labels[past[first].number - self._first] = past[first].label
-        else:
-            self.belief = edited(before, remove=_held(before, [*self._dropped]))
-            for n in range(first, len(past)):
-                if n > first:
-                    self._go(past[n].legs)
-                past[n] = self._as_held(past[n])
-                self._use(past[n])
-            if heard:
-                self._go(self._legs)
+            for n in heard:
+                self.labels[past[n].number - self._first] = past[n].label
         self._past = deque(past, maxlen=REMEMBERED)
+
+    def _state_again(self, earlier: Mapping[int, Scan]) -> None:
+        """Hear scans that are remembered as an association states them now."""
+        past = [*self._past]
+        changed = [n for n, one in enumerate(past) if one.number in earlier]
+        if not changed:
+            return
+        for n in changed:
+            scan = earlier[past[n].number]
+            past[n] = replace(past[n], scan=scan, label=scan.landmark)
+        self._go_again(past, changed[0])
+        self._past = deque(past, maxlen=REMEMBERED)
+
+    def _go_again(self, past: list[_Heard], first: int) -> None:
+        """Go back to before one of the scans that are remembered, and hear what came since."""
+        before = past[first].belief
+        self.belief = edited(before, remove=_held(before, [*self._dropped]))
+        for n in range(first, len(past)):
+            if n > first:
+                self._go(past[n].legs)
+            past[n] = self._as_held(past[n])
+            self._use(past[n])
+        self._go(self._legs)
 
     def _as_held(self, heard: _Heard) -> _Heard:
         """Return a scan to be heard after the present belief; what that lacks is not merged."""

@@ -5,7 +5,13 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
+import numpy as np
+from jaxtyping import Int
+
+from pipistrelle.detection.scans import Scan
+from pipistrelle.estimation.beliefs import Gaussian
 from pipistrelle.estimation.data_association.existence import Known, nobody
+from pipistrelle.estimation.data_association.rows import ScanRows
 from pipistrelle.estimation.data_association.tracks import Tracks
 
 
@@ -43,6 +49,19 @@ class Caller:
     """Number of the scan in which it was placed."""
 
 
+class EarlyScan(NamedTuple):
+    """A scan at whose end no landmark was known."""
+
+    number: int
+    scan: Scan
+    """As it was stated, and labelled."""
+    rows: ScanRows
+    direct: Int[np.ndarray, " c"]
+    """Row of each caller's direct call, or -1."""
+    pose: Gaussian
+    """Of the vehicle, before the scan."""
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Memory:
     """What the association remembers."""
@@ -53,3 +72,5 @@ class Memory:
     known: Known = field(default_factory=lambda: nobody(1))
     callers: Mapping[int, Caller] = field(default_factory=dict)
     """By number."""
+    early: tuple[EarlyScan, ...] = ()
+    """To be labelled by the map."""

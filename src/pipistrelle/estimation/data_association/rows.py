@@ -25,8 +25,8 @@ from pipistrelle.detection.scans import (
     Scan,
 )
 from pipistrelle.estimation.association import is_among
-from pipistrelle.estimation.data_association.matching import NOTHING
-from pipistrelle.estimation.data_association.pairs import UNPLACED, pair_costs
+from pipistrelle.estimation.data_association.matching import NOTHING, Innovate
+from pipistrelle.estimation.data_association.pairs import UNPLACED, pair_costs, pair_innovations
 from pipistrelle.geometry import wrap_angle
 from pipistrelle.jit import Flag, Whole, kernel, no_alloc
 
@@ -157,7 +157,7 @@ def compared(
     used = np.flatnonzero(heard.caller == number)
     used = used[used != direct]
     there, usable = 3 + 2 * np.arange(landmark.size), heard.usable
-    costs = pair_costs(_part(heard, used, 0.0), mean, covariance, there, at, chances)
+    costs = pair_costs(part_of(heard, used, 0.0), mean, covariance, there, at, chances)
     for n in np.flatnonzero(is_among(landmark, moving)):
         costs[:, n] = math.inf
     if at != UNPLACED:
@@ -177,6 +177,18 @@ def compared(
     return used[:size], costs[:size], close[:size]
 
 
+def innovations_of(
+    rows: tuple[np.ndarray, ...], used: Int[np.ndarray, " r"], joint: Joint, at: int
+) -> Innovate:
+    """Return how pairs of some rows and the landmarks give their innovations together.
+
+    ``at``: where the caller of the rows stands in the mean.
+    """
+    (landmark, mean, covariance), part = joint, part_of(ScanRows(*rows), used, 0.0)
+    there = 3 + 2 * np.arange(landmark.size)
+    return lambda row, of: pair_innovations(part, mean, covariance, there, at, (row, of))
+
+
 @kernel
 def bearing_fits(
     rows: tuple[np.ndarray, ...],
@@ -186,13 +198,13 @@ def bearing_fits(
     chances: tuple[float, float, float, float],
 ) -> bool:
     """Tell whether the bearing of a row may be of the landmark that stands at a place."""
-    (_, mean, covariance), part = joint, _part(ScanRows(*rows), np.full(1, row), 0.0)
+    (_, mean, covariance), part = joint, part_of(ScanRows(*rows), np.full(1, row), 0.0)
     costs = pair_costs(part, mean, covariance, np.full(1, at), UNPLACED, chances)
     return math.isfinite(costs[0, 0])
 
 
 @kernel
-def _part(heard: ScanRows, rows: Int[np.ndarray, " r"], spread: float) -> tuple[np.ndarray, ...]:
+def part_of(heard: ScanRows, rows: Int[np.ndarray, " r"], spread: float) -> tuple[np.ndarray, ...]:
     """Return columns of some rows (`pairs.Rows`); ``spread``: more deviation of the way."""
     way_std = heard.way_std[rows]
     for k in range(rows.size):
@@ -233,7 +245,7 @@ def settled(
         if confirmed[n] not in label:
             silent[n] = place_of(confirmed[n], landmark)
     stray, gated = stray[:size], (OVERLAP_GATE, chances[1], chances[2], chances[3])
-    overlapping = _part(heard, stray, OVERLAP_STD / (2.0 if number == OWN else 1.0))
+    overlapping = part_of(heard, stray, OVERLAP_STD / (2.0 if number == OWN else 1.0))
     costs = pair_costs(overlapping, mean, covariance, silent[silent >= 0], at, gated)
     size = 0
     for k in range(stray.size):

@@ -17,7 +17,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 
 from pipistrelle.detection.scans import (
     OWN,
@@ -28,12 +28,17 @@ from pipistrelle.detection.scans import (
     with_callers,
 )
 from pipistrelle.estimation.association import Assignment, is_among
-from pipistrelle.estimation.beliefs import Belief, JointGaussian
+from pipistrelle.estimation.beliefs import Belief, Gaussian, JointGaussian
 from pipistrelle.estimation.data_association.caller_search import (
     find_caller,
     find_moving_caller,
 )
 from pipistrelle.estimation.data_association.doubles import asked_of, doubles
+from pipistrelle.estimation.data_association.early_scans import (
+    MOST,
+    SETTLED,
+    labelled_by_map,
+)
 from pipistrelle.estimation.data_association.existence import (
     GONE,
     Known,
@@ -42,20 +47,21 @@ from pipistrelle.estimation.data_association.existence import (
     some,
     with_new,
 )
-from pipistrelle.estimation.data_association.matching import Innovations, Match
-from pipistrelle.estimation.data_association.memory import Caller, CallerPlace, Memory
+from pipistrelle.estimation.data_association.matching import Match
+from pipistrelle.estimation.data_association.memory import Caller, CallerPlace, EarlyScan, Memory
 from pipistrelle.estimation.data_association.pairs import (
     OWN_CALL,
     UNPLACED,
     Rows,
     pair_costs,
-    pair_innovations,
     with_point,
 )
 from pipistrelle.estimation.data_association.rows import (
     Joint,
     bearing_fits,
     compared,
+    innovations_of,
+    part_of,
     place_of,
     places_of,
     rows_of_scan,
@@ -217,7 +223,7 @@ class _Work:
             chances,
             2.0 * self.stage.limits.bearing_std,
         )
-        found = self.stage.match(costs, lambda row, of: self._innovations(used, at, (row, of)))
+        found = self.stage.match(costs, innovations_of(rows, used, self._joint(), at))
         matched = used, found, near
         confirmed = known.label[known.confirmed]
         begun, count = settled(self.label, rows, self._joint(), confirmed, matched, caller, chances)
@@ -255,8 +261,9 @@ class _Work:
     def finished(self) -> tuple[Memory, Assignment]:
         """Return the memory after the scan, and the assignment."""
         memory, scan, (known, at) = self.memory, self.scan, self._judged()
-        gone = {*known.label[known.odds < GONE].tolist(), *self._lost(known)}
-        remove, merge = (), ()
+        lost = self._lost(known)
+        gone = {*known.label[known.odds < GONE].tolist(), *lost}
+        remove, merge, earlier = (), (), {}
         if gone:
             left = np.array([*gone])
             known = some(known, ~is_among(known.label, left))
@@ -268,16 +275,45 @@ class _Work:
             merge = self._doubles(known, at)
         for kept, other in merge:
             self.label[self.label == other] = kept
+        if self.numbers is not scan.numbers:
+            scan = replace(scan, numbers=self.numbers)
+        if scan.direct.size:
+            scan = with_callers(scan, self.named)
+        early = () if lost else self._early(scan)
+        if early and memory.scan >= early[-1].number + SETTLED and not (gone or merge):
+            early, earlier = (), self._labelled_by_map(early, known)
         after = Memory(
             scan=memory.scan + 1,
             labels=self.labels,
             known=merged(known, merge),
             callers=self.callers,
+            early=early,
         )
-        if self.numbers is not scan.numbers:
-            scan = replace(scan, numbers=self.numbers)
-        stated = with_callers(scan, self.named) if scan.direct.size else None
-        return after, Assignment(label=self.label, remove=remove, merge=merge, scan=stated)
+        return after, Assignment(
+            label=self.label, remove=remove, merge=merge, scan=scan, earlier=earlier
+        )
+
+    def _early(self, scan: Scan) -> tuple[EarlyScan, ...]:
+        """Return the scans from before there was a map, this one among them if it is one."""
+        early = self.memory.early
+        if self.new or self.memory.known.label.size or len(early) == MOST:
+            return early
+        scan = replace(scan, landmark=self.label)
+        pose = Gaussian(mean=self.pose, covariance=self.joint.covariance[:3, :3])
+        return *early, EarlyScan(self.memory.scan, scan, self.rows, self.scan.direct, pose)
+
+    def _labelled_by_map(self, early: tuple[EarlyScan, ...], known: Known) -> dict[int, Scan]:
+        """Return early scans with labels, by their numbers; none before a caller is on the map."""
+        joint, stage, callers = self.joint, self.stage, [*self.callers.items()]
+        places = {number: self._where(caller.label) for number, caller in callers}
+        places = {n: UNPLACED if n in self.moves else at for n, at in places.items() if at >= 0}
+        stand = [caller.label for number, caller in callers if number not in self.moves]
+        sure = np.array([*known.label[known.confirmed].tolist(), *stand], np.int64)
+        return {
+            one.number: labelled_by_map(one, joint, sure, places, stage.match, stage.chances)
+            for one in early
+            if places
+        }
 
     def _judged(self) -> tuple[Known, Int[np.ndarray, " l"]]:
         """Return all landmarks, new ones too, after what was heard of them and what was not.
@@ -320,20 +356,9 @@ class _Work:
         """Return what kernels take of the joint Gaussian."""
         return self.joint.landmark, self.joint.mean, self.joint.covariance
 
-    def _some(self, rows: np.ndarray) -> Rows:
+    def _some(self, rows: Bool[np.ndarray, " m"]) -> Rows:
         """Return some rows."""
-        return Rows(*(column[rows] for column in self.rows[1:6]))
-
-    def _innovations(
-        self,
-        rows: Int[np.ndarray, " r"],
-        caller: int,
-        pairs: tuple[Int[np.ndarray, " p"], Int[np.ndarray, " p"]],
-    ) -> Innovations:
-        """Return the innovations of pairs of these rows and landmarks."""
-        mean, covariance = self.joint.mean, self.joint.covariance
-        there, columns = 3 + 2 * np.arange(self.joint.landmark.size), tuple(self._some(rows))
-        return pair_innovations(columns, mean, covariance, there, caller, pairs)
+        return Rows(*part_of(self.rows, np.flatnonzero(rows), 0.0))
 
     def _tell(self, number: int, caller: Caller) -> None:
         """State the place of a caller that was found as a range of its direct call."""

@@ -35,7 +35,7 @@ def turned(joint: JointGaussian, at: int, bearing: float, costs: Costs) -> Joint
     ``at``: where the caller stands in the mean; ``bearing``: of its direct call.
     """
     mean, spread = joint.mean, np.diag(joint.covariance)[at : at + 2].sum()
-    least, fitting = _fit(costs(mean))
+    least, fitting = fit(costs(mean))
     if fitting.size < LEAST_ROWS or fitting.mean() >= FEW:
         return joint
     towards, least, best = mean[2] + bearing, least - BETTER, mean
@@ -45,13 +45,13 @@ def turned(joint: JointGaussian, at: int, bearing: float, costs: Costs) -> Joint
         for angle in towards + BEARINGS:
             other = mean.copy()
             other[at : at + 2] = seen_from(mean[:3], far, angle)
-            cost, _ = _fit(costs(other))
+            cost, _ = fit(costs(other))
             if cost < least:
                 best, least = other, cost
     return replace(joint, mean=best)
 
 
-def _fit(costs: Float[np.ndarray, "r n"]) -> tuple[float, Bool[np.ndarray, " r"]]:
+def fit(costs: Float[np.ndarray, "r n"]) -> tuple[float, Bool[np.ndarray, " r"]]:
     """Return what rows cost together, each as clutter at most, and which are none."""
     least = costs.min(axis=1, initial=0.0)
     return float(least.sum()), least < 0.0

@@ -1,0 +1,110 @@
+"""Scans from before there was a map, labelled by the map that came of them.
+
+Excess paths say where landmarks are once their caller is on the map, and that it is from the scan
+after the one in which its range is stated. A vehicle that calls itself begins landmarks with its
+first scan. One that only listens has none until then, but at the start it knows its heading best,
+and what it heard there says how the map lies. So these rows are held against the map when that has
+settled, and map and vehicle are turned against each other as all rows fit best. A bearing alone
+places no landmark: it is given the range that the map has for it, so unsurely that little is said
+twice.
+"""
+
+import math
+from collections.abc import Mapping
+from dataclasses import replace
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from pipistrelle.detection.scans import RANGE, RANGE_STD, UNLABELLED, Scan
+from pipistrelle.estimation.association import is_among
+from pipistrelle.estimation.beliefs import JointGaussian
+from pipistrelle.estimation.data_association.matching import NOTHING, Match
+from pipistrelle.estimation.data_association.memory import EarlyScan
+from pipistrelle.estimation.data_association.pairs import UNPLACED, pair_costs, pair_innovations
+from pipistrelle.estimation.data_association.rows import part_of
+from pipistrelle.estimation.data_association.turns import fit
+
+MOST, SETTLED = 16, 12
+"""How many early scans are remembered, and after how many more the map is taken to have settled."""
+TURNS = np.linspace(-3.5, 3.5, 141)
+"""Turns that are tried, in standard deviations."""
+APART, CLEARER = 0.04, 10.0
+"""All turns that are so far from the best [rad] must cost so much more."""
+RANGE_SHARE = 0.2
+"""Deviation of a range that is taken from the map, as a share of it."""
+
+
+def labelled_by_map(
+    early: EarlyScan,
+    joint: JointGaussian,
+    sure: Int[np.ndarray, " s"],
+    callers: Mapping[int, int],
+    match: Match,
+    chances: tuple[float, float, float, float],
+) -> Scan:
+    """Return an early scan with labels, by a map that is known now.
+
+    In place of the pose of ``joint`` comes that of the early scan, as if the errors of map and
+    pose had nothing in common. ``sure``: labels of landmarks that are some; ``callers``: where
+    callers stand in the mean, by number, or UNPLACED of those that were elsewhere.
+    """
+    mean, covariance = joint.mean.copy(), joint.covariance.copy()
+    mean[:3], covariance[:3], covariance[:, :3] = early.pose.mean, 0.0, 0.0
+    covariance[:3, :3] = early.pose.covariance
+    kept = np.flatnonzero(is_among(joint.landmark, sure))
+    there, names = 3 + 2 * kept, np.append(joint.landmark[kept], UNLABELLED)
+    label, numbers = early.scan.landmark.copy(), early.scan.numbers.copy()
+    for number, place in callers.items():
+        direct = int(early.direct[number]) if number < early.direct.size else -1
+        at, rows = place if direct >= 0 else UNPLACED, early.rows
+        heard = rows.usable if at == UNPLACED else rows.with_way
+        used = np.flatnonzero(heard & (rows.caller == number))
+        used = used[used != direct]
+        found = _matched(part_of(rows, used, 0.0), (mean, covariance), there, at, match, chances)
+        label[used] = names[found]
+        if at == UNPLACED:
+            used, i = used[found != NOTHING], there[found[found != NOTHING]]
+            far = np.hypot(mean[i] - mean[0], mean[i + 1] - mean[1])
+            numbers[RANGE, used], numbers[RANGE_STD, used] = far, RANGE_SHARE * far
+    return replace(early.scan, landmark=label, numbers=numbers)
+
+
+def _matched(
+    rows: tuple[np.ndarray, ...],
+    gaussian: tuple[Float[np.ndarray, " d"], Float[np.ndarray, "d d"]],
+    there: Int[np.ndarray, " n"],
+    at: int,
+    match: Match,
+    chances: tuple[float, float, float, float],
+) -> Int[np.ndarray, " r"]:
+    """Return which landmark each row is of, NOTHING of all if they fit at more than one turn."""
+    (mean, spread, variance), covariance = _turn(*gaussian, there)
+    turns = math.sqrt(variance) * TURNS
+    means = [mean + spread * (turn / variance) for turn in turns]
+    costs = [pair_costs(rows, mean, covariance, there, at, chances) for mean in means]
+    total = np.array([fit(cost)[0] for cost in costs]) + TURNS * TURNS
+    best = int(total.argmin())
+    others = total[np.abs(turns - turns[best]) > APART]
+    if others.min(initial=0.0) < total[best] + CLEARER:
+        return np.full(rows[0].size, NOTHING)
+    return match(
+        costs[best],
+        lambda row, of: pair_innovations(rows, means[best], covariance, there, at, (row, of)),
+    )
+
+
+def _turn(
+    mean: Float[np.ndarray, " d"],
+    covariance: Float[np.ndarray, "d d"],
+    there: Int[np.ndarray, " n"],
+) -> tuple[tuple, Float[np.ndarray, "d d"]]:
+    """Return mean, covariance with the mean of all bearings, and its variance; and what is left."""
+    dx, dy = mean[there] - mean[0], mean[there + 1] - mean[1]
+    squared = there.size * (dx * dx + dy * dy)
+    slope = np.zeros(mean.size)
+    slope[there], slope[there + 1] = -dy / squared, dx / squared
+    slope[:3] = -slope[there].sum(), -slope[there + 1].sum(), -1.0
+    spread = covariance @ slope
+    variance = float(slope @ spread)
+    return (mean, spread, variance), covariance - np.outer(spread, spread) / variance
