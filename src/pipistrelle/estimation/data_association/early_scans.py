@@ -1,12 +1,20 @@
-"""Scans from before there was a map, labelled by the map that came of them.
+r"""Scans from before there was a map, labelled by the map that came of them.
 
 Excess paths say where landmarks are once their caller is on the map, and that it is from the scan
-after the one in which its range is stated. A vehicle that calls itself begins landmarks with its
-first scan. One that only listens has none until then, but at the start it knows its heading best,
-and what it heard there says how the map lies. So these rows are held against the map when that has
-settled, and map and vehicle are turned against each other as all rows fit best. A bearing alone
-places no landmark: it is given the range that the map has for it, so unsurely that little is said
-twice.
+after the one in which its range is stated. Until then a vehicle that only listens has no landmark,
+and one whose beam is narrow has few; but at the start the heading is known best, and what was heard
+there says how the map lies. So these rows are held against the map when that has settled. Before,
+map and vehicle are turned against each other as all rows fit best (`_turn`): their headings are
+off by more than bearings are. A bearing alone places no landmark: with it comes the range that the
+map has for it, stated so unsurely that little is said twice.
+
+**The turn.** With the mean bearing of all landmarks :math:`\beta = a^T x` of the variance
+:math:`a^T P a`, a turn by :math:`\delta` moves the mean to
+
+.. math:: x + \frac{P a}{a^T P a}\, \delta, \qquad
+          P - \frac{P a a^T P}{a^T P a}
+
+being the covariance of what is left.
 """
 
 import math
@@ -25,6 +33,8 @@ from pipistrelle.estimation.data_association.pairs import UNPLACED, pair_costs, 
 from pipistrelle.estimation.data_association.rows import part_of
 from pipistrelle.estimation.data_association.turns import fit
 
+FEW = 3
+"""A scan is early if fewer landmarks are known at its end, and no caller was on the map before."""
 MOST, SETTLED = 16, 12
 """How many early scans are remembered, and after how many more the map is taken to have settled."""
 TURNS = np.linspace(-3.5, 3.5, 141)
@@ -79,10 +89,10 @@ def _matched(
     chances: tuple[float, float, float, float],
 ) -> Int[np.ndarray, " r"]:
     """Return which landmark each row is of, NOTHING of all if they fit at more than one turn."""
-    (mean, spread, variance), covariance = _turn(*gaussian, there)
+    (mean, _), (spread, variance, left) = gaussian, _turn(*gaussian, there)
     turns = math.sqrt(variance) * TURNS
     means = [mean + spread * (turn / variance) for turn in turns]
-    costs = [pair_costs(rows, mean, covariance, there, at, chances) for mean in means]
+    costs = [pair_costs(rows, turned, left, there, at, chances) for turned in means]
     total = np.array([fit(cost)[0] for cost in costs]) + TURNS * TURNS
     best = int(total.argmin())
     others = total[np.abs(turns - turns[best]) > APART]
@@ -90,7 +100,7 @@ def _matched(
         return np.full(rows[0].size, NOTHING)
     return match(
         costs[best],
-        lambda row, of: pair_innovations(rows, means[best], covariance, there, at, (row, of)),
+        lambda row, of: pair_innovations(rows, means[best], left, there, at, (row, of)),
     )
 
 
@@ -98,8 +108,8 @@ def _turn(
     mean: Float[np.ndarray, " d"],
     covariance: Float[np.ndarray, "d d"],
     there: Int[np.ndarray, " n"],
-) -> tuple[tuple, Float[np.ndarray, "d d"]]:
-    """Return mean, covariance with the mean of all bearings, and its variance; and what is left."""
+) -> tuple[Float[np.ndarray, " d"], float, Float[np.ndarray, "d d"]]:
+    """Return P a, a^T P a, and the covariance without the turn."""
     dx, dy = mean[there] - mean[0], mean[there + 1] - mean[1]
     squared = there.size * (dx * dx + dy * dy)
     slope = np.zeros(mean.size)
@@ -107,4 +117,4 @@ def _turn(
     slope[:3] = -slope[there].sum(), -slope[there + 1].sum(), -1.0
     spread = covariance @ slope
     variance = float(slope @ spread)
-    return (mean, spread, variance), covariance - np.outer(spread, spread) / variance
+    return spread, variance, covariance - np.outer(spread, spread) / variance

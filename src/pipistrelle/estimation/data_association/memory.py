@@ -50,7 +50,7 @@ class Caller:
 
 
 class EarlyScan(NamedTuple):
-    """A scan at whose end no landmark was known."""
+    """A scan from before there was a map (`early_scans`)."""
 
     number: int
     scan: Scan

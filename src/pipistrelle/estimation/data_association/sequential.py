@@ -35,6 +35,7 @@ from pipistrelle.estimation.data_association.caller_search import (
 )
 from pipistrelle.estimation.data_association.doubles import asked_of, doubles
 from pipistrelle.estimation.data_association.early_scans import (
+    FEW,
     MOST,
     SETTLED,
     labelled_by_map,
@@ -295,12 +296,14 @@ class _Work:
 
     def _early(self, scan: Scan) -> tuple[EarlyScan, ...]:
         """Return the scans from before there was a map, this one among them if it is one."""
-        early = self.memory.early
-        if self.new or self.memory.known.label.size or len(early) == MOST:
+        early, number = self.memory.early, self.memory.scan
+        placed = any(caller.told and caller.since < number for caller in self.callers.values())
+        landmarks = self.memory.known.label.size + len(self.new)
+        if placed or landmarks >= FEW or len(early) == MOST:
             return early
         scan = replace(scan, landmark=self.label)
         pose = Gaussian(mean=self.pose, covariance=self.joint.covariance[:3, :3])
-        return *early, EarlyScan(self.memory.scan, scan, self.rows, self.scan.direct, pose)
+        return *early, EarlyScan(number, scan, self.rows, self.scan.direct, pose)
 
     def _labelled_by_map(self, early: tuple[EarlyScan, ...], known: Known) -> dict[int, Scan]:
         """Return early scans with labels, by their numbers; none before a caller is on the map."""
