@@ -1,12 +1,12 @@
 """A session goes back: landmarks that were none leave no trace, and scans are associated again."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 import pytest
 
 from pipistrelle.config import Config, InputError
-from pipistrelle.detection.scans import UNLABELLED, make_scan
+from pipistrelle.detection.scans import RANGE, UNLABELLED, make_scan
 from pipistrelle.estimation.association import Assignment
 from pipistrelle.estimation.beliefs import Gaussian
 from pipistrelle.estimation.catalogue import CATALOGUE, entry
@@ -26,6 +26,7 @@ class Script:
     remove: dict = field(default_factory=dict)
     merge: dict = field(default_factory=dict)
     again: dict = field(default_factory=dict)
+    earlier: dict = field(default_factory=dict)
 
     def start(self):
         return 0
@@ -34,7 +35,7 @@ class Script:
         label = np.array(self.labels.get(number, [1, 2, 3])[: scan.landmark.size])
         return number + 1, Assignment(
             label=label, remove=self.remove.get(number, ()), merge=self.merge.get(number, ()),
-            again=self.again.get(number),
+            again=self.again.get(number), earlier=self.earlier.get(number, {}),
         )  # fmt: skip
 
 
@@ -112,6 +113,27 @@ def test_the_joint_gaussian_has_the_pose_and_the_map_of_the_belief(name):
     assert np.linalg.eigvalsh(joint.covariance).min() > -1e-12
     error = joint.mean[3:].reshape(-1, 2) - PLACES[joint.landmark - 1]
     assert np.abs(error).max() < 0.5
+
+
+@pytest.mark.parametrize("name", ["ekf", "iekf", "smoother"])
+def test_a_scan_that_is_stated_otherwise_later_is_heard_as_if_it_had_been_so_at_once(name):
+    heard = driven(name, Script({})).state().past[1].came
+    stated = replace(
+        heard, landmark=np.array([1, 2, UNLABELLED]), numbers=heard.numbers + np.zeros((8, 1))
+    )
+    stated.numbers[RANGE, 0] += 0.03
+    first = {1: [1, UNLABELLED, UNLABELLED]}
+    late = driven(name, Script(first, earlier={GONE_AT: {1: stated, -40: stated}}))
+    at_once = driven(name, Script(first, earlier={2: {1: stated}}))
+    assert late.labels[1].tolist() == [1, 2, UNLABELLED]
+    plain = driven(name, Script(first))
+    assert np.abs(plain.belief.pose().mean - late.belief.pose().mean).max() > 1e-5
+    for one, other in (
+        (late.belief.pose(), at_once.belief.pose()),
+        (late.belief.landmarks(), at_once.belief.landmarks()),
+    ):
+        np.testing.assert_allclose(one.mean, other.mean, atol=1e-7)
+        np.testing.assert_allclose(one.covariance, other.covariance, atol=1e-8)
 
 
 class Informed(Script):

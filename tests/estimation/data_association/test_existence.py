@@ -17,7 +17,7 @@ from pipistrelle.estimation.data_association.existence import (
 
 NONE = (*(np.empty(0, np.int64),) * 2, *(np.empty(0),) * 4)
 AHEAD = np.array([0.0, 0.0, 0.0, 4.0, 0.0])
-THERE = (AHEAD, np.array([3]), np.array([-2]))
+THERE = (AHEAD, np.array([3]), np.array([-2]), np.array([False]))
 
 
 def row(label=1, way=4.0, level=40.0, bearing=0.0, surety=1.0):
@@ -64,7 +64,7 @@ def test_a_landmark_that_should_have_been_heard_and_was_not_is_given_up():
     [
         ("too far to be loud", NONE, (np.array([0, 0, 0, 20.0, 0]), *THERE[1:])),
         ("the call went elsewhere", NONE, (np.array([0, 0, 0, 0.0, 4.0]), *THERE[1:])),
-        ("it is not on the map", NONE, (AHEAD, np.array([-1]), np.array([-2]))),
+        ("it is not on the map", NONE, (AHEAD, np.array([-1]), *THERE[2:])),
     ],
 )  # fmt: skip
 def test_nothing_is_expected_where(why, rows, there):
@@ -95,7 +95,7 @@ def test_silence_counts_less_where_a_landmark_may_be_hidden_until_it_is_none(why
 
 def test_a_caller_that_did_not_call_tells_nothing_though_a_row_is_near():
     mean = np.array([0.0, 0.0, 0.0, 4.0, 0.0, 0.0, 6.0])
-    there = mean, np.array([3]), np.array([-2, 5])
+    there = mean, np.array([3]), np.array([-2, 5]), np.zeros(2, bool)
     way = 4.0 + np.hypot(4.0, 6.0) - 6.0
     heard = np.array([1]), np.array([1]), *(np.array([n]) for n in (way, 40.0, 0.0, 1.0))
     known = with_new(nobody(2), [1], 0, 2)
@@ -103,6 +103,21 @@ def test_a_caller_that_did_not_call_tells_nothing_though_a_row_is_near():
         known = judged(known, heard, there, np.array([False]), scan)
     after = judged(known, NONE, there, np.array([True]), 3)
     assert after.odds[0] == known.odds[0]
+
+
+@pytest.mark.parametrize(("moves", "missed"), [(False, True), (True, False)])
+def test_a_landmark_is_not_missed_when_its_only_caller_has_moved_too_far_away(moves, missed):
+    mean = np.array([0.0, 0.0, 0.0, 4.0, 0.0, 4.0, 2.0])
+    there = mean, np.array([3]), np.array([-2, 5]), np.array([False, moves])
+    way = 4.0 + 2.0 - np.hypot(4.0, 2.0)
+    heard = np.array([1]), np.array([1]), *(np.array([n]) for n in (way, 40.0, 0.0, 1.0))
+    known = with_new(nobody(2), [1], 0, 2)
+    for scan in range(3):
+        known = judged(known, heard, there, np.array([False]), scan)
+    mean[5:] = 4.0, 60.0  # 20 log10(30) = 30 dB fainter: below what is expected to be heard
+    called = np.array([-1]), np.array([1]), *(np.array([n]) for n in (0.0, 40.0, 1.5, 1.0))
+    after = judged(known, called, there, np.array([False]), 3)
+    assert bool(after.odds[0] < known.odds[0]) is missed
 
 
 LIDAR = (5.0, 2.0)
@@ -145,7 +160,7 @@ def test_a_sensor_without_levels_misses_nothing_where(why, rows, where, sight, n
 
 def test_what_is_not_yet_one_is_none_after_a_long_silence():
     known = heard_so_often(1)
-    nowhere = (AHEAD, np.array([-1]), np.array([-2]))
+    nowhere = (AHEAD, np.array([-1]), *THERE[2:])
     for scan in range(1, PATIENCE + 2):
         known = judged(known, NONE, nowhere, np.array([False]), scan)
     assert known.odds[0] < GONE

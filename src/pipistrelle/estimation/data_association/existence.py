@@ -45,6 +45,8 @@ AIMED = 0.1
 WITHIN, BEFORE = 0.9, 0.05
 """Without levels a landmark is expected within this share of the sensor's range, so far inside its
 field of view, and where no nearer row is within such a bearing of it [rad]."""
+NEAR = 0.3
+"""Sound spreads from so far on [m]."""
 FORGETTING = 0.2
 """Share of the newest level in the mean."""
 OFTEN = 255
@@ -63,7 +65,8 @@ class Known(NamedTuple):
     odds: Float[np.ndarray, " l"]
     confirmed: Bool[np.ndarray, " l"]
     source: Float[np.ndarray, "l c"]
-    """Level that it would have at 1 m, by caller [dB], or NaN."""
+    """Level that it would have at 1 m, by caller [dB], or NaN; of one that moves: at 1 m from the
+    caller, too."""
     aim: Float[np.ndarray, " l"]
     """Bearing at which the vehicle's own call was last heard of it [rad]."""
     together: UInt8[np.ndarray, "l l"]
@@ -141,8 +144,11 @@ Heard = tuple[
 """Label, caller, range or excess path, level, bearing and surety (from 0 to 1) of each row."""
 Sight = tuple[float, float]
 """Range [m] and field of view [rad] of a sensor that tells no levels; a range of 0: not known."""
-Place = tuple[Float[np.ndarray, " d"], Int[np.ndarray, " l"], Int[np.ndarray, " c"]]
-"""Joint mean, where each known landmark stands in it, and each caller; -1: nowhere."""
+Place = tuple[
+    Float[np.ndarray, " d"], Int[np.ndarray, " l"], Int[np.ndarray, " c"], Bool[np.ndarray, " c"]
+]
+"""Joint mean, where each known landmark stands in it, and each caller (-1: nowhere), and whether
+the caller moves."""
 
 
 def judged(
@@ -180,7 +186,7 @@ def _judge(
     sight: Sight,
 ) -> None:
     """Write odds, counts and levels after a scan."""
-    known, (mean, at, callers) = Known(*columns), there
+    known, (mean, at, callers, _) = Known(*columns), there
     label, caller, _, level, _, surety = rows
     place = np.full(label.size, -1)
     for n in range(known.label.size):
@@ -194,7 +200,8 @@ def _judge(
             rise, place[m] = max(rise, HEARD * surety[m]), n
             if math.isnan(far) or math.isnan(level[m]):
                 continue
-            source, before = level[m] + _spreading(caller[m], far), known.source[n, caller[m]]
+            lost = _spreading(caller[m], far, at[n], there)
+            source, before = level[m] + lost, known.source[n, caller[m]]
             mean_source = before + FORGETTING * (source - before)
             known.source[n, caller[m]] = source if math.isnan(before) else mean_source
             if caller[m] == OWN:
@@ -231,9 +238,19 @@ def _count_together(
 
 
 @no_alloc
-def _spreading(caller: Whole, far: float) -> float:
-    """Return what a level loses on the way from a landmark, there and back of the own call [dB]."""
-    return (40.0 if caller == OWN else 20.0) * math.log10(max(far, 0.3))
+def _spreading(caller: Whole, far: float, i: Whole, place: Place) -> float:
+    """Return what a level loses by the way of an echo from the landmark that stands at i [dB].
+
+    That is there and back of the vehicle's own call, and from the landmark of another caller's, but
+    of one that moves the way to the landmark, too.
+    """
+    loss = (40.0 if caller == OWN else 20.0) * math.log10(max(far, NEAR))
+    mean, _, callers, moves = place
+    if moves[caller] and callers[caller] >= 0:
+        j = callers[caller]
+        there = math.hypot(mean[i] - mean[j], mean[i + 1] - mean[j + 1])
+        loss += 20.0 * math.log10(max(there, NEAR))
+    return loss
 
 
 @no_alloc
@@ -249,13 +266,13 @@ def _missed(
     sight: Sight,
 ) -> float:
     """Return how surely a caller's call should have been heard of a landmark: 1, `HIDDEN` or 0."""
-    (_, caller, way, level, _, _), (mean, at, callers) = rows, place
+    (_, caller, way, level, _, _), (mean, at, callers, _) = rows, place
     if math.isnan(far):
         return 0.0
     if math.isnan(known.source[n, c]):
         seen = c == OWN and not hidden and _in_sight(far, bearing, rows, sight)
         return 1.0 if seen else 0.0
-    loud = known.source[n, c] - _spreading(c, far)
+    loud = known.source[n, c] - _spreading(c, far, at[n], place)
     if loud < FAINTEST or (c == OWN and abs(wrap_angle(bearing - known.aim[n])) > AIMED):
         return 0.0
     ahead = far

@@ -326,12 +326,13 @@ class _Work:
         memory, scan, rows = self.memory, self.scan, self.rows
         size = max(1 + scan.caller.max(initial=0), scan.direct.size, memory.known.source.shape[1])
         known = with_new(memory.known, self.new, memory.scan, size)
-        callers = np.full(size, UNPLACED)
+        callers, moves = np.full(size, UNPLACED), np.zeros(size, np.bool_)
+        moves[[*self.moves]] = True
         for number, caller in self.callers.items():
             callers[number] = self._where(caller.label)
         heard = self.label, rows.caller, rows.way, rows.level_db, rows.bearing, rows.surety
         at, near = places_of(known.label, self.joint.landmark, self.near)
-        place = self.joint.mean, at, callers
+        place = self.joint.mean, at, callers, moves
         return judged(known, heard, place, near, memory.scan, self.stage.limits.sight), at
 
     def _doubles(self, known: Known, at: Int[np.ndarray, " l"]) -> tuple[tuple[int, int], ...]:
