@@ -9,7 +9,7 @@ none is removed, and its rows are taken back; what turns out to be on the map tw
 
 A caller is known by its direct call, and its place is found by the excess paths themselves
 (`caller_search`). Until then its rows are followed, and not used; then the session hears again all
-that it remembers.
+that it remembers. What came before there was a map is labelled by the map (`early_scans`).
 """
 
 import math
