@@ -119,13 +119,13 @@ def test_the_joint_gaussian_has_the_pose_and_the_map_of_the_belief(name):
 def test_a_scan_that_is_stated_otherwise_later_is_heard_as_if_it_had_been_so_at_once(name):
     heard = driven(name, Script({})).state().past[1].came
     stated = replace(
-        heard, landmark=np.array([1, 2, UNLABELLED]), numbers=heard.numbers + np.zeros((8, 1))
+        heard, landmark=np.array([7, 2, UNLABELLED]), numbers=heard.numbers + np.zeros((8, 1))
     )
     stated.numbers[RANGE, 0] += 0.03
     first = {1: [1, UNLABELLED, UNLABELLED]}
     late = driven(name, Script(first, earlier={GONE_AT: {1: stated, -40: stated}}))
     at_once = driven(name, Script(first, earlier={2: {1: stated}}))
-    assert late.labels[1].tolist() == [1, 2, UNLABELLED]
+    assert late.labels[1].tolist() == [1, 2, UNLABELLED], "a row that has a label keeps it"
     plain = driven(name, Script(first))
     assert np.abs(plain.belief.pose().mean - late.belief.pose().mean).max() > 1e-5
     for one, other in (

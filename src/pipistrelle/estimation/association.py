@@ -48,8 +48,9 @@ class Assignment:
     """News about earlier scans, or None: all scans that the session remembers are associated again
     with memories that have it (`informed`)."""
     earlier: Mapping[int, Scan] = field(default_factory=dict)
-    """Earlier scans, by their numbers from 0, with other labels or stated otherwise: the session
-    hears again those that it remembers, and all since, before it corrects by this one."""
+    """Earlier scans, by their numbers from 0, stated otherwise, or with labels for rows that had
+    none: the session hears again those that it remembers, and all since, before it corrects by
+    this one."""
 
 
 class Association(Protocol[M]):

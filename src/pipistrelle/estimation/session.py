@@ -308,8 +308,9 @@ class Session(Generic[B]):
         if not changed:
             return
         for n in changed:
-            scan = earlier[past[n].number]
-            past[n] = replace(past[n], scan=scan, label=scan.landmark)
+            scan, label = earlier[past[n].number], past[n].label
+            label = np.where(label == UNLABELLED, scan.landmark, label)
+            past[n] = replace(past[n], scan=scan, label=label)
         self._go_again(past, changed[0])
         self._past = deque(past, maxlen=REMEMBERED)
 

@@ -50,11 +50,9 @@ def early_scan(places, with_direct, rng):
     way = way if with_direct else np.full(len(off), np.nan)
     scan = make_scan(0.0, labels, bearing, caller=ones, excess_path=way, **stds)
     direct = np.array([-1, len(off) - 1 if with_direct else -1])
-    if with_direct:
-        labels[-1] = CALLER
     pose = Gaussian(mean=np.zeros(3), covariance=np.diag([1e-6, 1e-6, 1e-6]))
     rows = rows_of_scan(scan, (0.05, 0.35, 0.25), ())
-    return EarlyScan(0, replace(scan, landmark=labels), rows, direct, pose), 10 + order
+    return EarlyScan(0, scan, rows, direct, pose), 10 + order
 
 
 def labelled(early, joint, at, method="marginal"):
@@ -88,7 +86,7 @@ def test_with_its_direct_call_a_callers_rows_are_labelled_by_their_excess_paths(
     named = scan.landmark[:-1] != UNLABELLED
     assert np.mean(named) > 0.8
     assert (scan.landmark[:-1][named] == truth[named]).all()
-    assert scan.landmark[-1] == CALLER, "the direct call keeps its name"
+    assert scan.landmark[-1] == UNLABELLED, "the direct call has its name already"
     assert np.isnan(scan.numbers[RANGE]).all(), "excess paths place landmarks"
 
 
@@ -105,19 +103,18 @@ def test_a_map_that_fits_at_two_turns_labels_nothing():
     assert (labelled(early, joint, UNPLACED).landmark == UNLABELLED).all()
 
 
-def test_what_was_given_is_not_changed_and_a_label_that_was_given_stays():
+def test_what_was_given_is_not_changed_and_the_vehicles_own_rows_are_left_alone():
     joint, places = world(1, 0.1)
     early, _ = early_scan(places, False, np.random.default_rng(1))
-    own = replace(early.scan, landmark=early.scan.landmark.copy())
-    own.landmark[0], caller = 77, early.scan.caller.copy()
+    caller = early.scan.caller.copy()
     caller[0] = 0
-    early = early._replace(scan=own, rows=early.rows._replace(caller=caller))
-    mean, numbers = joint.mean.copy(), own.numbers.copy()
+    early = early._replace(rows=early.rows._replace(caller=caller))
+    mean, numbers = joint.mean.copy(), early.scan.numbers.copy()
     scan = labelled(early, joint, UNPLACED)
-    assert scan.landmark[0] == 77, "the vehicle's own call is labelled already"
+    assert scan.landmark[0] == UNLABELLED
     assert np.isnan(scan.range[0])
     np.testing.assert_array_equal(joint.mean, mean)
-    np.testing.assert_array_equal(own.numbers, numbers)
+    np.testing.assert_array_equal(early.scan.numbers, numbers)
 
 
 def test_a_turn_moves_the_mean_bearing_and_what_is_left_does_not():

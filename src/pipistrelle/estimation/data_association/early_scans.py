@@ -53,7 +53,7 @@ def labelled_by_map(
     match: Match,
     chances: tuple[float, float, float, float],
 ) -> Scan:
-    """Return an early scan with labels, by a map that is known now.
+    """Return an early scan, its callers' rows with labels by a map that is known now.
 
     In place of the pose of ``joint`` comes that of the early scan, as if the errors of map and
     pose had nothing in common. ``sure``: labels of landmarks that are some; ``callers``: where
@@ -64,7 +64,7 @@ def labelled_by_map(
     covariance[:3, :3] = early.pose.covariance
     kept = np.flatnonzero(is_among(joint.landmark, sure))
     there, names = 3 + 2 * kept, np.append(joint.landmark[kept], UNLABELLED)
-    label, numbers = early.scan.landmark.copy(), early.scan.numbers.copy()
+    label, numbers = np.full(early.scan.caller.size, UNLABELLED), early.scan.numbers.copy()
     for number, place in callers.items():
         direct = int(early.direct[number]) if number < early.direct.size else -1
         at, rows = place if direct >= 0 else UNPLACED, early.rows

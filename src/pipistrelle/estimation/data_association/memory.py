@@ -54,7 +54,7 @@ class EarlyScan(NamedTuple):
 
     number: int
     scan: Scan
-    """As it was stated, and labelled."""
+    """As it was stated."""
     rows: ScanRows
     direct: Int[np.ndarray, " c"]
     """Row of each caller's direct call, or -1."""

@@ -263,25 +263,18 @@ class _Work:
         """Return the memory after the scan, and the assignment."""
         memory, scan, (known, at) = self.memory, self.scan, self._judged()
         lost = self._lost(known)
-        gone = {*known.label[known.odds < GONE].tolist(), *lost}
-        remove, merge, earlier = (), (), {}
-        if gone:
-            left = np.array([*gone])
-            known = some(known, ~is_among(known.label, left))
-            for labels in (self.label, self.named):
-                labels[is_among(labels, left)] = UNLABELLED
-            before = {*memory.known.label.tolist(), *(c.label for c in memory.callers.values())}
-            remove = tuple(sorted(gone & before))
-        else:
-            merge = self._doubles(known, at)
+        gone = np.array([*{*known.label[known.odds < GONE].tolist(), *lost}], np.int64)
+        remove = self._unlabelled(gone)
+        known = some(known, ~is_among(known.label, gone)) if gone.size else known
+        merge = () if gone.size else self._doubles(known, at)
         for kept, other in merge:
             self.label[self.label == other] = kept
         if self.numbers is not scan.numbers:
             scan = replace(scan, numbers=self.numbers)
         if scan.direct.size:
             scan = with_callers(scan, self.named)
-        early = () if lost else self._early(scan)
-        if early and memory.scan >= early[-1].number + SETTLED and not (gone or merge):
+        early, earlier = () if lost else self._early(scan), {}
+        if early and memory.scan >= early[-1].number + SETTLED and not (gone.size or merge):
             early, earlier = (), self._labelled_by_map(early, known)
         after = Memory(
             scan=memory.scan + 1,
@@ -294,6 +287,13 @@ class _Work:
             label=self.label, remove=remove, merge=merge, scan=scan, earlier=earlier
         )
 
+    def _unlabelled(self, gone: Int[np.ndarray, " g"]) -> tuple[int, ...]:
+        """Take labels from rows and callers; return those that had been given before this scan."""
+        for labels in (self.label, self.named):
+            labels[is_among(labels, gone)] = UNLABELLED
+        callers = {caller.label for caller in self.memory.callers.values()}
+        return tuple(sorted({*gone.tolist()} & {*self.memory.known.label.tolist(), *callers}))
+
     def _early(self, scan: Scan) -> tuple[EarlyScan, ...]:
         """Return the scans from before there was a map, this one among them if it is one."""
         early, number = self.memory.early, self.memory.scan
@@ -301,7 +301,6 @@ class _Work:
         landmarks = self.memory.known.label.size + len(self.new)
         if placed or landmarks >= FEW or len(early) == MOST:
             return early
-        scan = replace(scan, landmark=self.label)
         pose = Gaussian(mean=self.pose, covariance=self.joint.covariance[:3, :3])
         return *early, EarlyScan(number, scan, self.rows, self.scan.direct, pose)
 
@@ -310,12 +309,13 @@ class _Work:
         joint, stage, callers = self.joint, self.stage, [*self.callers.items()]
         places = {number: self._where(caller.label) for number, caller in callers}
         places = {n: UNPLACED if n in self.moves else at for n, at in places.items() if at >= 0}
+        if not places:
+            return {}
         stand = [caller.label for number, caller in callers if number not in self.moves]
         sure = np.array([*known.label[known.confirmed].tolist(), *stand], np.int64)
         return {
             one.number: labelled_by_map(one, joint, sure, places, stage.match, stage.chances)
             for one in early
-            if places
         }
 
     def _judged(self) -> tuple[Known, Int[np.ndarray, " l"]]:
