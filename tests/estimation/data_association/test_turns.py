@@ -1,9 +1,17 @@
 """A caller that turns at once is found again on the map, and one that did not is left alone."""
 
+from dataclasses import replace
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 
+from pipistrelle.config import AssociationConfig, Config
+from pipistrelle.detection.scans import UNLABELLED, make_scan
 from pipistrelle.estimation.beliefs import JointGaussian
+from pipistrelle.estimation.data_association.existence import nobody, with_new
+from pipistrelle.estimation.data_association.memory import Caller, CallerPlace, Memory
+from pipistrelle.estimation.data_association.methods import association_of
 from pipistrelle.estimation.data_association.pairs import pair_costs
 from pipistrelle.estimation.data_association.turns import turned
 from pipistrelle.estimation.measurement import excess_path_slopes
@@ -41,3 +49,37 @@ def test_one_that_has_turned_is_where_its_rows_fit(caller):
 def test_one_that_is_where_it_was_expected_or_is_heard_little_of_is_left_there():
     assert tried(EXPECTED + 0.1).tolist() == EXPECTED.tolist()
     assert tried(np.array([7.0, 4.5]), heard=4).tolist() == EXPECTED.tolist()
+
+
+@pytest.mark.parametrize(("moves", "begun"), [(True, 0), (False, 20)])
+def test_what_is_heard_of_a_caller_that_is_not_where_it_was_expected_begins_no_landmark(
+    moves, begun
+):
+    """Its rows fit nowhere: of one that stands they would be of new landmarks."""
+    size, rng = len(PLACES), np.random.default_rng(5)
+    mean = np.concatenate([np.zeros(3), PLACES.ravel(), EXPECTED])
+    joint = JointGaussian(
+        landmark=np.arange(1, size + 2), mean=mean, covariance=1e-4 * np.eye(mean.size)
+    )
+    known = with_new(nobody(2), list(range(1, size + 1)), 0, 2)._replace(
+        confirmed=np.ones(size, bool)
+    )
+    caller = Caller(label=size + 1, place=CallerPlace(*EXPECTED), told=True)
+    memory = Memory(scan=5, labels=size + 1, known=known, callers={1: caller})
+    bearing = np.append(np.arange(-3.0, 3.0, 0.3), np.arctan2(EXPECTED[1], EXPECTED[0]))
+    heard = make_scan(
+        5.0,
+        np.full(size + 1, UNLABELLED),
+        bearing,
+        caller=np.ones(size + 1, int),
+        excess_path=np.append(rng.uniform(40.0, 60.0, size), 0.0),
+        bearing_std=0.01,
+        excess_path_std=0.02,
+        level_db=np.full(size + 1, 40.0),
+    )
+    moving = np.ones(1, int) if moves else np.empty(0, int)
+    scan = replace(heard, direct=np.array([-1, size]), moving=moving)
+    stage = association_of(Config(association=AssociationConfig(method="marginal")))
+    after, assignment = stage.associate(memory, SimpleNamespace(joint=lambda: joint), scan)
+    assert after.labels - memory.labels == begun
+    assert assignment.label[-1] == size + 1, "the direct call is the caller's"

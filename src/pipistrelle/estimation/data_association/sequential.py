@@ -69,7 +69,7 @@ from pipistrelle.estimation.data_association.rows import (
     settled,
 )
 from pipistrelle.estimation.data_association.tracks import Tracks, followed
-from pipistrelle.estimation.data_association.turns import turned
+from pipistrelle.estimation.data_association.turns import may_have_turned, turned
 
 FIRST_SEARCH, FIRST_SEARCH_MOVING = 8, 10
 """Scans of a caller that stands, and of one that moves, after which its place is searched for, at
@@ -229,6 +229,8 @@ class _Work:
         confirmed = known.label[known.confirmed]
         begun, count = settled(self.label, rows, self._joint(), confirmed, matched, caller, chances)
         self._judge_caller(number, count)
+        if number in self.moves and confirmed.size >= LEAST_ROWS and may_have_turned(*count):
+            return  # its rows are of landmarks of the map, but not from where it is expected
         for row in begun.tolist():
             self._bear(number, row)
 

@@ -29,6 +29,11 @@ Costs = Callable[[Float[np.ndarray, " d"]], Float[np.ndarray, "r n"]]
 """Costs of rows and landmarks (`pairs.pair_costs`) by the joint mean."""
 
 
+def may_have_turned(fitting: int, rows: int) -> bool:
+    """Tell whether too few of a caller's rows fit where it was expected."""
+    return rows >= LEAST_ROWS and fitting < FEW * rows
+
+
 def turned(joint: JointGaussian, at: int, bearing: float, costs: Costs) -> JointGaussian:
     """Return a joint Gaussian in which a caller is where its rows fit.
 
@@ -36,7 +41,7 @@ def turned(joint: JointGaussian, at: int, bearing: float, costs: Costs) -> Joint
     """
     mean, spread = joint.mean, np.diag(joint.covariance)[at : at + 2].sum()
     least, fitting = fit(costs(mean))
-    if fitting.size < LEAST_ROWS or fitting.mean() >= FEW:
+    if not may_have_turned(np.count_nonzero(fitting), fitting.size):
         return joint
     towards, least, best = mean[2] + bearing, least - BETTER, mean
     expected = math.hypot(*(mean[at : at + 2] - mean[:2]))
