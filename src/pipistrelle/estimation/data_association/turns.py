@@ -41,7 +41,7 @@ def turned(joint: JointGaussian, at: int, bearing: float, costs: Costs) -> Joint
     """
     mean, spread = joint.mean, np.diag(joint.covariance)[at : at + 2].sum()
     least, fitting = fit(costs(mean))
-    if not may_have_turned(np.count_nonzero(fitting), fitting.size):
+    if not may_have_turned(int(fitting.sum()), fitting.size):
         return joint
     towards, least, best = mean[2] + bearing, least - BETTER, mean
     expected = math.hypot(*(mean[at : at + 2] - mean[:2]))
