@@ -3,7 +3,8 @@
 pipistrelle study association -o STUDY
 python docs/association_tables.py STUDY [STUDY ...]
 
-Of several folders, each of some methods, the trials are taken together.
+Of several folders, each of some methods, the trials are taken together; a method is held against
+labels in the worlds that it has.
 """
 
 import sys
@@ -68,9 +69,10 @@ def print_table(trials, cell):
                 cells = []
                 for _, strategy, radius in COLUMNS:
                     same = strategy == "active" and not timing
-                    pair = (chosen(trials, strategy, radius, name, which, timing)
-                            for which in ("known", method))  # fmt: skip
-                    cells.append("as above" if same else cell(*pair))
+                    known, found = (chosen(trials, strategy, radius, name, which, timing)
+                                    for which in ("known", method))  # fmt: skip
+                    known = known.filter(pl.col("iteration").is_in(found["iteration"].to_list()))
+                    cells.append("as above" if same else cell(known, found))
                 first = "" if timing else "bearings alone, "
                 print(f"| {first}{words}, `{method}` | " + " | ".join(cells) + " |")
 
@@ -78,7 +80,8 @@ def print_table(trials, cell):
 def main(*studies):
     """Print both tables, and what a trial takes."""
     trials = trials_of(studies)
-    print(trials["iteration"].n_unique(), "worlds")
+    worlds = trials.group_by("association.method").agg(pl.col("iteration").n_unique())
+    print("worlds:", dict(sorted(worlds.iter_rows())))
     print_table(trials, error_cell)
     print_table(trials, score_cell)
     with_timing = trials.filter(pl.col("listening.timing").cast(pl.Float64) == 1.0)
