@@ -51,35 +51,47 @@ def test_one_that_is_where_it_was_expected_or_is_heard_little_of_is_left_there()
     assert tried(np.array([7.0, 4.5]), heard=4).tolist() == EXPECTED.tolist()
 
 
-@pytest.mark.parametrize(("moves", "begun"), [(True, 0), (False, 20)])
+@pytest.mark.parametrize(
+    ("moves", "hears_itself", "heard_before", "begun"),
+    [
+        (True, True, True, 0),
+        (False, True, True, 20),
+        (True, False, True, 20),
+        (True, True, False, 20),
+    ],
+)
 def test_what_is_heard_of_a_caller_that_is_not_where_it_was_expected_begins_no_landmark(
-    moves, begun
+    moves, hears_itself, heard_before, begun
 ):
-    """Its rows fit nowhere: of one that stands they would be of new landmarks."""
+    """Of one that stands they are new, and who only listens has nothing else to go by."""
     size, rng = len(PLACES), np.random.default_rng(5)
     mean = np.concatenate([np.zeros(3), PLACES.ravel(), EXPECTED])
     joint = JointGaussian(
         landmark=np.arange(1, size + 2), mean=mean, covariance=1e-4 * np.eye(mean.size)
     )
+    source = np.full((size, 2), 60.0 if heard_before else np.nan)
     known = with_new(nobody(2), list(range(1, size + 1)), 0, 2)._replace(
-        confirmed=np.ones(size, bool)
+        confirmed=np.ones(size, bool), source=source
     )
     caller = Caller(label=size + 1, place=CallerPlace(*EXPECTED), told=True)
     memory = Memory(scan=5, labels=size + 1, known=known, callers={1: caller})
     bearing = np.append(np.arange(-3.0, 3.0, 0.3), np.arctan2(EXPECTED[1], EXPECTED[0]))
     heard = make_scan(
         5.0,
-        np.full(size + 1, UNLABELLED),
-        bearing,
-        caller=np.ones(size + 1, int),
-        excess_path=np.append(rng.uniform(40.0, 60.0, size), 0.0),
+        np.full(size + 2, UNLABELLED),
+        np.append(bearing, np.arctan2(*PLACES[0, ::-1])),
+        range=np.append(np.full(size + 1, np.nan), np.hypot(*PLACES[0])),
+        caller=np.append(np.ones(size + 1, int), 0 if hears_itself else 1),
+        excess_path=np.append(rng.uniform(40.0, 60.0, size), [0.0, np.nan]),
         bearing_std=0.01,
+        range_std=0.02,
         excess_path_std=0.02,
-        level_db=np.full(size + 1, 40.0),
+        level_db=np.full(size + 2, 40.0),
     )
     moving = np.ones(1, int) if moves else np.empty(0, int)
     scan = replace(heard, direct=np.array([-1, size]), moving=moving)
     stage = association_of(Config(association=AssociationConfig(method="marginal")))
     after, assignment = stage.associate(memory, SimpleNamespace(joint=lambda: joint), scan)
     assert after.labels - memory.labels == begun
-    assert assignment.label[-1] == size + 1, "the direct call is the caller's"
+    assert assignment.label[size] == size + 1, "the direct call is the caller's"
+    assert assignment.label[-1] == (1 if hears_itself else UNLABELLED)

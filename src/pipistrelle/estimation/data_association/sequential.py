@@ -229,10 +229,20 @@ class _Work:
         confirmed = known.label[known.confirmed]
         begun, count = settled(self.label, rows, self._joint(), confirmed, matched, caller, chances)
         self._judge_caller(number, count)
-        if number in self.moves and confirmed.size >= LEAST_ROWS and may_have_turned(*count):
-            return  # its rows are of landmarks of the map, but not from where it is expected
+        if begun.size and number in self.moves and self._is_elsewhere(number, count):
+            return
         for row in begun.tolist():
             self._bear(number, row)
+
+    def _is_elsewhere(self, number: int, count: tuple[int, int]) -> bool:
+        """Tell whether a caller must be elsewhere than expected: few of its rows are of landmarks.
+
+        It was heard of as many before, and the vehicle hears of its own call where it is itself.
+        """
+        known, own = self.memory.known, self.label[self.scan.caller == OWN]
+        before = known.confirmed & ~np.isnan(known.source[:, number])
+        often = int(before.sum()) >= count[1]
+        return often and may_have_turned(*count) and bool((own != UNLABELLED).any())
 
     def _follow_turn(self, number: int, at: int) -> None:
         """Take a caller that moves for where its rows fit, if they do not where it was expected."""
