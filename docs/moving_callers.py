@@ -1,0 +1,78 @@
+"""Print the table of callers that move, in `association.md`, anew.
+
+    python docs/moving_callers.py [WORLDS]
+
+Worlds of a seed that no study uses, whose beacon goes in a circle or walks, are driven through with
+the settings of the study `association`, with labels and by `marginal`.
+"""
+
+import sys
+import tomllib
+
+import numpy as np
+
+import pipistrelle
+from pipistrelle.experiments.studies.plan_file import find_plan
+
+SEED, WORLDS = 6601, 16
+RADIUS = 0.0088
+"""Piston radius of a beam of 33 degrees [m]."""
+COURSES = {
+    "circle": {"course": "circle", "radius": 15.0, "speed": 0.75},
+    "walk": {"course": "walk"},
+}
+FILTERS = {"iekf": "invariant EKF", "smoother": "smoother"}
+LOST_M, LOST_TIMES = 0.25, 5.0
+"""A world is lost if its aligned error is above this and so many times that with labels."""
+NAMES = (
+    "position [m]", "aligned [mm]", "caller, aligned [m]", "rows right", "missed", "false", "twice",
+    "worlds lost",
+)  # fmt: skip
+
+
+def trials_of(course, worlds):
+    """Return the trials of worlds whose caller goes a course, one a row."""
+    plan = tomllib.loads(find_plan("association").read_text(encoding="utf-8"))
+    plan["config"] |= {"seed": SEED, "listening.timing": True, "emitter.radius": RADIUS}
+    plan["config"]["callers"] = [COURSES[course]]
+    plan |= {"strategies": ["fused", "passive"]}
+    plan["grid"] = {"association.method": ["known", "marginal"]}
+    return pipistrelle.study(plan, iterations=worlds).trials.sort("iteration").to_dicts()
+
+
+def cells(known, found):
+    """Return the cells of a row: with labels and without, then without."""
+
+    def of(trials, score):
+        return np.array([trial[score] for trial in trials], float)
+
+    raw = [np.sqrt(np.mean(of(one, "position_rmse_m") ** 2)) for one in (known, found)]
+    aligned = [of(one, "position_rmse_aligned_m") for one in (known, found)]
+    caller = [np.nanmean(of(one, "caller_rmse_aligned_m")) for one in (known, found)]
+    lost = np.count_nonzero((aligned[1] > LOST_M) & (aligned[1] > LOST_TIMES * aligned[0]))
+    yield " → ".join(f"{error:.2f}" for error in raw)
+    yield " → ".join(f"{1e3 * error.mean():.0f}" for error in aligned)
+    yield " → ".join(f"{error:.2f}" for error in caller)
+    yield f"{np.mean(of(found, 'associated_right')):.3f}"
+    for what in ("missed", "false", "twice"):
+        yield f"{np.mean(of(found, f'landmarks_{what}')):.1f}"
+    yield str(lost)
+
+
+def main(worlds=WORLDS):
+    """Print the table."""
+    print("| | " + " | ".join(NAMES) + " |\n|---" + "|--:" * len(NAMES) + "|")
+    for course in COURSES:
+        trials = trials_of(course, worlds)
+        for strategy in ("fused", "passive"):
+            for name, words in FILTERS.items():
+                here = [t for t in trials if (t["strategy"], t["filter"]) == (strategy, name)]
+                pair = (
+                    [t for t in here if t["association.method"] == method]
+                    for method in ("known", "marginal")
+                )
+                print(f"| {course}, {strategy}, {words} | " + " | ".join(cells(*pair)) + " |")
+
+
+if __name__ == "__main__":
+    main(*map(int, sys.argv[1:]))
