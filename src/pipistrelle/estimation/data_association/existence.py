@@ -32,6 +32,8 @@ MOST, CONFIRMED, GONE = 8.0, 3.0, -2.0
 LEAST_SCANS, PATIENCE = 3, 25
 """In how many scans it takes a landmark to be one; scans of silence after which a landmark that is
 not yet one is none."""
+LASTING = 12
+"""What was heard in so many scans is a landmark, though it may be gone: it is never taken back."""
 FAINTEST = 18.0
 """A landmark is expected from this level on [dB]."""
 HIDDEN = 0.2
@@ -216,7 +218,10 @@ def _judge(
                 here = _missed(known, n, c, far, bearing, rows, there, near[n], sight)
                 missed = max(missed, here)
             known.odds[n] -= MISSED * missed
-            if not known.confirmed[n] and scan - known.heard[n] > PATIENCE:
+            if known.count[n] >= LASTING:
+                if known.odds[n] < GONE:
+                    known.odds[n], known.confirmed[n] = GONE, False
+            elif not known.confirmed[n] and scan - known.heard[n] > PATIENCE:
                 known.odds[n] = -MOST
         if known.odds[n] >= CONFIRMED and known.count[n] >= LEAST_SCANS:
             known.confirmed[n] = True
