@@ -10,7 +10,7 @@ from pipistrelle.config import AssociationConfig, Config
 from pipistrelle.detection.scans import UNLABELLED, make_scan
 from pipistrelle.estimation.beliefs import Gaussian, JointGaussian, placed
 from pipistrelle.estimation.catalogue import entry
-from pipistrelle.estimation.data_association.existence import PATIENCE
+from pipistrelle.estimation.data_association.existence import LASTING, PATIENCE
 from pipistrelle.estimation.data_association.memory import Caller, CallerPlace, Memory
 from pipistrelle.estimation.data_association.methods import association_of
 from pipistrelle.estimation.data_association.sequential import PLACE_SHARE
@@ -109,6 +109,21 @@ def test_a_landmark_that_vanishes_is_removed_and_one_that_appears_is_born():
     for _ in range(4):
         session.hear(scan_of(np.vstack([PLACES, [[-3.0, -4.0]]])))
     assert len(session.landmarks().landmark) == 5
+
+
+@pytest.mark.parametrize("name", ["iekf", "smoother", "fastslam"])
+def test_what_was_heard_often_leaves_the_map_in_silence_and_is_the_same_when_heard_again(name):
+    session, there = session_of(name), np.vstack([PLACES, [[1.5, -2.5]]])
+    for _ in range(LASTING):
+        session.hear(scan_of(there))
+    for _ in range(2 * PATIENCE):
+        session.hear(scan_of(PLACES))
+    assert sorted(session.landmarks().landmark.tolist()) == [1, 2, 3, 4]
+    assert 5 in session.belief.labels(), "what it told of the way stays"
+    for _ in range(4):
+        session.hear(scan_of(there))
+    assert session.labels[-1].tolist() == [1, 2, 3, 4, 5]
+    assert sorted(session.landmarks().landmark.tolist()) == [1, 2, 3, 4, 5]
 
 
 def test_two_landmarks_within_a_call_of_each_other_are_told_apart_once_both_are_heard():

@@ -217,15 +217,21 @@ def _judge(
             for c in range(callers.size):
                 here = _missed(known, n, c, far, bearing, rows, there, near[n], sight)
                 missed = max(missed, here)
-            known.odds[n] -= MISSED * missed
-            if known.count[n] >= LASTING:
-                if known.odds[n] < GONE:
-                    known.odds[n], known.confirmed[n] = GONE, False
-            elif not known.confirmed[n] and scan - known.heard[n] > PATIENCE:
-                known.odds[n] = -MOST
+            _lower(known, n, MISSED * missed, scan)
         if known.odds[n] >= CONFIRMED and known.count[n] >= LEAST_SCANS:
             known.confirmed[n] = True
     _count_together(known.together, place, caller)
+
+
+@no_alloc
+def _lower(known: Known, n: Whole, fall: float, scan: Whole) -> None:
+    """Lower the odds of a landmark that was not heard."""
+    known.odds[n] -= fall
+    if known.count[n] >= LASTING:
+        if known.odds[n] < GONE:
+            known.odds[n], known.confirmed[n] = GONE, False
+    elif not known.confirmed[n] and scan - known.heard[n] > PATIENCE:
+        known.odds[n] = -MOST
 
 
 @no_alloc
