@@ -33,7 +33,8 @@ LEAST_SCANS, PATIENCE = 3, 25
 """In how many scans it takes a landmark to be one; scans of silence after which a landmark that is
 not yet one is none."""
 LASTING = 12
-"""What was heard in so many scans is a landmark, though it may be gone: it is never taken back."""
+"""What was heard in so many scans, of the vehicle's own call, too, is a landmark, though it may be
+gone: it is never taken back. Where one is by others' calls alone hangs on where these are."""
 FAINTEST = 18.0
 """A landmark is expected from this level on [dB]."""
 HIDDEN = 0.2
@@ -227,7 +228,7 @@ def _judge(
 def _lower(known: Known, n: Whole, fall: float, scan: Whole) -> None:
     """Lower the odds of a landmark that was not heard."""
     known.odds[n] -= fall
-    if known.count[n] >= LASTING:
+    if known.count[n] >= LASTING and not math.isnan(known.source[n, OWN]):
         if known.odds[n] < GONE:
             known.odds[n], known.confirmed[n] = GONE, False
     elif not known.confirmed[n] and scan - known.heard[n] > PATIENCE:
