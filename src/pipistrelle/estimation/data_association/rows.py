@@ -25,7 +25,7 @@ from pipistrelle.detection.scans import (
     Scan,
 )
 from pipistrelle.estimation.association import is_among
-from pipistrelle.estimation.data_association.matching import NOTHING, Innovate
+from pipistrelle.estimation.data_association.matching import NOTHING, Innovate, Innovations
 from pipistrelle.estimation.data_association.pairs import UNPLACED, pair_costs, pair_innovations
 from pipistrelle.geometry import wrap_angle
 from pipistrelle.jit import Flag, Whole, kernel, no_alloc
@@ -184,9 +184,13 @@ def innovations_of(
 
     ``at``: where the caller of the rows stands in the mean.
     """
-    (landmark, mean, covariance), part = joint, part_of(ScanRows(*rows), used, 0.0)
-    there = 3 + 2 * np.arange(landmark.size)
-    return lambda row, of: pair_innovations(part, mean, covariance, there, at, (row, of))
+
+    def innovate(row: Int[np.ndarray, " p"], of: Int[np.ndarray, " p"]) -> Innovations:
+        (landmark, mean, covariance), part = joint, part_of(ScanRows(*rows), used, 0.0)
+        there = 3 + 2 * np.arange(landmark.size)
+        return pair_innovations(part, mean, covariance, there, at, (row, of))
+
+    return innovate
 
 
 @kernel
