@@ -48,10 +48,15 @@ def error_cell(known, unlabelled):
     return f"{raw[0] / raw[1]:.2f} ({aligned[0] / aligned[1]:.2f})"
 
 
+def worlds_lost(labelled, error):
+    """Return how many worlds are lost, of aligned errors with labels and without."""
+    return np.count_nonzero((error > LOST_M) & (error > LOST_TIMES * labelled))
+
+
 def score_cell(known, unlabelled):
     """Return the share of rows that is right; landmarks missed, false, twice; and worlds lost."""
     error, labelled = (one["position_rmse_aligned_m"].to_numpy() for one in (unlabelled, known))
-    lost = np.count_nonzero((error > LOST_M) & (error > LOST_TIMES * labelled))
+    lost = worlds_lost(labelled, error)
     share = unlabelled["associated_right"].drop_nulls().mean()
     counts = [unlabelled[f"landmarks_{what}"].mean() for what in ("missed", "false", "twice")]
     right = "-" if share is None else f"{share:.3f}"

@@ -7,12 +7,12 @@ the settings of the study `association`, with labels and by `marginal`.
 """
 
 import sys
-import tomllib
 
 import numpy as np
+from association_tables import worlds_lost
+from false_echoes import planned
 
 import pipistrelle
-from pipistrelle.experiments.studies.plan_file import find_plan
 
 SEED, WORLDS = 6601, 16
 RADIUS = 0.0088
@@ -22,8 +22,6 @@ COURSES = {
     "walk": {"course": "walk"},
 }
 FILTERS = {"iekf": "invariant EKF", "smoother": "smoother"}
-LOST_M, LOST_TIMES = 0.25, 5.0
-"""A world is lost if its aligned error is above this and so many times that with labels."""
 NAMES = (
     "position [m]", "aligned [mm]", "caller, aligned [m]", "rows right", "missed", "false", "twice",
     "worlds lost",
@@ -32,11 +30,9 @@ NAMES = (
 
 def trials_of(course, worlds):
     """Return the trials of worlds whose caller goes a course, one a row."""
-    plan = tomllib.loads(find_plan("association").read_text(encoding="utf-8"))
-    plan["config"] |= {"seed": SEED, "listening.timing": True, "emitter.radius": RADIUS}
-    plan["config"]["callers"] = [COURSES[course]]
-    plan |= {"strategies": ["fused", "passive"]}
-    plan["grid"] = {"association.method": ["known", "marginal"]}
+    config = {"seed": SEED, "emitter.radius": RADIUS, "callers": [COURSES[course]]}
+    plan = planned({"association.method": ["known", "marginal"]}, **config)
+    plan |= {"strategies": ["fused", "passive"], "filters": [*FILTERS]}
     return pipistrelle.study(plan, iterations=worlds).trials.sort("iteration").to_dicts()
 
 
@@ -49,14 +45,13 @@ def cells(known, found):
     raw = [np.sqrt(np.mean(of(one, "position_rmse_m") ** 2)) for one in (known, found)]
     aligned = [of(one, "position_rmse_aligned_m") for one in (known, found)]
     caller = [np.nanmean(of(one, "caller_rmse_aligned_m")) for one in (known, found)]
-    lost = np.count_nonzero((aligned[1] > LOST_M) & (aligned[1] > LOST_TIMES * aligned[0]))
     yield " → ".join(f"{error:.2f}" for error in raw)
     yield " → ".join(f"{1e3 * error.mean():.0f}" for error in aligned)
     yield " → ".join(f"{error:.2f}" for error in caller)
     yield f"{np.mean(of(found, 'associated_right')):.3f}"
     for what in ("missed", "false", "twice"):
         yield f"{np.mean(of(found, f'landmarks_{what}')):.1f}"
-    yield str(lost)
+    yield str(worlds_lost(*aligned))
 
 
 def main(worlds=WORLDS):

@@ -45,6 +45,11 @@ RANGE_SHARE = 0.2
 """Deviation of a range that is taken from the map, as a share of it."""
 
 
+def direct_row(direct: Int[np.ndarray, " c"], number: int) -> int:
+    """Return the row of a caller's direct call, or -1, of the rows of all direct calls."""
+    return int(direct[number]) if number < direct.size else -1
+
+
 def labelled_by_map(
     early: EarlyScan,
     joint: JointGaussian,
@@ -66,7 +71,7 @@ def labelled_by_map(
     there, names = 3 + 2 * kept, np.append(joint.landmark[kept], UNLABELLED)
     label, numbers = np.full(early.scan.caller.size, UNLABELLED), early.scan.numbers.copy()
     for number, place in callers.items():
-        direct = int(early.direct[number]) if number < early.direct.size else -1
+        direct = direct_row(early.direct, number)
         at, rows = place if direct >= 0 else UNPLACED, early.rows
         heard = rows.usable if at == UNPLACED else rows.with_way
         used = np.flatnonzero(heard & (rows.caller == number))

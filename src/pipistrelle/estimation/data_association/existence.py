@@ -33,8 +33,9 @@ LEAST_SCANS, PATIENCE = 3, 25
 """In how many scans it takes a landmark to be one; scans of silence after which a landmark that is
 not yet one is none."""
 LASTING = 12
-"""What was heard in so many scans, of the vehicle's own call, too, is a landmark, though it may be
-gone: it is never taken back. Where one is by others' calls alone hangs on where these are."""
+"""A landmark that was heard in at least this many scans, and at least once by the vehicle's own
+call, is never removed, only unconfirmed. The place of one that was heard by other callers alone
+depends on where they are, so that it may be wrong."""
 FAINTEST = 18.0
 """A landmark is expected from this level on [dB]."""
 HIDDEN = 0.2

@@ -59,7 +59,7 @@ class EarlyScan(NamedTuple):
     direct: Int[np.ndarray, " c"]
     """Row of each caller's direct call, or -1."""
     pose: Gaussian
-    """Of the vehicle, before the scan."""
+    """The vehicle's pose as it was predicted before the scan corrected it."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

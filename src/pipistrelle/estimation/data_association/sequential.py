@@ -38,6 +38,7 @@ from pipistrelle.estimation.data_association.early_scans import (
     FEW,
     MOST,
     SETTLED,
+    direct_row,
     labelled_by_map,
 )
 from pipistrelle.estimation.data_association.existence import (
@@ -275,10 +276,12 @@ class _Work:
         """Return the memory after the scan, and the assignment."""
         memory, scan, (known, at) = self.memory, self.scan, self._judged()
         lost = self._lost(known)
-        gone = np.array([*{*known.label[known.odds < GONE].tolist(), *lost}], np.int64)
-        remove = self._unlabelled(gone)
-        known = some(known, ~is_among(known.label, gone)) if gone.size else known
-        merge = () if gone.size else self._doubles(known, at)
+        gone = {*known.label[known.odds < GONE].tolist(), *lost}
+        remove, merge = (), ()
+        if gone:
+            known, remove = self._without(known, gone)
+        else:
+            merge = self._doubles(known, at)
         for kept, other in merge:
             self.label[self.label == other] = kept
         if self.numbers is not scan.numbers:
@@ -286,7 +289,7 @@ class _Work:
         if scan.direct.size:
             scan = with_callers(scan, self.named)
         early, earlier = () if lost else self._early(scan), {}
-        if early and memory.scan >= early[-1].number + SETTLED and not (gone.size or merge):
+        if early and memory.scan >= early[-1].number + SETTLED and not (gone or merge):
             early, earlier = (), self._labelled_by_map(early, known)
         after = Memory(
             scan=memory.scan + 1,
@@ -299,12 +302,13 @@ class _Work:
             label=self.label, remove=remove, merge=merge, scan=scan, earlier=earlier
         )
 
-    def _unlabelled(self, gone: Int[np.ndarray, " g"]) -> tuple[int, ...]:
-        """Take labels from rows and callers; return those that had been given before this scan."""
+    def _without(self, known: Known, gone: set[int]) -> tuple[Known, tuple[int, ...]]:
+        """Take labels from rows and callers; return the others, and which of them are not new."""
+        memory, left = self.memory, np.array([*gone])
         for labels in (self.label, self.named):
-            labels[is_among(labels, gone)] = UNLABELLED
-        callers = {caller.label for caller in self.memory.callers.values()}
-        return tuple(sorted({*gone.tolist()} & {*self.memory.known.label.tolist(), *callers}))
+            labels[is_among(labels, left)] = UNLABELLED
+        before = {*memory.known.label.tolist(), *(c.label for c in memory.callers.values())}
+        return some(known, ~is_among(known.label, left)), tuple(sorted(gone & before))
 
     def _early(self, scan: Scan) -> tuple[EarlyScan, ...]:
         """Return the scans from before there was a map, this one among them if it is one."""
@@ -318,13 +322,16 @@ class _Work:
 
     def _labelled_by_map(self, early: tuple[EarlyScan, ...], known: Known) -> dict[int, Scan]:
         """Return early scans with labels, by their numbers; none before a caller is on the map."""
-        joint, stage, callers = self.joint, self.stage, [*self.callers.items()]
-        places = {number: self._where(caller.label) for number, caller in callers}
-        places = {n: UNPLACED if n in self.moves else at for n, at in places.items() if at >= 0}
+        joint, stage, places = self.joint, self.stage, {}
+        sure = known.label[known.confirmed].tolist()
+        for number, caller in self.callers.items():
+            if (at := self._where(caller.label)) >= 0:
+                moves = number in self.moves
+                places[number] = UNPLACED if moves else at
+                sure += [] if moves else [caller.label]
         if not places:
             return {}
-        stand = [caller.label for number, caller in callers if number not in self.moves]
-        sure = np.array([*known.label[known.confirmed].tolist(), *stand], np.int64)
+        sure = np.array(sure, np.int64)
         return {
             one.number: labelled_by_map(one, joint, sure, places, stage.match, stage.chances)
             for one in early
@@ -366,7 +373,7 @@ class _Work:
 
     def _direct(self, number: int) -> int:
         """Return the row of a caller's direct call, or -1."""
-        return int(self.scan.direct[number]) if number < self.scan.direct.size else -1
+        return direct_row(self.scan.direct, number)
 
     def _joint(self) -> Joint:
         """Return what kernels take of the joint Gaussian."""
