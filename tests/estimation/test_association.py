@@ -222,6 +222,15 @@ def test_a_merge_says_nothing_of_the_heading_to_the_invariant_error():
     assert after.covariance[2, 2] > far.covariance[2, 2] - belief.covariance[2, 2] - 1e-9
 
 
+@pytest.mark.parametrize("error", [LINEAR, INVARIANT])
+def test_landmarks_that_cannot_both_be_right_tell_nothing_of_the_rest_when_they_are_one(error):
+    _, belief = mapped(error)
+    merged, removed = belief.edited((), ((2, 7),)).joint(), belief.edited((7,), ()).joint()
+    assert merged.landmark.tolist() == removed.landmark.tolist() == [2, 4, 9]
+    np.testing.assert_array_equal(merged.mean, removed.mean)
+    np.testing.assert_array_equal(merged.covariance, removed.covariance)
+
+
 def test_of_a_ray_and_a_placed_landmark_the_placed_one_stays_and_of_two_rays_the_first():
     slam, belief = mapped(LINEAR)
     rays = make_scan(0.0, np.array([20, 21]), np.array([0.1, 0.9]), bearing_std=0.05)

@@ -271,11 +271,15 @@ class Session(Generic[B]):
             self._first += old
         return used
 
-    def _use(self, heard: _Heard) -> Scan:
-        """Correct the belief with a scan that an association has labelled."""
+    def _use(self, heard: _Heard, since: int = 0) -> Scan:
+        """Correct the belief with a scan that an association has labelled.
+
+        ``since``: from which scan on its merging has not changed labels yet.
+        """
         self.labels[heard.number - self._first :] = [heard.label]
         for kept, gone in heard.merge:
-            self.labels = [np.where(label == gone, kept, label) for label in self.labels]
+            labels = self.labels[since:]
+            self.labels[since:] = [np.where(label == gone, kept, label) for label in labels]
         self.belief = edited(self.belief, merge=heard.merge)
         scan = self._noise.hidden(heard.came, heard.scan) if self._noise else heard.scan
         merged = labelled(scan, heard.label)
@@ -318,11 +322,12 @@ class Session(Generic[B]):
         """Go back to before one of the scans that are remembered, and hear what came since."""
         before = past[first].belief
         self.belief = edited(before, remove=_held(before, [*self._dropped]))
+        since = past[first].number - self._first
         for n in range(first, len(past)):
             if n > first:
                 self._go(past[n].legs)
             past[n] = self._as_held(past[n])
-            self._use(past[n])
+            self._use(past[n], since)
         self._go(self._legs)
 
     def _as_held(self, heard: _Heard) -> _Heard:

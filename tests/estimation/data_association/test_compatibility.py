@@ -1,5 +1,6 @@
 """Joint compatibility against a search through all sets, and innovations against a slow version."""
 
+from functools import partial
 from itertools import product
 
 import numpy as np
@@ -38,12 +39,7 @@ def drawn(seed, rows=5, landmarks=5, heading_std=0.15):
 def costs_and_innovations(joint, columns):
     at = 3 + 2 * np.arange(joint.landmark.size)
     costs = pair_costs(columns, joint.mean, joint.covariance, at, OWN_CALL, CHANCES)
-
-    def innovate(row, landmark):
-        pairs = row, landmark
-        return pair_innovations(columns, joint.mean, joint.covariance, at, OWN_CALL, pairs)
-
-    return costs, innovate
+    return costs, partial(pair_innovations, columns, joint.mean, joint.covariance, at, OWN_CALL)
 
 
 def best_of_all(costs, innovate):
@@ -55,7 +51,7 @@ def best_of_all(costs, innovate):
         landmark = np.array(labels)[row]
         if not row.size or len({*landmark.tolist()}) < row.size:
             continue
-        nu, S, numbers = innovate(row, landmark)
+        nu, S, numbers = innovate((row, landmark))
         squared = float(nu @ np.linalg.solve(S, nu))
         if squared <= gates(numbers.sum())[-1] and (row.size, -squared) > best[:2]:
             best = row.size, -squared, np.array(labels)
@@ -74,7 +70,7 @@ def test_innovations_are_those_of_the_slow_version(seed):
     joint, columns = drawn(seed)
     row, landmark = np.array([0, 1, 3]), np.array([2, 0, 4])
     _, innovate = costs_and_innovations(joint, columns)
-    nu, S, numbers = innovate(row, landmark)
+    nu, S, numbers = innovate((row, landmark))
     bearing, bearing_std, way, way_std, _ = columns
     scan = make_scan(0.0, np.full(bearing.size, -1), bearing, range=way,
                      bearing_std=bearing_std[0], range_std=way_std[0])  # fmt: skip

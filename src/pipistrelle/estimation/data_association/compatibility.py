@@ -56,7 +56,7 @@ def jointly_compatible(
     order = np.lexsort((costs[row, landmark], row))
     row, landmark = row[order], landmark[order]
     options = np.append(np.flatnonzero(np.diff(row, prepend=-1)), row.size)
-    pairs = _search(options, landmark, innovate(row, landmark), gates(2 * (options.size - 1)))
+    pairs = _search(options, landmark, innovate((row, landmark)), gates(2 * (options.size - 1)))
     found[row[pairs]] = landmark[pairs]
     return found
 

@@ -20,6 +20,7 @@ being the covariance of what is left.
 import math
 from collections.abc import Mapping
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -103,10 +104,7 @@ def _matched(
     others = total[np.abs(turns - turns[best]) > APART]
     if others.min(initial=0.0) < total[best] + CLEARER:
         return np.full(rows[0].size, NOTHING)
-    return match(
-        costs[best],
-        lambda row, of: pair_innovations(rows, means[best], left, there, at, (row, of)),
-    )
+    return match(costs[best], partial(pair_innovations, rows, means[best], left, there, at))
 
 
 def _turn(

@@ -25,8 +25,8 @@ NOTHING = -1
 """A row of no landmark."""
 Innovations = tuple[Float[np.ndarray, " e"], Float[np.ndarray, "e e"], Int[np.ndarray, " p"]]
 """Of pairs, two numbers each: their innovation, its covariance, and how many of the two count."""
-Innovate = Callable[[Int[np.ndarray, " p"], Int[np.ndarray, " p"]], Innovations]
-"""From rows and landmarks of pairs to their innovations together."""
+Innovate = Callable[[tuple[Int[np.ndarray, " p"], Int[np.ndarray, " p"]]], Innovations]
+"""From rows and landmarks of pairs to their innovations together (`pairs.pair_innovations`)."""
 Match = Callable[[Float[np.ndarray, "m n"], Innovate | None], Int[np.ndarray, " m"]]
 """From costs of rows and landmarks to the landmark of each row, or NOTHING."""
 LIKELY, SURE = 0.9, 0.99

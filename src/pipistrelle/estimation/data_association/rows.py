@@ -25,8 +25,8 @@ from pipistrelle.detection.scans import (
     Scan,
 )
 from pipistrelle.estimation.association import is_among
-from pipistrelle.estimation.data_association.matching import NOTHING, Innovate, Innovations
-from pipistrelle.estimation.data_association.pairs import UNPLACED, pair_costs, pair_innovations
+from pipistrelle.estimation.data_association.matching import NOTHING
+from pipistrelle.estimation.data_association.pairs import UNPLACED, pair_costs
 from pipistrelle.geometry import wrap_angle
 from pipistrelle.jit import Flag, Whole, kernel, no_alloc
 
@@ -175,22 +175,6 @@ def compared(
         if usable[m]:
             size += 1
     return used[:size], costs[:size], close[:size]
-
-
-def innovations_of(
-    rows: tuple[np.ndarray, ...], used: Int[np.ndarray, " r"], joint: Joint, at: int
-) -> Innovate:
-    """Return how pairs of some rows and the landmarks give their innovations together.
-
-    ``at``: where the caller of the rows stands in the mean.
-    """
-
-    def innovate(row: Int[np.ndarray, " p"], of: Int[np.ndarray, " p"]) -> Innovations:
-        (landmark, mean, covariance), part = joint, part_of(ScanRows(*rows), used, 0.0)
-        there = 3 + 2 * np.arange(landmark.size)
-        return pair_innovations(part, mean, covariance, there, at, (row, of))
-
-    return innovate
 
 
 @kernel

@@ -15,6 +15,7 @@ that it remembers. What came before there was a map is labelled by the map (`ear
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -56,13 +57,13 @@ from pipistrelle.estimation.data_association.pairs import (
     UNPLACED,
     Rows,
     pair_costs,
+    pair_innovations,
     with_point,
 )
 from pipistrelle.estimation.data_association.rows import (
     Joint,
     bearing_fits,
     compared,
-    innovations_of,
     part_of,
     place_of,
     places_of,
@@ -216,19 +217,13 @@ class _Work:
         if number in self.moves and at >= 0:
             self._follow_turn(number, at)
         rows, chances, known = tuple(self.rows), self.stage.chances, self.memory.known
-        used, costs, near = compared(
-            rows,
-            self._joint(),
-            self.moving,
-            self.near,
-            caller,
-            chances,
-            2.0 * self.stage.limits.bearing_std,
-        )
-        found = self.stage.match(costs, innovations_of(rows, used, self._joint(), at))
-        matched = used, found, near
+        joint, telling = self._joint(), 2.0 * self.stage.limits.bearing_std
+        used, costs, near = compared(rows, joint, self.moving, self.near, caller, chances, telling)
+        part, there = part_of(self.rows, used, 0.0), 3 + 2 * np.arange(costs.shape[1])
+        innovate = partial(pair_innovations, part, *joint[1:], there, at)
+        matched = used, self.stage.match(costs, innovate), near
         confirmed = known.label[known.confirmed]
-        begun, count = settled(self.label, rows, self._joint(), confirmed, matched, caller, chances)
+        begun, count = settled(self.label, rows, joint, confirmed, matched, caller, chances)
         self._judge_caller(number, count)
         if begun.size and number in self.moves and self._is_elsewhere(number, count):
             return

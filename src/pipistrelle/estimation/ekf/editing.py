@@ -8,6 +8,8 @@ to `MERGED_STD`. With :math:`H = (\dots, I, \dots, -I, \dots)` and S = H P H^T +
 
 and then the second is dropped. The invariant error has the same H: that d is 0 is true of the map
 however it is turned, so it says nothing of the heading, and the mean moves by the exponential.
+Where d is beyond what S admits (`FARTHEST`), wrong rows have placed one of the two: their
+difference then tells nothing of the rest, and the second is dropped alone.
 """
 
 import math
@@ -18,10 +20,12 @@ from jaxtyping import Bool, Float, Int
 from pipistrelle.config import InputError
 from pipistrelle.estimation.ekf.caller_motion import is_standing, velocity_of
 from pipistrelle.estimation.ekf.gaussian import LINEAR, retract
-from pipistrelle.jit import kernel
+from pipistrelle.jit import Whole, kernel
 
 MERGED_STD = 1e-3
 """Standard deviation of the difference of two landmarks that are one, along each axis [m]."""
+FARTHEST = 100.0
+"""Largest squared distance of two that are one to be a measurement."""
 
 State = tuple[
     Float[np.ndarray, " d"],
@@ -49,10 +53,28 @@ def is_placed(landmark: Int[np.ndarray, " h"]) -> Bool[np.ndarray, " h"]:
 
 def removed(state: State, label: int) -> State:
     """Return a state without the members of a landmark, and without its velocity if it moves."""
-    mean, covariance, landmark, weight = state
-    gone = (landmark == _present(landmark, label)) | (landmark == velocity_of(label))
-    kept = np.concatenate((np.ones(3, bool), np.repeat(~gone, 2)))
-    return mean[kept], covariance[np.ix_(kept, kept)], landmark[~gone], weight[~gone]
+    return _left(*state, _present(state[2], label))
+
+
+@kernel
+def _left(
+    mean: Float[np.ndarray, " d"],
+    covariance: Float[np.ndarray, "d d"],
+    landmark: Int[np.ndarray, " h"],
+    weight: Float[np.ndarray, " h"],
+    label: Whole,
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Return what is left of a state without a landmark."""
+    kept = np.flatnonzero((landmark != label) & (landmark != velocity_of(label)))
+    left, P = np.empty(3 + 2 * kept.size), np.empty((3 + 2 * kept.size, 3 + 2 * kept.size))
+    at = np.arange(left.size)
+    for n in range(kept.size):
+        at[3 + 2 * n], at[4 + 2 * n] = 3 + 2 * kept[n], 4 + 2 * kept[n]
+    for i in range(at.size):
+        left[i] = mean[at[i]]
+        for j in range(at.size):
+            P[i, j] = covariance[at[i], at[j]]
+    return left, P, landmark[kept], weight[kept]
 
 
 def merged(state: State, kept: int, gone: int, error: float) -> State:
@@ -70,31 +92,38 @@ def merged(state: State, kept: int, gone: int, error: float) -> State:
         )
     placed = is_placed(landmark)
     if placed[first].all() and placed[second].all():
-        state = _equated(state, 3 + 2 * first.argmax(), 3 + 2 * second.argmax(), error)
+        k, g = 3 + 2 * int(first.argmax()), 3 + 2 * int(second.argmax())
+        state = *_equated(*state[:2], k, g, error), *state[2:]
     elif placed[second].all():
         mean, covariance, landmark, weight = removed(state, kept)
         return mean, covariance, np.where(landmark == gone, kept, landmark), weight
     return removed(state, gone)
 
 
-def _equated(state: State, k: int, g: int, error: float) -> State:
-    """Correct a state by the measurement that the points at two indices are one."""
-    mean, P, landmark, weight = state
-    size, d = mean.size, mean[k : k + 2] - mean[g : g + 2]
-    PH = P[:, k : k + 2] - P[:, g : g + 2]
-    S = PH[k : k + 2] - PH[g : g + 2] + MERGED_STD**2 * np.eye(2)
-    a, b = math.sqrt(S[0, 0]), S[1, 0] / math.sqrt(S[0, 0])
-    c = math.sqrt(S[1, 1] - b * b)
-    w0 = PH[:, 0] / a
-    w1 = (PH[:, 1] - b * w0) / c
-    e0 = -d[0] / a
-    e1 = (-d[1] - b * e0) / c
-    mean = mean.copy()
+@kernel
+def _equated(
+    mean: Float[np.ndarray, " d"], P: Float[np.ndarray, "d d"], k: Whole, g: Whole, error: float
+) -> tuple[Float[np.ndarray, " d"], Float[np.ndarray, "d d"]]:
+    """Correct mean and covariance by the measurement that the points at two indices are one."""
+    w0, w1 = P[:, k] - P[:, g], P[:, k + 1] - P[:, g + 1]
+    a = math.sqrt(w0[k] - w0[g] + MERGED_STD * MERGED_STD)
+    b = (w0[k + 1] - w0[g + 1]) / a
+    c = math.sqrt(w1[k + 1] - w1[g + 1] + MERGED_STD * MERGED_STD - b * b)
+    e0 = -(mean[k] - mean[g]) / a
+    e1 = (-(mean[k + 1] - mean[g + 1]) - b * e0) / c
+    moved, left = mean.copy(), P.copy()
+    if e0 * e0 + e1 * e1 > FARTHEST:
+        return moved, left
+    w0 = w0 / a
+    w1 = (w1 - b * w0) / c
     if error == LINEAR:
-        mean += e0 * w0 + e1 * w1
+        moved += e0 * w0 + e1 * w1
     else:
-        retract(mean, size, w0, e0, w1, e1)
-    return mean, P - np.outer(w0, w0) - np.outer(w1, w1), landmark, weight
+        retract(moved, mean.size, w0, e0, w1, e1)
+    for i in range(mean.size):
+        for j in range(mean.size):
+            left[i, j] = P[i, j] - w0[i] * w0[j] - w1[i] * w1[j]
+    return moved, left
 
 
 def _present(landmark: Int[np.ndarray, " h"], label: int) -> int:
