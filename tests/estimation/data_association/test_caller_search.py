@@ -40,7 +40,7 @@ def heard(seed, *, scans=12, landmarks=20, turn_std=0.0, clutter=0, caller=lambd
         size = bearing.size
         rows = Rows(
             bearing + rng.normal(0.0, 0.01, size), np.full(size, 0.01),
-            way + rng.normal(0.0, 0.03, size), np.full(size, 0.03), np.full(size, 20.0),
+            way + rng.normal(0.0, 0.03, size), np.full(size, 0.03), np.ones(size),
         )  # fmt: skip
         towards = math.atan2(*(there - pose[:2])[::-1]) - pose[2]
         believed = pose + np.array([0.0, 0.0, lost])
@@ -111,7 +111,7 @@ def test_a_vehicle_that_stands_still_finds_no_caller():
     for k in range(12):
         rows = Rows(
             bearing + rng.normal(0.0, 0.01, 15), np.full(15, 0.01),
-            way + rng.normal(0.0, 0.03, 15), np.full(15, 0.03), np.full(15, 20.0),
+            way + rng.normal(0.0, 0.03, 15), np.full(15, 0.03), np.ones(15),
         )  # fmt: skip
         tracks = followed(tracks, 0.5 * k, np.zeros(3), 0.5, rows)
     for found in (find_caller(tracks), find_moving_caller(tracks)):

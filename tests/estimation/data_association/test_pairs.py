@@ -29,7 +29,7 @@ def joint_of(seed, std=0.05):
 
 
 def rows_of(scan, way, std):
-    return Rows(scan.bearing, scan.bearing_std, way, std, scan.level_db)
+    return Rows(scan.bearing, scan.bearing_std, way, std, np.ones(scan.caller.size))
 
 
 @pytest.mark.parametrize("seed", range(5))
@@ -64,6 +64,16 @@ def test_costs_are_those_of_the_joint_innovations(seed, own):
         assert found[m, column] == pytest.approx(cost, rel=1e-9)
     if not own:
         assert np.isinf(found[:, 3]).all(), "a caller is no echo of its own call"
+
+
+def test_a_row_that_is_clutter_more_rarely_costs_less_by_twice_the_logarithm():
+    joint, row = joint_of(1, std=0.01), (np.zeros(1), np.full(1, 0.01), np.ones(1), np.ones(1))
+    gate = (1e9, *CHANCES[1:])
+    often, rarely = (
+        pair_costs((*row, share), joint.mean, joint.covariance, np.array([3]), OWN_CALL, gate)
+        for share in (np.ones(1), np.full(1, 0.1))
+    )
+    assert often - rarely == pytest.approx(-2.0 * math.log(0.1))
 
 
 def test_a_bearing_is_compared_across_the_cut_behind():

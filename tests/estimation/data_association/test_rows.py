@@ -9,6 +9,8 @@ from pipistrelle.estimation.data_association.pairs import OWN_CALL
 from pipistrelle.estimation.data_association.rows import (
     ASSUMED,
     BESIDE,
+    RARE_SHARE,
+    RAREST,
     SURE_SHARE,
     compared,
     rows_of_scan,
@@ -21,7 +23,7 @@ CHANCES = 25.0, 0.06, 1.3, 0.8
 
 def test_rows_are_sure_as_the_formulae_written_out_say():
     rng = np.random.default_rng(5)
-    caller, own = rng.integers(0, 2, 200), rng.choice([0.01, 0.06, 0.15, np.nan], 200)
+    caller, own = rng.integers(0, 2, 200), rng.choice([0.001, 0.01, 0.06, 0.15, np.nan], 200)
     way = np.where(rng.random(200) < 0.2, np.nan, 3.0)
     std = rng.choice([0.1, 0.3, 0.4, 0.9, np.nan], 200)
     columns = {"range": way, "range_std": std, "excess_path": way, "excess_path_std": std}
@@ -36,6 +38,8 @@ def test_rows_are_sure_as_the_formulae_written_out_say():
     assert np.array_equal(rows.sure, (std <= LIMITS[2]) | (std == 0.9))
     share = np.fmin(SURE_SHARE * LIMITS[0] / own, 1.0)
     assert np.array_equal(rows.surety, np.where(own == 0.15, ASSUMED, share))
+    rare = np.fmin(np.square(own / (RARE_SHARE * LIMITS[0])), 1.0)
+    np.testing.assert_allclose(rows.clutter, np.where(own == 0.15, 1.0, np.fmax(rare, RAREST)))
 
 
 @pytest.mark.parametrize(("apart", "begun"), [(0.9, [1]), (1.1, [1, 0])])

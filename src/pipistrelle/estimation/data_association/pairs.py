@@ -6,7 +6,8 @@ the caller is on the map, an excess path. Of each pair of a row and a landmark
 .. math:: d^2 = \nu^T S^{-1} \nu, \qquad S = H P H^T + R
 
 with the joint covariance P of pose, landmark and caller. The cost of a pair compares what the row
-would be of that landmark with what it would be of clutter of a density :math:`\lambda`:
+would be of that landmark with what it would be of clutter of a density :math:`\lambda`, less for a
+row with a sure bearing (`rows`):
 
 .. math:: c = d^2 + \ln |2 \pi S| + 2 \ln (\lambda / p_D)
 
@@ -36,7 +37,8 @@ class Rows(NamedTuple):
     way: Float[np.ndarray, " m"]
     """Range of the vehicle's own call, excess path of another's [m], or NaN."""
     way_std: Float[np.ndarray, " m"]
-    level_db: Float[np.ndarray, " m"]
+    clutter: Float[np.ndarray, " m"]
+    """Density of clutter with a way over that of `Chances`."""
 
 
 class Chances(NamedTuple):
@@ -92,7 +94,7 @@ def pair_costs(
                 c = along + heard.way_std[m] ** 2
                 det = a * c - b * b
                 squared = (c * nu * nu - 2.0 * b * nu * off + a * off * off) / det
-                size, density = (2.0 * math.pi) ** 2 * det, made.clutter
+                size, density = (2.0 * math.pi) ** 2 * det, made.clutter * heard.clutter[m]
             if squared < made.gate:
                 costs[m, n] = squared + math.log(size) + 2.0 * math.log(density / made.detection)
     return costs

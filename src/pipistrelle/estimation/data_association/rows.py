@@ -37,6 +37,9 @@ OVERLAP_STD, OVERLAP_GATE = 0.7, 9.0
 SURE_SHARE, ASSUMED = 0.65, 0.75
 """A row is as sure as any up to this share of the limit of its bearing's deviation; how sure one is
 whose deviation is only assumed."""
+RARE_SHARE, RAREST = 0.4, 0.01
+"""Below this share of that limit rows are clutter more rarely, by the square of the deviation, and
+at most so rarely."""
 
 
 class ScanRows(NamedTuple):
@@ -56,6 +59,8 @@ class ScanRows(NamedTuple):
     """Whether the way is sure enough to begin a landmark."""
     surety: Float[np.ndarray, " m"]
     """How sure a bearing is, from 0 to 1."""
+    clutter: Float[np.ndarray, " m"]
+    """As in `pairs.Rows`."""
 
 
 Joint = tuple[Int[np.ndarray, " n"], Float[np.ndarray, " d"], Float[np.ndarray, "d d"]]
@@ -85,7 +90,7 @@ def _read(
     size, (limit, way_limit, birth_limit) = caller.size, limits
     bearing_std, way, way_std = numbers[BEARING_STD], np.empty(size), np.empty(size)
     usable, with_way, sure = np.empty((3, size), np.bool_)
-    surety = np.full(size, ASSUMED)
+    surety, clutter = np.full(size, ASSUMED), np.ones(size)
     for m in range(size):
         own = caller[m] == OWN
         way[m] = numbers[RANGE if own else EXCESS_PATH, m]
@@ -97,8 +102,10 @@ def _read(
         if not _is_assumed(bearing_std[m], assumed):
             share = SURE_SHARE * limit / bearing_std[m]
             surety[m] = share if share < 1.0 else 1.0  # of none stated, too
-    bearing, level = numbers[BEARING], numbers[LEVEL]
-    return caller, bearing, bearing_std, way, way_std, level, usable, with_way, sure, surety
+            rare = bearing_std[m] / (RARE_SHARE * limit)
+            clutter[m] = max(rare * rare, RAREST) if rare < 1.0 else 1.0
+    bearing, told = numbers[BEARING], (usable, with_way, sure, surety, clutter)
+    return caller, bearing, bearing_std, way, way_std, numbers[LEVEL], *told
 
 
 @no_alloc
@@ -197,8 +204,8 @@ def part_of(heard: ScanRows, rows: Int[np.ndarray, " r"], spread: float) -> tupl
     way_std = heard.way_std[rows]
     for k in range(rows.size):
         way_std[k] = math.hypot(way_std[k], spread)
-    bearing, bearing_std, level = heard.bearing, heard.bearing_std, heard.level_db
-    return bearing[rows], bearing_std[rows], heard.way[rows], way_std, level[rows]
+    bearing, bearing_std, clutter = heard.bearing, heard.bearing_std, heard.clutter
+    return bearing[rows], bearing_std[rows], heard.way[rows], way_std, clutter[rows]
 
 
 @kernel
