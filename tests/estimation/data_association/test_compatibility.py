@@ -33,7 +33,7 @@ def drawn(seed, rows=5, landmarks=5, heading_std=0.15):
     way = np.hypot(*seen.T) + 0.03 * rng.standard_normal(rows)
     way[0] = np.nan if seed % 3 == 0 else way[0]
     stds = np.full(rows, 0.01), np.full(rows, 0.03)
-    return joint, (bearing, stds[0], way, stds[1], np.zeros(rows))
+    return joint, (bearing, stds[0], way, stds[1], np.ones(rows))
 
 
 def costs_and_innovations(joint, columns):
@@ -93,7 +93,7 @@ def test_a_turned_vehicle_is_told_by_all_rows_together_where_each_by_itself_errs
     )
     bearing = np.arctan2(places[:5, 1], places[:5, 0]) + 0.3  # a landmark is every 0.52 rad
     way = np.full(5, 5.0)
-    columns = bearing, np.full(5, 0.01), way, np.full(5, 0.03), np.zeros(5)
+    columns = bearing, np.full(5, 0.01), way, np.full(5, 0.03), np.ones(5)
     costs, innovate = costs_and_innovations(joint, columns)
     assert costs.argmin(axis=1).tolist() == [1, 2, 3, 4, 5]
     found = jointly_compatible(costs, innovate)
