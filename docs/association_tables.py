@@ -8,10 +8,13 @@ labels in the worlds that it has.
 """
 
 import sys
+import tomllib
 from pathlib import Path
 
 import numpy as np
 import polars as pl
+
+from pipistrelle.experiments.studies.plan_file import find_plan, plan_of
 
 BEAMS = {"180°": 0.0025, "33°": 0.0088, "11°": 0.025}
 COLUMNS = [(f"{strategy} {beam}", strategy, radius)
@@ -21,6 +24,20 @@ FILTERS = {"iekf": "invariant EKF", "smoother": "smoother, at the end"}
 METHODS = ("marginal", "joint", "nearest")
 LOST_M, LOST_TIMES = 0.25, 5.0
 """A world is lost if its aligned error is above this and so many times that with labels."""
+
+
+def planned(grid, **config):
+    """Return the study `association` with excess paths, another grid and settings more."""
+    table = tomllib.loads(find_plan("association").read_text(encoding="utf-8"))
+    table["config"] |= {"listening.timing": True, **config}
+    return table | {"filters": ["iekf"], "grid": grid}
+
+
+def settings_of(name, **config):
+    """Return its settings for one filter."""
+    table = planned({})
+    table["config"] |= table.pop("own").get(name, {}) | config
+    return plan_of(table | {"filters": [name]}).config
 
 
 def trials_of(studies):

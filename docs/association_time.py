@@ -7,10 +7,10 @@ the settings of the study `association`, with labels and by `marginal`, in turns
 """
 
 import sys
-import tomllib
 from time import process_time
 
 import numpy as np
+from association_tables import BEAMS, settings_of
 
 from pipistrelle.detection.noise import noise_of
 from pipistrelle.estimation.catalogue import entry
@@ -19,19 +19,13 @@ from pipistrelle.estimation.session import Session
 from pipistrelle.experiments.hearing.listening import listen
 from pipistrelle.experiments.hearing.scenario import world_of
 from pipistrelle.experiments.runs.heard_world import drive_of, scans_of
-from pipistrelle.experiments.studies.plan_file import find_plan, plan_of
 
 SEED, WORLDS, TURNS = 515151, 5, 3
-WIDEST = 0.0025
-"""Piston radius of a beam of 180 degrees [m]."""
 
 
 def settings(name, method):
     """Return those of the study `association` for one filter and method, and another seed."""
-    table = tomllib.loads(find_plan("association").read_text(encoding="utf-8"))
-    own = table.pop("own").get(name, {}) | {"seed": SEED, "association.method": method}
-    table["config"] |= own | {"listening.timing": True}
-    return plan_of(table | {"filters": [name], "grid": {}}).config
+    return settings_of(name, seed=SEED, **{"association.method": method})
 
 
 def times(config, name, drive, scans):
@@ -55,7 +49,7 @@ def main(worlds):
     told = settings("iekf", "known")
     scenarios = [world_of(told, world) for world in range(worlds)]
     heard = [
-        listen(scenario, told, [WIDEST], iteration=world, labels=False)[0]
+        listen(scenario, told, [BEAMS["180°"]], iteration=world, labels=False)[0]
         for world, scenario in enumerate(scenarios)
     ]
     for name in ("iekf", "smoother"):

@@ -9,11 +9,11 @@ excess paths, by each method; with labels it has the same rows, without the fals
 """
 
 import sys
-import tomllib
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+from association_tables import BEAMS, settings_of
 
 from pipistrelle.detection.merging import labelled
 from pipistrelle.detection.noise import noise_of, without_hidden
@@ -26,11 +26,8 @@ from pipistrelle.experiments.hearing.listening import listen
 from pipistrelle.experiments.hearing.scenario import standing_landmarks, world_of
 from pipistrelle.experiments.runs.filtering import run_filter
 from pipistrelle.experiments.runs.heard_world import drive_of
-from pipistrelle.experiments.studies.plan_file import find_plan, plan_of
 
 SEED = 60606
-WIDEST = 0.0025
-"""Piston radius of a beam of 180 degrees [m]."""
 CLUTTER = (0, 5, 10, 20)
 DETECTION = (1.0, 0.9, 0.7)
 FARTHEST = {RANGE: 12.0, EXCESS_PATH: 20.0}
@@ -39,9 +36,7 @@ FARTHEST = {RANGE: 12.0, EXCESS_PATH: 20.0}
 
 def settings(method):
     """Return those of the study `association` for one method, and another seed."""
-    table = tomllib.loads(find_plan("association").read_text(encoding="utf-8"))
-    table["config"] |= table.pop("own")["iekf"] | {"seed": SEED, "association.method": method}
-    return plan_of(table | {"filters": ["iekf"], "grid": {}}).config
+    return settings_of("iekf", seed=SEED, **{"association.method": method})
 
 
 def thinned(frame, probability, config, beacon, rng):
@@ -85,7 +80,7 @@ def errors_of(world):
     """Return, for each detection and clutter, the error with labels and by each method."""
     known, errors = settings("known"), {}
     scenario = world_of(known, world)
-    heard = listen(scenario, known, [WIDEST], iteration=world, labels=False)[0]
+    heard = listen(scenario, known, [BEAMS["180°"]], iteration=world, labels=False)[0]
     drive, path = drive_of(scenario, known, world), scenario.path
     beacon, noise = int(standing_landmarks(scenario)[0][-1]), noise_of(known.filter)
     for probability in DETECTION:

@@ -8,11 +8,11 @@ driven through, with the settings of the study `association`.
 """
 
 import sys
-import tomllib
 from collections import Counter
 from time import process_time
 
 import numpy as np
+from association_tables import BEAMS, planned, settings_of
 
 import pipistrelle
 from pipistrelle.acoustics.callers import VEHICLE
@@ -22,12 +22,10 @@ from pipistrelle.detection.scans import UNLABELLED
 from pipistrelle.experiments.hearing.listening import listen
 from pipistrelle.experiments.hearing.oracle import label_detections
 from pipistrelle.experiments.hearing.scenario import world_of
-from pipistrelle.experiments.studies.plan_file import find_plan, plan_of
 from pipistrelle.geometry import wrap
 
 SEED = 31337
 WAYS = ("merge", "resolve")
-BEAMS = {"180°": 0.0025, "33°": 0.0088, "11°": 0.025}
 TONES = {"own": VEHICLE, "beacon's": VEHICLE + 1}
 KINDS = ("between two echoes", "a neighbour's edge", "bearing off", "leakage", "noise")
 LEAK_DB = -30.0
@@ -36,17 +34,10 @@ FAINT_DB = 12.0
 """Of echoes that overlap those count that are fainter than the loudest by no more."""
 
 
-def planned(grid, **config):
-    """Return the study `association` with another grid and seed, for the invariant EKF alone."""
-    table = tomllib.loads(find_plan("association").read_text(encoding="utf-8"))
-    table["config"] |= {"seed": SEED, "listening.timing": True, **config}
-    return table | {"filters": ["iekf"], "grid": grid}
-
-
 def settings(way, frames):
-    """Return its sound, for so many frames."""
+    """Return those of the study `association`, for so many frames."""
     changes = {"detection.overlaps": way, "scenario.steps": 4 * frames}
-    return plan_of(planned({}, **changes)).config
+    return settings_of("iekf", seed=SEED, **changes)
 
 
 def kind_of(caller, delay, bearing, arrivals, faintest_db):
@@ -130,7 +121,7 @@ def rows_table(worlds, frames):
 def missions_table(worlds):
     """Print what that does to missions, with labels and without."""
     grid = {"detection.overlaps": WAYS, "association.method": ["known", "marginal"]}
-    plan = planned(grid | {"emitter.radius": [*BEAMS.values()]})
+    plan = planned(grid | {"emitter.radius": [*BEAMS.values()]}, seed=SEED)
     trials = pipistrelle.study(plan, iterations=worlds).trials.to_dicts()
     names = [f"{what}, {how}" for how in ("labels", "none") for what in ("[m]", "aligned [mm]")]
     names += ["right [%]", "missed", "false", "twice"]

@@ -9,14 +9,11 @@ the settings of the study `association`, with labels and by `marginal`.
 import sys
 
 import numpy as np
-from association_tables import worlds_lost
-from false_echoes import planned
+from association_tables import BEAMS, planned, worlds_lost
 
 import pipistrelle
 
 SEED, WORLDS = 6601, 16
-RADIUS = 0.0088
-"""Piston radius of a beam of 33 degrees [m]."""
 COURSES = {
     "circle": {"course": "circle", "radius": 15.0, "speed": 0.75},
     "walk": {"course": "walk"},
@@ -30,7 +27,7 @@ NAMES = (
 
 def trials_of(course, worlds):
     """Return the trials of worlds whose caller goes a course, one a row."""
-    config = {"seed": SEED, "emitter.radius": RADIUS, "callers": [COURSES[course]]}
+    config = {"seed": SEED, "emitter.radius": BEAMS["33°"], "callers": [COURSES[course]]}
     plan = planned({"association.method": ["known", "marginal"]}, **config)
     plan |= {"strategies": ["fused", "passive"], "filters": [*FILTERS]}
     return pipistrelle.study(plan, iterations=worlds).trials.sort("iteration").to_dicts()
