@@ -54,7 +54,7 @@ class Chances(NamedTuple):
     """Probability that a landmark which can be heard is."""
 
 
-VAGUE = 0.06
+VAGUE = 0.02
 """Largest root of the determinant of H P H^T, of bearing and range [rad m]."""
 OWN_CALL, UNPLACED = -1, -2
 """In place of a caller's index in the joint mean: the vehicle, and one that is not on the map."""
