@@ -54,8 +54,9 @@ class Chances(NamedTuple):
     """Probability that a landmark which can be heard is."""
 
 
-VAGUE = 0.02
-"""Largest root of the determinant of H P H^T, of bearing and range [rad m]."""
+VAGUE = 0.0012
+"""Largest root of the determinant of H P H^T, of bearing and range, times the clutter per radian
+and metre."""
 OWN_CALL, UNPLACED = -1, -2
 """In place of a caller's index in the joint mean: the vehicle, and one that is not on the map."""
 
@@ -76,12 +77,13 @@ def pair_costs(
     heard, made = Rows(*rows), Chances(*chances)
     costs = np.full((heard.bearing.size, at.size), np.inf)
     H, index = np.zeros((2, 7)), np.zeros(7, np.int64)
+    vague = VAGUE / made.clutter
     for n in range(at.size):
         if at[n] == caller:
             continue
         bearing, way = _expected(mean, at[n], caller, H, index)
         across, b, along = _spread(covariance, H, index, 5 if caller < 0 else 7)
-        if caller == OWN_CALL and across * along - b * b > VAGUE * VAGUE:
+        if caller == OWN_CALL and across * along - b * b > vague * vague:
             continue
         for m in range(heard.bearing.size):
             nu = wrap_angle(heard.bearing[m] - bearing)
