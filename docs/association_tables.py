@@ -94,7 +94,8 @@ def print_table(trials, cell):
                     known, found = (chosen(trials, strategy, radius, name, which, timing)
                                     for which in ("known", method))  # fmt: skip
                     known = known.filter(pl.col("iteration").is_in(found["iteration"].to_list()))
-                    cells.append("as above" if same else cell(known, found))
+                    told = "-" if found.is_empty() else cell(known, found)
+                    cells.append("as above" if same else told)
                 first = "" if timing else "bearings alone, "
                 print(f"| {first}{words}, `{method}` | " + " | ".join(cells) + " |")
 
