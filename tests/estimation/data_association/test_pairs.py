@@ -76,6 +76,15 @@ def test_a_row_that_is_clutter_more_rarely_costs_less_by_twice_the_logarithm():
     assert often - rarely == pytest.approx(-2.0 * math.log(0.1))
 
 
+@pytest.mark.parametrize(("clutter", "told"), [(0.06, False), (0.02, True)])
+def test_where_clutter_is_likely_within_what_is_unsure_a_row_tells_of_no_landmark(clutter, told):
+    mean, covariance = np.array([0.0, 0.0, 0.0, 5.0, 0.0]), np.diag([0.0, 0.0, 0.0, 0.25, 0.25])
+    row = np.zeros(1), np.full(1, 0.01), np.full(1, 5.0), np.full(1, 0.02), np.ones(1)
+    chances = 25.0, clutter, 1.2, 0.8
+    costs = pair_costs(row, mean, covariance, np.array([3]), OWN_CALL, chances)
+    assert np.isfinite(costs[0, 0]) == told
+
+
 def test_a_bearing_is_compared_across_the_cut_behind():
     here = JointGaussian(
         landmark=np.array([7]), mean=np.array([0.0, 0.0, 0.0, -5.0, 0.1]),
