@@ -20,7 +20,7 @@ CHANCES = (1e9, 0.06, 1.2, 0.8)
 CALLER = 5
 
 
-def joint_of(seed, std=0.05):
+def joint_of(seed, std=0.02):
     """Return a pose and four landmarks, the last of them the caller, all correlated."""
     rng = np.random.default_rng(seed)
     root = std * rng.standard_normal((11, 11))
