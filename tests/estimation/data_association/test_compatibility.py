@@ -12,7 +12,7 @@ from pipistrelle.estimation.beliefs import JointGaussian
 from pipistrelle.estimation.data_association.compatibility import gates, jointly_compatible
 from pipistrelle.estimation.data_association.pairs import OWN_CALL, pair_costs, pair_innovations
 
-CHANCES = (25.0, 0.06, 1.3, 0.8)
+CHANCES = (25.0, 0.06, 1.3, 0.8, 0.06)
 
 
 def drawn(seed, rows=5, landmarks=5, heading_std=0.15):

@@ -16,7 +16,7 @@ from pipistrelle.estimation.data_association.pairs import (
     with_point,
 )
 
-CHANCES = (1e9, 0.06, 1.2, 0.8)
+CHANCES = (1e9, 0.06, 1.2, 0.8, 0.06)
 CALLER = 5
 
 
@@ -76,11 +76,12 @@ def test_a_row_that_is_clutter_more_rarely_costs_less_by_twice_the_logarithm():
     assert often - rarely == pytest.approx(-2.0 * math.log(0.1))
 
 
-@pytest.mark.parametrize(("clutter", "told"), [(0.06, False), (0.02, True)])
-def test_where_clutter_is_likely_within_what_is_unsure_a_row_tells_of_no_landmark(clutter, told):
+@pytest.mark.parametrize(("vague", "std", "told"),
+                         [(0.02, 0.02, False), (0.06, 0.02, True), (0.02, 0.3, True)])  # fmt: skip
+def test_a_row_tells_of_a_landmark_that_is_known_or_as_well_as_the_row_says(vague, std, told):
     mean, covariance = np.array([0.0, 0.0, 0.0, 5.0, 0.0]), np.diag([0.0, 0.0, 0.0, 0.25, 0.25])
-    row = np.zeros(1), np.full(1, 0.01), np.full(1, 5.0), np.full(1, 0.02), np.ones(1)
-    chances = 25.0, clutter, 1.2, 0.8
+    row = np.zeros(1), np.full(1, 0.1), np.full(1, 5.0), np.full(1, std), np.ones(1)
+    chances = *CHANCES[:4], vague
     costs = pair_costs(row, mean, covariance, np.array([3]), OWN_CALL, chances)
     assert np.isfinite(costs[0, 0]) == told
 
@@ -93,7 +94,7 @@ def test_a_bearing_is_compared_across_the_cut_behind():
     none = np.full(1, np.nan)
     row = Rows(np.array([-math.pi + 0.01]), np.array([0.05]), none, none, none)
     costs = pair_costs(
-        tuple(row), here.mean, here.covariance, np.array([3]), UNPLACED, (25.0, 0.06, 1.2, 0.8)
+        tuple(row), here.mean, here.covariance, np.array([3]), UNPLACED, (25.0, *CHANCES[1:])
     )
     assert np.isfinite(costs[0, 0])
 

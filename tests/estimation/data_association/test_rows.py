@@ -18,7 +18,7 @@ from pipistrelle.estimation.data_association.rows import (
 )
 
 LIMITS = 0.05, 0.35, 0.25
-CHANCES = 25.0, 0.06, 1.3, 0.8
+CHANCES = 25.0, 0.06, 1.3, 0.8, 0.06
 
 
 def test_rows_are_sure_as_the_formulae_written_out_say():

@@ -16,7 +16,7 @@ from pipistrelle.estimation.data_association.pairs import pair_costs
 from pipistrelle.estimation.data_association.turns import turned
 from pipistrelle.estimation.measurement import excess_path_slopes
 
-CHANCES = (25.0, 0.06, 1.2, 0.8)
+CHANCES = (25.0, 0.06, 1.2, 0.8, 0.06)
 PLACES = np.random.default_rng(2).uniform(-10.0, 10.0, (20, 2))
 EXPECTED = np.array([9.0, 6.0])
 AT = 3 + 2 * len(PLACES)

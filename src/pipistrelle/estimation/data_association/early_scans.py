@@ -57,7 +57,7 @@ def labelled_by_map(
     sure: Int[np.ndarray, " s"],
     callers: Mapping[int, int],
     match: Match,
-    chances: tuple[float, float, float, float],
+    chances: tuple[float, float, float, float, float],
 ) -> Scan:
     """Return an early scan, its callers' rows with labels by a map that is known now.
 
@@ -92,7 +92,7 @@ def _matched(
     there: Int[np.ndarray, " n"],
     at: int,
     match: Match,
-    chances: tuple[float, float, float, float],
+    chances: tuple[float, float, float, float, float],
 ) -> Int[np.ndarray, " r"]:
     """Return which landmark each row is of, NOTHING of all if they fit at more than one turn."""
     (mean, _), (spread, variance, left) = gaussian, _turn(*gaussian, there)

@@ -4,7 +4,7 @@ from pipistrelle.config import Config, InputError
 from pipistrelle.estimation.association import KNOWN, Association
 from pipistrelle.estimation.data_association.compatibility import jointly_compatible
 from pipistrelle.estimation.data_association.matching import marginal, nearest
-from pipistrelle.estimation.data_association.pairs import Chances
+from pipistrelle.estimation.data_association.pairs import BARELY, Chances
 from pipistrelle.estimation.data_association.sequential import Limits, Sequential
 from pipistrelle.estimation.outside import ASSOCIATION, build, class_of, names_class
 
@@ -12,6 +12,9 @@ METHODS = {"nearest": nearest, "joint": jointly_compatible, "marginal": marginal
 """How rows of a scan are matched with landmarks, by ``association.method``."""
 GATE = 25.0
 """Largest squared distance of a row from its landmark: 0.5 to 1 % of right rows are beyond."""
+
+VAGUE = 0.0012
+"""What is vague (`Chances.vague`), times the clutter per radian and metre."""
 
 
 def association_of(config: Config) -> Association | None:
@@ -26,13 +29,16 @@ def association_of(config: Config) -> Association | None:
     if name == KNOWN:
         return None
     if name in METHODS:
+        told, vague = config.filter, VAGUE / settings.clutter
+        if told.noise == "constant":  # the estimator knows no more of what was heard once
+            vague = max(vague, BARELY * told.bearing_std * told.range_std)
         chances = Chances(
             gate=GATE,
             clutter=settings.clutter,
             bearing_clutter=20.0 * settings.clutter,
             detection=settings.detection,
+            vague=vague,
         )
-        told = config.filter
         limits = Limits(
             bearing_std=settings.bearing_std,
             way_std=settings.way_std,

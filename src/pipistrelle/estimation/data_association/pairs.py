@@ -13,8 +13,8 @@ row with a sure bearing (`rows`):
 
 A pair of a cost below 0 is likelier than clutter. After a long way among other landmarks pose and
 landmark may be so unsure of each other that a row of the vehicle's own call tells nothing of the
-pair, however well it fits (`VAGUE`): such a row is of something new, until it is seen to be one
-with what is known (`doubles`).
+pair, however well it fits (`Chances.vague`): such a row is of something new, until it is seen to be
+one with what is known (`doubles`).
 """
 
 import math
@@ -52,11 +52,13 @@ class Chances(NamedTuple):
     """The same of rows that have a bearing alone, per radian."""
     detection: float
     """Probability that a landmark which can be heard is."""
+    vague: float
+    """Largest root of the determinant of H P H^T, of bearing and range [rad m]."""
 
 
-VAGUE = 0.0012
-"""Largest root of the determinant of H P H^T, of bearing and range, times the clutter per radian
-and metre."""
+BARELY = 2.0
+"""Nobody knows a landmark better that was heard once: the least that is vague, over the deviations
+of bearing and range of the row itself."""
 OWN_CALL, UNPLACED = -1, -2
 """In place of a caller's index in the joint mean: the vehicle, and one that is not on the map."""
 
@@ -68,7 +70,7 @@ def pair_costs(
     covariance: Float[np.ndarray, "d d"],
     at: Int[np.ndarray, " n"],
     caller: Whole,
-    chances: tuple[float, float, float, float],
+    chances: tuple[float, float, float, float, float],
 ) -> Float[np.ndarray, "m n"]:
     """Return the cost of each pair of a row and a landmark; infinite beyond the gate, or if vague.
 
@@ -77,15 +79,15 @@ def pair_costs(
     heard, made = Rows(*rows), Chances(*chances)
     costs = np.full((heard.bearing.size, at.size), np.inf)
     H, index = np.zeros((2, 7)), np.zeros(7, np.int64)
-    vague = VAGUE / made.clutter
     for n in range(at.size):
         if at[n] == caller:
             continue
         bearing, way = _expected(mean, at[n], caller, H, index)
         across, b, along = _spread(covariance, H, index, 5 if caller < 0 else 7)
-        if caller == OWN_CALL and across * along - b * b > vague * vague:
-            continue
+        unsure = across * along - b * b if caller == OWN_CALL else 0.0
         for m in range(heard.bearing.size):
+            if unsure > max(made.vague, BARELY * heard.bearing_std[m] * heard.way_std[m]) ** 2:
+                continue
             nu = wrap_angle(heard.bearing[m] - bearing)
             a = across + heard.bearing_std[m] ** 2
             if math.isnan(heard.way[m]) or caller == UNPLACED:

@@ -123,7 +123,7 @@ class Sequential:
     >>> start = Gaussian(mean=np.zeros(3), covariance=1e-6 * np.eye(3))
     >>> session = Session(
     ...     entry("iekf").build(Config(), motion), start, np.random.default_rng(7),
-    ...     association=Sequential(match=nearest, chances=(25.0, 0.06, 1.3, 0.8)))
+    ...     association=Sequential(match=nearest, chances=(25.0, 0.06, 1.3, 0.8, 0.02)))
     >>> stds = {"bearing_std": 0.01, "range_std": 0.02}
     >>> heard = make_scan(0.0, np.full(2, -1), np.array([0.1, 1.0]), range=np.ones(2), **stds)
     >>> for _ in range(3):
@@ -134,7 +134,7 @@ class Sequential:
 
     match: Match
     """How rows are matched with landmarks (`matching`, `compatibility`)."""
-    chances: tuple[float, float, float, float]
+    chances: tuple[float, float, float, float, float]
     """`pairs.Chances`."""
     limits: Limits = Limits()
 
