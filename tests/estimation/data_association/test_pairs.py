@@ -68,9 +68,8 @@ def test_costs_are_those_of_the_joint_innovations(seed, own):
 
 def test_a_row_that_is_clutter_more_rarely_costs_less_by_twice_the_logarithm():
     joint, row = joint_of(1, std=0.01), (np.zeros(1), np.full(1, 0.01), np.ones(1), np.ones(1))
-    gate = (1e9, *CHANCES[1:])
     often, rarely = (
-        pair_costs((*row, share), joint.mean, joint.covariance, np.array([3]), OWN_CALL, gate)
+        pair_costs((*row, share), joint.mean, joint.covariance, np.array([3]), OWN_CALL, CHANCES)
         for share in (np.ones(1), np.full(1, 0.1))
     )
     assert often - rarely == pytest.approx(-2.0 * math.log(0.1))

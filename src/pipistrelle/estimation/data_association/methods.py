@@ -14,7 +14,7 @@ GATE = 25.0
 """Largest squared distance of a row from its landmark: 0.5 to 1 % of right rows are beyond."""
 
 VAGUE = 0.0012
-"""What is vague (`Chances.vague`), times the clutter per radian and metre."""
+"""The clutter that a pair may cover: `Chances.vague` times the clutter per radian and metre."""
 
 
 def association_of(config: Config) -> Association | None:
