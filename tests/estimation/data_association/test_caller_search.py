@@ -9,7 +9,9 @@ from pipistrelle.estimation.data_association.caller_search import (
     find_caller,
     find_moving_caller,
     misfit,
+    searched,
 )
+from pipistrelle.estimation.data_association.memory import Caller, CallerPlace
 from pipistrelle.estimation.data_association.pairs import Rows
 from pipistrelle.estimation.data_association.tracks import Tracks, followed, in_window
 from pipistrelle.estimation.measurement import excess_path_slopes
@@ -70,6 +72,47 @@ def test_without_errors_the_misfit_is_least_where_the_caller_is():
     here = misfit(places, poses, table, direct)
     for step in ([2.0, 0.0], [-2.0, 0.0], [0.0, 2.0], [0.0, -2.0], [5.0, -4.0]):
         assert misfit(places + step, poses, table, direct) > here + 10.0
+
+
+def found_first(factor, *, scans=20, **drive):
+    """Return a caller that was found at so many times its range, and what it was heard of since."""
+    tracks, poses = heard(3, scans=scans, **drive)
+    x, y = poses[0, :2] + factor * (CALLER - poses[0, :2])
+    return Caller(label=1, place=CallerPlace(x, y), told=True, tracks=tracks)
+
+
+def test_where_a_second_search_disagrees_the_mean_of_both_is_taken():
+    first = found_first(1.5)
+    second = find_caller(first.tracks).place
+    caller, place = searched(first, moves=False)
+    assert caller is first and place.agreed
+    assert place[:2] == pytest.approx(np.add(first.place[:2], second[:2]) / 2.0)
+    error = [np.hypot(*(one[:2] - CALLER)) for one in (first.place, place)]
+    assert error[1] < 0.6 * error[0]
+
+
+def test_where_both_searches_agree_it_is_where_it_was_and_is_not_followed_on():
+    first = found_first(1.02)
+    caller, place = searched(first, moves=False)
+    assert place is None and caller.place == first.place._replace(agreed=True)
+    assert not len(caller.tracks.poses)
+
+
+def test_a_second_search_that_finds_nothing_is_given_up():
+    for scans, given_up in ((20, False), (28, False), (30, True)):
+        first = found_first(1.5, scans=scans, landmarks=3)
+        caller, place = searched(first, moves=False)
+        assert place is None and caller.place.agreed == given_up, scans
+
+
+def test_who_is_found_late_or_moves_is_searched_for_once():
+    for scans, moves, once in ((8, False, False), (18, False, False), (20, False, True)):
+        unknown = Caller(label=1, tracks=heard(3, scans=scans)[0])
+        assert searched(unknown, moves)[1].agreed == once, scans
+    unknown = Caller(label=1, tracks=heard(3, scans=12)[0])
+    assert searched(unknown, moves=True)[1].agreed
+    unknown = Caller(label=1, tracks=heard(3, scans=9)[0])
+    assert searched(unknown, moves=False) == (unknown, None)
 
 
 WAYS = {

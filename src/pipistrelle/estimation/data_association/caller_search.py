@@ -7,6 +7,8 @@ what their rows say, headings as medians over tracks, residuals that count no mo
 :math:`3 \sigma`), goes downhill from the best, and believes it if what is at another range fits
 clearly worse.
 
+A caller that stands is searched for twice, in windows that have little in common (`searched`).
+
 Of a caller that moves the places at the begin, in the middle and at the end of the window are
 looked for, which a parabola joins. A landmark that stands is told by its bearings alone, as the
 vehicle goes by, and its excess path then tells of the caller at each scan: velocity and
@@ -15,12 +17,13 @@ acceleration can be observed, too.
 
 import math
 from collections.abc import Callable
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float
 
-from pipistrelle.estimation.data_association.memory import CallerPlace
+from pipistrelle.estimation.data_association.memory import Caller, CallerPlace
 from pipistrelle.estimation.data_association.tracks import TURN, Tracks, in_window
 from pipistrelle.geometry import wrap_angle
 from pipistrelle.jit import kernel, no_alloc
@@ -42,6 +45,11 @@ FASTEST = 2.0
 CAP = 9.0
 """A row's misfit counts no more."""
 PASSES, WEIGHINGS = 3, 2
+FIRST, FIRST_MOVING = 8, 10
+"""Scans after which a caller that stands, and one that moves, is searched for, at every second."""
+SECOND, LAST, APART = 20, 30, 0.15
+"""Scans after which one that stands is searched for once more, until it is found; by which share
+of its range the two places must differ for their mean to be taken."""
 
 
 class Found(NamedTuple):
@@ -58,6 +66,35 @@ class Found(NamedTuple):
     def sure(self) -> bool:
         """Whether it is to be believed."""
         return self.ahead > CLEARLY and self.misfit < WELL and self.tracks >= LEAST_TRACKS
+
+
+def searched(caller: Caller, moves: bool) -> tuple[Caller, CallerPlace | None]:
+    """Search for a caller by its tracks, if it is time; return it, and its place if that is news.
+
+    One that stands is searched for twice. What the two windows tell is nearly independent, so where
+    they differ their mean is the better place.
+    """
+    tracks, first, scans = caller.tracks, caller.place, len(caller.tracks.poses)
+    begin = SECOND if first is not None else FIRST_MOVING if moves else FIRST
+    if scans < begin or scans % 2:
+        return caller, None
+    found = find_moving_caller(tracks) if moves else find_caller(tracks)
+    if found is None or not found.sure:
+        return (caller if first is None or scans < LAST else _agreed(caller, first)), None
+    second = found.place
+    if first is None:
+        return caller, second._replace(agreed=moves or scans >= SECOND)
+    x, y = tracks.poses[0, :2]
+    far = [math.hypot(place.x - x, place.y - y) for place in (first, second)]
+    if abs(math.log(far[1] / far[0])) < APART:
+        return _agreed(caller, first), None
+    mean = 0.5 * (first.x + second.x), 0.5 * (first.y + second.y)
+    return caller, CallerPlace(*mean, agreed=True)
+
+
+def _agreed(caller: Caller, place: CallerPlace) -> Caller:
+    """Return a caller that is at a place, and not searched for any more."""
+    return replace(caller, place=place._replace(agreed=True), tracks=Tracks())
 
 
 def find_caller(tracks: Tracks) -> Found | None:

@@ -27,6 +27,8 @@ class CallerPlace(NamedTuple):
     """Time at which the caller is there [s]."""
     since: float = -math.inf
     """Time from which on place and motion hold [s]."""
+    agreed: bool = False
+    """Whether it is not searched for once more."""
 
     def at(self, time: float) -> tuple[float, float]:
         """Return the position at a time [m]."""

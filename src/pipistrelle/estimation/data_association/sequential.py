@@ -30,10 +30,7 @@ from pipistrelle.detection.scans import (
 )
 from pipistrelle.estimation.association import Assignment, is_among
 from pipistrelle.estimation.beliefs import Belief, Gaussian, JointGaussian
-from pipistrelle.estimation.data_association.caller_search import (
-    find_caller,
-    find_moving_caller,
-)
+from pipistrelle.estimation.data_association.caller_search import searched
 from pipistrelle.estimation.data_association.doubles import asked_of, doubles
 from pipistrelle.estimation.data_association.early_scans import (
     FEW,
@@ -73,9 +70,6 @@ from pipistrelle.estimation.data_association.rows import (
 from pipistrelle.estimation.data_association.tracks import Tracks, followed
 from pipistrelle.estimation.data_association.turns import may_have_turned, turned
 
-FIRST_SEARCH, FIRST_SEARCH_MOVING = 8, 10
-"""Scans of a caller that stands, and of one that moves, after which its place is searched for, at
-every second one."""
 PLACE_SHARE, MOVING_SHARE = 0.12, 0.2
 """Deviation of the range at which a caller that stands was found, and one that moves, as a share of
 it."""
@@ -184,29 +178,24 @@ class _Work:
         self.near = np.zeros(self.joint.landmark.size + scan.landmark.size, np.bool_)
 
     def search_callers(self) -> dict[int, CallerPlace]:
-        """Follow the rows of callers that are not found, and return where some now are."""
+        """Follow the rows of callers that are searched for, and return where some are found."""
         news: dict[int, CallerPlace] = {}
         for number, row in enumerate(self.scan.direct.tolist()):
             if number == OWN or (row < 0 and number not in self.callers):
                 continue
             caller = self.callers.get(number) or Caller(label=self._another())
+            if caller.place is None or (caller.told and not caller.place.agreed):
+                caller, place = searched(self._followed(number, caller, row), number in self.moves)
+                news |= {} if place is None else {number: place}
             self.callers[number] = caller
-            if caller.place is None:
-                news |= self._searched(number, caller, row)
         return news
 
-    def _searched(self, number: int, caller: Caller, row: int) -> dict[int, CallerPlace]:
-        """Follow a caller's rows, and return its place if that is found."""
+    def _followed(self, number: int, caller: Caller, row: int) -> Caller:
+        """Return a caller with this scan's rows among its tracks."""
         rows = self._some(self.rows.with_way & (self.scan.caller == number))
         direct = self.scan.bearing[row] if row >= 0 else math.nan
         tracks = followed(caller.tracks, self.scan.time, self.pose, direct, rows)
-        self.callers[number] = replace(caller, tracks=tracks)
-        moves = number in self.moves
-        first = FIRST_SEARCH_MOVING if moves else FIRST_SEARCH
-        if len(tracks.poses) < first or len(tracks.poses) % 2:
-            return {}
-        found = find_moving_caller(tracks) if moves else find_caller(tracks)
-        return {number: found.place} if found is not None and found.sure else {}
+        return replace(caller, tracks=tracks)
 
     def match(self, number: int) -> None:
         """Label the rows of one caller, and begin landmarks with those that are near no other."""
