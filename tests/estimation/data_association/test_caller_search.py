@@ -85,7 +85,8 @@ def test_where_a_second_search_disagrees_the_mean_of_both_is_taken():
     first = found_first(1.5)
     second = find_caller(first.tracks).place
     caller, place = searched(first, moves=False)
-    assert caller is first and place.agreed
+    assert caller is first
+    assert place.agreed
     assert place[:2] == pytest.approx(np.add(first.place[:2], second[:2]) / 2.0)
     error = [np.hypot(*(one[:2] - CALLER)) for one in (first.place, place)]
     assert error[1] < 0.6 * error[0]
@@ -94,7 +95,8 @@ def test_where_a_second_search_disagrees_the_mean_of_both_is_taken():
 def test_where_both_searches_agree_it_is_where_it_was_and_is_not_followed_on():
     first = found_first(1.02)
     caller, place = searched(first, moves=False)
-    assert place is None and caller.place == first.place._replace(agreed=True)
+    assert place is None
+    assert caller.place == first.place._replace(agreed=True)
     assert not len(caller.tracks.poses)
 
 
@@ -102,7 +104,8 @@ def test_a_second_search_that_finds_nothing_is_given_up():
     for scans, given_up in ((20, False), (28, False), (30, True)):
         first = found_first(1.5, scans=scans, landmarks=3)
         caller, place = searched(first, moves=False)
-        assert place is None and caller.place.agreed == given_up, scans
+        assert place is None, scans
+        assert caller.place.agreed == given_up, scans
 
 
 def test_who_is_found_late_or_moves_is_searched_for_once():

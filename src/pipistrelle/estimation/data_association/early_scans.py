@@ -30,7 +30,12 @@ from pipistrelle.estimation.association import is_among
 from pipistrelle.estimation.beliefs import JointGaussian
 from pipistrelle.estimation.data_association.matching import NOTHING, Match
 from pipistrelle.estimation.data_association.memory import EarlyScan
-from pipistrelle.estimation.data_association.pairs import UNPLACED, pair_costs, pair_innovations
+from pipistrelle.estimation.data_association.pairs import (
+    UNPLACED,
+    PlainChances,
+    pair_costs,
+    pair_innovations,
+)
 from pipistrelle.estimation.data_association.rows import part_of
 from pipistrelle.estimation.data_association.turns import fit
 
@@ -57,7 +62,7 @@ def labelled_by_map(
     sure: Int[np.ndarray, " s"],
     callers: Mapping[int, int],
     match: Match,
-    chances: tuple[float, float, float, float, float],
+    chances: PlainChances,
 ) -> Scan:
     """Return an early scan, its callers' rows with labels by a map that is known now.
 
@@ -92,7 +97,7 @@ def _matched(
     there: Int[np.ndarray, " n"],
     at: int,
     match: Match,
-    chances: tuple[float, float, float, float, float],
+    chances: PlainChances,
 ) -> Int[np.ndarray, " r"]:
     """Return which landmark each row is of, NOTHING of all if they fit at more than one turn."""
     (mean, _), (spread, variance, left) = gaussian, _turn(*gaussian, there)

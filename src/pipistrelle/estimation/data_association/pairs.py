@@ -56,6 +56,8 @@ class Chances(NamedTuple):
     """Largest root of the determinant of H P H^T, of bearing and range [rad m]."""
 
 
+PlainChances = tuple[float, float, float, float, float]
+"""`Chances` as kernels take them."""
 BARELY = 2.0
 """Nobody knows a landmark better that was heard once: the least that is vague, over the deviations
 of bearing and range of the row itself."""
@@ -70,7 +72,7 @@ def pair_costs(
     covariance: Float[np.ndarray, "d d"],
     at: Int[np.ndarray, " n"],
     caller: Whole,
-    chances: tuple[float, float, float, float, float],
+    chances: PlainChances,
 ) -> Float[np.ndarray, "m n"]:
     """Return the cost of each pair of a row and a landmark; infinite beyond the gate, or if vague.
 

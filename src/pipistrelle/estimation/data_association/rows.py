@@ -26,7 +26,7 @@ from pipistrelle.detection.scans import (
 )
 from pipistrelle.estimation.association import is_among
 from pipistrelle.estimation.data_association.matching import NOTHING
-from pipistrelle.estimation.data_association.pairs import UNPLACED, pair_costs
+from pipistrelle.estimation.data_association.pairs import UNPLACED, PlainChances, pair_costs
 from pipistrelle.geometry import wrap_angle
 from pipistrelle.jit import Flag, Whole, kernel, no_alloc
 
@@ -151,7 +151,7 @@ def compared(
     moving: Int[np.ndarray, " v"],
     near: Bool[np.ndarray, " k"],
     caller: tuple[Whole, Whole, Whole],
-    chances: tuple[float, float, float, float, float],
+    chances: PlainChances,
     telling: float,
 ) -> tuple[Int[np.ndarray, " r"], Float[np.ndarray, "r n"], Bool[np.ndarray, " r"]]:
     """Return the usable rows of a caller, their costs, and whether any landmark is near each.
@@ -190,7 +190,7 @@ def bearing_fits(
     row: Whole,
     joint: Joint,
     at: Whole,
-    chances: tuple[float, float, float, float, float],
+    chances: PlainChances,
 ) -> bool:
     """Tell whether the bearing of a row may be of the landmark that stands at a place."""
     (_, mean, covariance), part = joint, part_of(ScanRows(*rows), np.full(1, row), 0.0)
@@ -216,7 +216,7 @@ def settled(
     confirmed: Int[np.ndarray, " c"],
     matched: tuple[Int[np.ndarray, " r"], Int[np.ndarray, " r"], Bool[np.ndarray, " r"]],
     caller: tuple[Whole, Whole, Whole],
-    chances: tuple[float, float, float, float, float],
+    chances: PlainChances,
 ) -> tuple[Int[np.ndarray, " b"], tuple[int, int]]:
     """Label a caller's rows; return those that begin landmarks, the loudest first, and two counts.
 
@@ -239,7 +239,7 @@ def settled(
     for n in range(confirmed.size):
         if confirmed[n] not in label:
             silent[n] = place_of(confirmed[n], landmark)
-    stray, gated = stray[:size], (OVERLAP_GATE, chances[1], chances[2], chances[3], chances[4])
+    stray, gated = stray[:size], (OVERLAP_GATE, *chances[1:])
     overlapping = part_of(heard, stray, OVERLAP_STD / (2.0 if number == OWN else 1.0))
     costs = pair_costs(overlapping, mean, covariance, silent[silent >= 0], at, gated)
     size = 0

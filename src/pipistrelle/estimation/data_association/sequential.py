@@ -52,6 +52,7 @@ from pipistrelle.estimation.data_association.memory import Caller, CallerPlace, 
 from pipistrelle.estimation.data_association.pairs import (
     OWN_CALL,
     UNPLACED,
+    PlainChances,
     Rows,
     pair_costs,
     pair_innovations,
@@ -128,7 +129,7 @@ class Sequential:
 
     match: Match
     """How rows are matched with landmarks (`matching`, `compatibility`)."""
-    chances: tuple[float, float, float, float, float]
+    chances: PlainChances
     """`pairs.Chances`."""
     limits: Limits = Limits()
 

@@ -111,9 +111,9 @@ def _equated(
     c = math.sqrt(w1[k + 1] - w1[g + 1] + MERGED_STD * MERGED_STD - b * b)
     e0 = -(mean[k] - mean[g]) / a
     e1 = (-(mean[k + 1] - mean[g + 1]) - b * e0) / c
-    moved, left = mean.copy(), P.copy()
     if e0 * e0 + e1 * e1 > FARTHEST:
-        return moved, left
+        return mean.copy(), P.copy()
+    moved, left = mean.copy(), np.empty_like(P)
     w0 = w0 / a
     w1 = (w1 - b * w0) / c
     if error == LINEAR:
