@@ -92,6 +92,12 @@ def test_where_a_second_search_disagrees_the_mean_of_both_is_taken():
     assert error[1] < 0.6 * error[0]
 
 
+def test_where_they_differ_widely_the_second_alone_is_taken():
+    first = found_first(2.5)
+    _, place = searched(first, moves=False)
+    assert place[:2] == pytest.approx(find_caller(first.tracks).place[:2])
+
+
 def test_where_both_searches_agree_it_is_where_it_was_and_is_not_followed_on():
     first = found_first(1.02)
     caller, place = searched(first, moves=False)

@@ -47,9 +47,10 @@ CAP = 9.0
 PASSES, WEIGHINGS = 3, 2
 FIRST, FIRST_MOVING = 8, 10
 """Scans after which a caller that stands, and one that moves, is searched for, at every second."""
-SECOND, LAST, APART = 20, 30, 0.15
-"""Scans after which one that stands is searched for once more, until it is found; by which share
-of its range the two places must differ for their mean to be taken."""
+SECOND, LAST, APART, WIDELY = 20, 30, 0.15, math.log(2.0)
+"""Scans after which one that stands is searched for once more, until it is found; logarithms of the
+factor by which its two ranges must differ for the mean of both places to be taken, and for the
+second alone."""
 
 
 class Found(NamedTuple):
@@ -72,7 +73,8 @@ def searched(caller: Caller, moves: bool) -> tuple[Caller, CallerPlace | None]:
     """Search for a caller by its tracks, if it is time; return it, and its place if that is news.
 
     One that stands is searched for twice. What the two windows tell is nearly independent, so where
-    they differ their mean is the better place.
+    they differ their mean is the better place; where they differ widely the first, of the shorter
+    way, is wrong.
     """
     tracks, first, scans = caller.tracks, caller.place, len(caller.tracks.poses)
     begin = SECOND if first is not None else FIRST_MOVING if moves else FIRST
@@ -86,10 +88,12 @@ def searched(caller: Caller, moves: bool) -> tuple[Caller, CallerPlace | None]:
         return caller, second._replace(agreed=moves or scans >= SECOND)
     x, y = tracks.poses[0, :2]
     far = [math.hypot(place.x - x, place.y - y) for place in (first, second)]
-    if abs(math.log(far[1] / far[0])) < APART:
+    apart = abs(math.log(far[1] / far[0]))
+    if apart < APART:
         return _agreed(caller, first), None
-    mean = 0.5 * (first.x + second.x), 0.5 * (first.y + second.y)
-    return caller, CallerPlace(*mean, agreed=True)
+    share = 1.0 if apart > WIDELY else 0.5
+    x, y = first.x + share * (second.x - first.x), first.y + share * (second.y - first.y)
+    return caller, CallerPlace(x, y, agreed=True)
 
 
 def _agreed(caller: Caller, place: CallerPlace) -> Caller:
