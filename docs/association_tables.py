@@ -51,7 +51,7 @@ def chosen(trials, strategy, radius, name, method, timing):
         (pl.col("strategy") == strategy)
         & (pl.col("filter") == name)
         & (pl.col("association.method") == method)
-        & (pl.col("listening.timing").cast(pl.Float64) == float(timing))
+        & (pl.col("listening.timing").cast(pl.Float64) == timing)
     )
     if strategy != "passive":
         cell = cell.filter(pl.col("emitter.radius") == radius)
@@ -83,10 +83,10 @@ def score_cell(known, unlabelled):
 def print_table(trials, cell):
     """Print a table of all methods that are there, and filters."""
     there = {*trials["association.method"].unique()}
-    timings = {*trials["listening.timing"].cast(pl.Float64).unique()}
+    timings = trials["listening.timing"].cast(pl.Float64).unique().sort(descending=True)
     print("\n| | " + " | ".join(name for name, *_ in COLUMNS) + " |")
     print("|---|" + "--:|" * len(COLUMNS))
-    for timing in (one for one in (True, False) if float(one) in timings):
+    for timing in timings:
         for name, words in FILTERS.items():
             for method in (one for one in METHODS if one in there):
                 cells = []

@@ -83,16 +83,16 @@ def searched(caller: Caller, moves: bool) -> tuple[Caller, CallerPlace | None]:
     found = find_moving_caller(tracks) if moves else find_caller(tracks)
     if found is None or not found.sure:
         return (caller if first is None or scans < LAST else _agreed(caller, first)), None
-    second = found.place
+    place = found.place
     if first is None:
-        return caller, second._replace(agreed=moves or scans >= SECOND)
+        return caller, place._replace(agreed=moves or scans >= SECOND)
     x, y = tracks.poses[0, :2]
-    far = [math.hypot(place.x - x, place.y - y) for place in (first, second)]
+    far = [math.hypot(one.x - x, one.y - y) for one in (first, place)]
     apart = abs(math.log(far[1] / far[0]))
     if apart < APART:
         return _agreed(caller, first), None
     share = 1.0 if apart > WIDELY else 0.5
-    x, y = first.x + share * (second.x - first.x), first.y + share * (second.y - first.y)
+    x, y = first.x + share * (place.x - first.x), first.y + share * (place.y - first.y)
     return caller, CallerPlace(x, y, agreed=True)
 
 

@@ -187,7 +187,8 @@ class _Work:
             caller = self.callers.get(number) or Caller(label=self._another())
             if caller.place is None or (caller.told and not caller.place.agreed):
                 caller, place = searched(self._followed(number, caller, row), number in self.moves)
-                news |= {} if place is None else {number: place}
+                if place is not None:
+                    news[number] = place
             self.callers[number] = caller
         return news
 
