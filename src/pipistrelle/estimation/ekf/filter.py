@@ -54,6 +54,7 @@ from pipistrelle.estimation.ekf.invariant_error import (
 from pipistrelle.estimation.measurement import columns_of, timings_of
 from pipistrelle.estimation.motion import Motion, motion_numbers
 from pipistrelle.estimation.rays import update_params
+from pipistrelle.estimation.recovery import recovered
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -79,6 +80,8 @@ class EkfBelief:
     innovations: Innovations = NO_INNOVATIONS
     error: float = LINEAR
     """`gaussian.LINEAR` or `gaussian.INVARIANT`."""
+    doubt: float = 0.0
+    """Evidence that the odometry has failed (`estimation.recovery`)."""
     origin: Float[np.ndarray, "2"] = field(default_factory=lambda: np.zeros(2))
     """Where the vehicle started [m], for the invariant error; (0, 0) for the linear one."""
 
@@ -131,6 +134,21 @@ class EkfBelief:
             state = removed(state, label)
         mean, covariance, landmark, weight = state
         return replace(self, mean=mean, covariance=covariance, landmark=landmark, weight=weight)
+
+    def freed(self, pose: Float[np.ndarray, "3"], stds: Float[np.ndarray, "3"]) -> "EkfBelief":
+        """Return the belief with the vehicle at a pose, with an independent error more."""
+        here = np.append(pose[:2] - self.origin, pose[2])
+        mean, P = np.append(here, self.mean[3:]), self.covariance.copy()
+        noise = np.zeros((mean.size, 3))
+        noise[:3] = np.diag(stds)
+        if self.error == INVARIANT:
+            for a, lever in enumerate(rotated_left((self.mean[:2] - here[:2])[np.newaxis])):
+                P[a] += lever * P[2]
+                P[:, a] += lever * P[:, 2]
+            noise[:2, 2] -= stds[2] * rotated_left(mean[np.newaxis, :2])
+            noise[3:, 2] = -stds[2] * rotated_left(mean[3:].reshape(-1, 2))
+        P += np.einsum("ia,ja->ij", noise, noise, optimize=False)
+        return replace(self, mean=mean, covariance=P)
 
 
 def _map_of(
@@ -348,6 +366,16 @@ class EkfSlam:
         scan = usable_scan(scan)
         if scan.landmark.size == 0:
             return belief
+        after = self._corrected(belief, scan)
+        if self.gate < 1.0:
+            found = recovered(belief, after, scan, self.gate, self.rays.range_bounds[1])
+            if isinstance(found, float):
+                return replace(after, doubt=found)
+            after = replace(self._corrected(*found), doubt=0.0)
+        return after
+
+    def _corrected(self, belief: EkfBelief, scan: Scan) -> EkfBelief:
+        """Correct the belief with the measurements that pass the gate."""
         mean, covariance, landmark, weight, gated, squared, degrees = corrected(
             belief.mean,
             belief.covariance,

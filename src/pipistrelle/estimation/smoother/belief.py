@@ -43,6 +43,8 @@ class SmootherBelief:
     rays: RayConfig
     gated: int = 0
     innovations: Innovations = NO_INNOVATIONS  # counted only with a gate
+    doubt: float = 0.0
+    """Evidence that the odometry has failed (`estimation.recovery`)."""
     found: dict[str, Any] = field(init=False, repr=False, default_factory=dict)
     """The optimum, once it has been asked for, and all covariances there."""
 
@@ -160,6 +162,27 @@ class SmootherBelief:
         poses = belief.placed(self.odometry, len(self.odometry.mean) - 1)
         ahead = Gaussian(mean=poses.mean[-1], covariance=poses.covariance[-1])
         return replace(belief, ahead=ahead)
+
+    def freed(self, pose: Float[np.ndarray, "3"], stds: Float[np.ndarray, "3"]) -> "SmootherBelief":
+        """Return the belief with the vehicle at a pose, with an independent error more.
+
+        The change and the error grow evenly over the control steps since the last node.
+        """
+        if not len(self.odometry.mean):
+            return self
+        x, y, turned = pose - self.at.mean
+        c, s = np.cos(self.at.mean[2]), np.sin(self.at.mean[2])
+        end = np.array([c * x + s * y, c * y - s * x, turned]) - self.odometry.mean[-1]
+        end[2] = wrap(end[2])
+        share = np.linspace(0.0, 1.0, len(self.odometry.mean) + 1)[1:, np.newaxis]
+        odometry = replace(
+            self.odometry,
+            mean=self.odometry.mean + share * end,
+            covariance=self.odometry.covariance + share[:, np.newaxis] * np.diag(stds * stds),
+        )
+        ahead = self.placed(odometry, len(share) - 1)
+        ahead = Gaussian(mean=ahead.mean[-1], covariance=ahead.covariance[-1])
+        return replace(self, odometry=odometry, ahead=ahead)
 
     def moving(self) -> Landmarks:
         """Return moving callers: a row for each in the chain, a ray for each heard just now."""

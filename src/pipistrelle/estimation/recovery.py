@@ -1,0 +1,336 @@
+r"""Recovery from a failure of the odometry: a skid, a slip, a push that it does not report.
+
+The gate tests measurements one by one against the predicted pose. After a skid all of them are
+improbable there, all would be rejected, and the vehicle would stay lost. So the odometry is tested,
+too. Each measurement is normal or an outlier, and the negative log likelihood of a pose x is, up to
+constants, the truncated sum of squares
+
+.. math:: c(x) = \sum_i \min(d_i^2(x), b_i)
+
+with :math:`d_i^2` the squared residual over its variance S (of the measurement and, given the pose,
+of the map). An outlier has a uniform density u: any bearing, any range up to the reach of the
+sensor. So :math:`b_i = -2 \ln u - \ln |2 \pi S|`, and no less than the bound of the gate.
+
+Where the odometry is discarded, the pose has a wide prior of information :math:`\Lambda_0`, and the
+scan costs by Laplace's approximation
+
+.. math:: c_1 = \min_x c(x) + \ln \frac{|\Lambda|}{|\Lambda_0|}
+
+with :math:`\Lambda` the information of the measurements that fit. So few measurements, which some
+pose always fits, are no evidence. The gain :math:`c(\hat x) - c_1` over the pose :math:`\hat x`
+that the filter found is summed over scans (Page's cumulative sum), and the odometry since the last
+scan is discarded once the sum exceeds the bound of three degrees of freedom. The minimum is found
+by graduated non-convexity.
+
+Page, Biometrika 41 (1954); Yang, Antonante, Tzoumas & Carlone, IEEE Robotics and Automation
+Letters 5 (2020).
+"""
+
+import math
+from dataclasses import replace
+from functools import cache
+from typing import Any, Protocol, Self, TypeVar
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+from pipistrelle.detection.scans import (
+    BEARING,
+    BEARING_STD,
+    EXCESS_PATH,
+    EXCESS_PATH_STD,
+    RANGE,
+    RANGE_STD,
+    UNLABELLED,
+    Scan,
+    rows_of,
+    with_columns,
+)
+from pipistrelle.estimation.beliefs import Belief, JointGaussian
+from pipistrelle.estimation.measurement import excess_path_slopes, observe
+from pipistrelle.estimation.rays import gate_bounds
+from pipistrelle.geometry import wrap_angle
+from pipistrelle.jit import Whole, kernel, no_alloc
+
+DEGREES = 3
+"""Numbers of a pose."""
+FASTER = 1.4
+"""Factor by which the cost is made less convex at each pass, Yang et al.'s."""
+SINGULAR = 1e-12
+"""Least variance of a predicted pose [m^2, rad^2]."""
+
+
+class Recoverable(Belief, Protocol):
+    """A belief that can lose its odometry."""
+
+    @property
+    def doubt(self) -> float:
+        """Sum of what discarding the odometry would have gained in the last scans."""
+        ...
+
+    def joint(self) -> JointGaussian:
+        """Return pose and landmarks together."""
+        ...
+
+    def freed(self, pose: Float[np.ndarray, "3"], stds: Float[np.ndarray, "3"]) -> Self:
+        """Return the belief with the vehicle at a pose, with an independent error more."""
+        ...
+
+
+B = TypeVar("B", bound=Recoverable)
+Fit = tuple[Float[np.ndarray, "3"], float, Bool[np.ndarray, "2 m"]]
+"""A pose, its cost, and of each row whether bearing with range and whether excess path fit."""
+
+
+@cache
+def odometry_bound(gate: float) -> float:
+    """Return the cost of odometry that is an outlier: the quantile of three degrees of freedom.
+
+    >>> round(odometry_bound(0.999), 2)
+    16.27
+    """
+    from scipy.special import gammaincinv
+
+    return float(2.0 * gammaincinv(0.5 * DEGREES, gate))
+
+
+def recovered(before: B, after: B, scan: Scan, gate: float, reach: float) -> tuple[B, Scan] | float:
+    """Test whether the odometry before a scan failed.
+
+    Parameters
+    ----------
+    before, after : Recoverable
+        Before and after the correction by the scan.
+    scan : Scan
+    gate : float
+        Share of a predicted distribution that is accepted.
+    reach : [m]
+        Standard deviation of each coordinate of the pose where odometry is discarded; that of the
+        heading is half a turn.
+
+    Returns
+    -------
+    tuple of Belief and Scan, or float
+        The belief before the scan without the odometry, and the measurements that fit it; or the
+        sum of gains, where the odometry is kept.
+    """
+    if after.gated == before.gated:
+        return 0.0
+    joint, bounds = before.joint(), (*gate_bounds(gate), reach)
+    problem = _problem(joint, scan)
+    stds = np.array([reach, reach, math.pi])
+    kept = _cost(problem, after.pose().mean, bounds)[0]
+    pose, cost, fits = _fitted(problem, joint.mean[:3], stds, bounds)
+    doubt = max(0.0, before.doubt + kept - cost)  # 0 where a cost is not a number
+    if doubt <= odometry_bound(gate):
+        return doubt
+    timed = np.where(fits[1], scan.excess_path, np.nan)
+    freed: Any = before.freed(pose, stds)
+    free = replace(freed, gated=before.gated + int((~fits).sum()))
+    return free, rows_of(with_columns(scan, excess_path=timed), fits[0])
+
+
+Problem = tuple[Float[np.ndarray, "8 m"], Int[np.ndarray, "2 m"], np.ndarray, np.ndarray]
+"""Numbers of a scan's rows, where landmark and caller of each stand in the joint mean (-1:
+nowhere), this mean, and its covariance given the pose."""
+Bounds = tuple[float, float, float]
+"""Bounds of the gate for one and for two numbers, and the reach of the sensor [m]."""
+
+
+def _problem(joint: JointGaussian, scan: Scan) -> Problem:
+    """Return a scan and the map as kernels take them."""
+    at = {label: 3 + 2 * n for n, label in enumerate(joint.landmark.tolist())}
+    calls = [scan.callers[n] if n < scan.callers.size else UNLABELLED for n in scan.caller]
+    landmarks = [at.get(label, -1) for label in scan.landmark.tolist()]
+    ends = np.array([landmarks, [at.get(int(label), -1) for label in calls]], np.int64)
+    numbers = np.ascontiguousarray(scan.numbers)
+    return numbers, ends, joint.mean, _given_pose(joint.covariance)
+
+
+@kernel
+def _given_pose(P: Float[np.ndarray, "d d"]) -> Float[np.ndarray, "d d"]:
+    """Return the covariance of the landmarks given the pose, by eliminating its three numbers."""
+    left = P.copy()
+    for e in range(3):
+        pivot, row = max(left[e, e], SINGULAR), left[e].copy()
+        for i in range(P.shape[0]):
+            for j in range(P.shape[0]):
+                left[i, j] -= row[i] * row[j] / pivot
+    return left
+
+
+@kernel
+def _fitted(
+    problem: Problem,
+    predicted: Float[np.ndarray, "3"],
+    stds: Float[np.ndarray, "3"],
+    bounds: Bounds,
+) -> Fit:
+    """Return the pose that costs least, by graduated non-convexity from the predicted one."""
+    pose, (_, ratios) = predicted.copy(), _cost(problem, predicted, bounds)
+    largest = max(ratios.max(), 1.0)
+    convexity = 1.0 / (2.0 * largest - 1.0)
+    weights, sharp = np.ones(ratios.shape), False
+    while not sharp and convexity <= largest:
+        _step(problem, pose, weights, predicted, stds)
+        _, ratios = _cost(problem, pose, bounds)
+        sharp = True
+        for p in range(2):
+            for m in range(ratios.shape[1]):
+                ratio = ratios[p, m]
+                if ratio * (convexity + 1.0) <= convexity:
+                    weights[p, m] = 1.0
+                elif ratio * convexity >= convexity + 1.0:
+                    weights[p, m] = 0.0
+                else:
+                    root = math.sqrt(convexity * (convexity + 1.0) / ratio)
+                    weights[p, m], sharp = root - convexity, False
+        convexity *= FASTER
+    _step(problem, pose, weights, predicted, stds)
+    information = _step(problem, pose, weights, predicted, stds)
+    cost, ratios = _cost(problem, pose, bounds)
+    for std in stds:
+        information += 2.0 * math.log(std)
+    return pose, cost + information, ratios <= 1.0
+
+
+@kernel
+def _cost(
+    problem: Problem, pose: Float[np.ndarray, "3"], bounds: Bounds
+) -> tuple[float, Float[np.ndarray, "2 m"]]:
+    """Return the cost of a pose, and of each measurement the squared residual over its bound.
+
+    The first row is of bearings with ranges, the second of excess paths; 0 where there is none.
+    """
+    ratios, cost = np.zeros(problem[1].shape), 0.0
+    A, g = np.zeros((3, 3)), np.zeros(3)
+    for m in range(ratios.shape[1]):
+        squared, det, size = _direction(problem, pose, m, 0.0, A, g)
+        late, variance = _lateness(problem, pose, m, 0.0, A, g)
+        spread = 2.0 * math.pi if size == 1 else 2.0 * math.pi * bounds[2]
+        most = _outlier(spread, det, size, bounds)
+        latest = _outlier(2.0 * bounds[2], variance, 1, bounds)
+        ratios[0, m], ratios[1, m] = squared / most, late / latest
+        cost += min(squared, most) + min(late, latest)
+    return cost, ratios
+
+
+@no_alloc
+def _outlier(spread: float, det: float, size: Whole, bounds: Bounds) -> float:
+    """Return the cost of an outlier, uniform over a spread, beside a normal measurement's."""
+    return max(2.0 * math.log(spread) - math.log((2.0 * math.pi) ** size * det), bounds[size - 1])
+
+
+@kernel
+def _step(
+    problem: Problem,
+    pose: Float[np.ndarray, "3"],
+    weights: Float[np.ndarray, "2 m"],
+    predicted: Float[np.ndarray, "3"],
+    stds: Float[np.ndarray, "3"],
+) -> float:
+    """Take a step of Gauss and Newton with weighted measurements, in place.
+
+    Returns the logarithm of the determinant of the information.
+    """
+    information, A, g = 0.0, np.zeros((3, 3)), np.zeros(3)
+    for a in range(3):
+        off = predicted[a] - pose[a]
+        A[a, a] = 1.0 / stds[a] ** 2
+        g[a] = A[a, a] * (wrap_angle(off) if a == 2 else off)
+    for m in range(weights.shape[1]):
+        _direction(problem, pose, m, weights[0, m], A, g)
+        _lateness(problem, pose, m, weights[1, m], A, g)
+    for e in range(3):
+        for i in range(e + 1, 3):
+            share = A[i, e] / A[e, e]
+            g[i] -= share * g[e]
+            for j in range(e, 3):
+                A[i, j] -= share * A[e, j]
+    for e in range(2, -1, -1):
+        for j in range(e + 1, 3):
+            g[e] -= A[e, j] * g[j]
+        g[e] /= A[e, e]
+        pose[e] += g[e]
+        information += math.log(A[e, e])
+    pose[2] = wrap_angle(pose[2])
+    return information
+
+
+@no_alloc
+def _direction(
+    problem: Problem,
+    pose: Float[np.ndarray, "3"],
+    m: Whole,
+    weight: float,
+    A: Float[np.ndarray, "3 3"],
+    g: Float[np.ndarray, "3"],
+) -> tuple[float, float, Whole]:
+    """Return the squared residual of a bearing, with its range if any, |S| and their number.
+
+    Weighted, they are added to the normal equations. A row without a bearing, or of a landmark that
+    is not on the map, has residual 0.
+    """
+    numbers, ends, mean, C = problem
+    i = ends[0, m]
+    if i < 0 or math.isnan(numbers[BEARING, m]):
+        return 0.0, 1.0, 1
+    distance, bearing, c, s, k = observe(pose[0], pose[1], pose[2], mean[i], mean[i + 1])
+    xx, xy, yy = C[i, i], C[i, i + 1], C[i + 1, i + 1]
+    nu = wrap_angle(numbers[BEARING, m] - bearing)
+    bb = (s * s * xx - 2.0 * s * c * xy + c * c * yy) * k * k + numbers[BEARING_STD, m] ** 2
+    h0, h1 = s * k, -c * k
+    if math.isnan(numbers[RANGE, m]):
+        _add(A, g, (h0, h1, -1.0), weight / bb, nu)
+        return nu * nu / bb, bb, 1
+    off = numbers[RANGE, m] - distance
+    rr = c * c * xx + 2.0 * c * s * xy + s * s * yy + numbers[RANGE_STD, m] ** 2
+    br = (-s * c * xx + (c * c - s * s) * xy + c * s * yy) * k
+    # The range by itself, then the bearing given the range: two independent numbers.
+    share = br / rr
+    rest, left = nu - share * off, bb - share * br
+    _add(A, g, (-c, -s, 0.0), weight / rr, off)
+    _add(A, g, (h0 + share * c, h1 + share * s, -1.0), weight / left, rest)
+    return off * off / rr + rest * rest / left, rr * left, 2
+
+
+@no_alloc
+def _lateness(
+    problem: Problem,
+    pose: Float[np.ndarray, "3"],
+    m: Whole,
+    weight: float,
+    A: Float[np.ndarray, "3 3"],
+    g: Float[np.ndarray, "3"],
+) -> tuple[float, float]:
+    """Return the squared residual of an excess path and S; add it to the normal equations."""
+    numbers, ends, mean, C = problem
+    i, j = ends[0, m], ends[1, m]
+    if i < 0 or j < 0 or i == j or math.isnan(numbers[EXCESS_PATH, m]):
+        return 0.0, 1.0
+    path, lx, ly, cx, cy = excess_path_slopes(
+        pose[0], pose[1], mean[i], mean[i + 1], mean[j], mean[j + 1]
+    )
+    slopes, at = (lx, ly, cx, cy), (i, i + 1, j, j + 1)
+    variance = numbers[EXCESS_PATH_STD, m] ** 2
+    for a in range(4):
+        for b in range(4):
+            variance += slopes[a] * C[at[a], at[b]] * slopes[b]
+    nu = numbers[EXCESS_PATH, m] - path
+    _add(A, g, (-lx - cx, -ly - cy, 0.0), weight / variance, nu)
+    return nu * nu / variance, variance
+
+
+@no_alloc
+def _add(
+    A: Float[np.ndarray, "3 3"],
+    g: Float[np.ndarray, "3"],
+    slopes: tuple[float, float, float],
+    weight: float,
+    residual: float,
+) -> None:
+    """Add a number with its slopes to the normal equations."""
+    for a in range(3):
+        g[a] += weight * slopes[a] * residual
+        for b in range(3):
+            A[a, b] += weight * slopes[a] * slopes[b]
