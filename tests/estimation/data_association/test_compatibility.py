@@ -9,7 +9,11 @@ import pytest
 from pipistrelle.detection.scans import make_scan
 from pipistrelle.estimation.association import expected
 from pipistrelle.estimation.beliefs import JointGaussian
-from pipistrelle.estimation.data_association.compatibility import gates, jointly_compatible
+from pipistrelle.estimation.data_association.compatibility import (
+    MOST_ROWS,
+    gates,
+    jointly_compatible,
+)
 from pipistrelle.estimation.data_association.pairs import OWN_CALL, pair_costs, pair_innovations
 
 CHANCES = (25.0, 0.06, 1.3, 0.8, 0.06)
@@ -109,3 +113,19 @@ def test_a_scan_of_many_rows_ends_within_its_bound():
 def test_no_rows_and_no_landmarks_are_no_harm():
     assert jointly_compatible(np.empty((0, 3)), None).tolist() == []
     assert jointly_compatible(np.empty((2, 0)), None).tolist() == [-1, -1]
+
+
+def test_more_rows_than_are_tested_together_find_their_landmarks_too():
+    rng = np.random.default_rng(2)
+    size = 2 * MOST_ROWS + 7
+    places = rng.uniform(-300.0, 300.0, (size, 2))
+    joint = JointGaussian(
+        landmark=np.arange(size), mean=np.append(np.zeros(3), places),
+        covariance=1e-6 * np.eye(3 + 2 * size),
+    )  # fmt: skip
+    order = rng.permutation(size)
+    bearing = np.arctan2(places[order, 1], places[order, 0])
+    way, ones = np.hypot(*places[order].T), np.ones(size)
+    columns = bearing, 0.001 * ones, way, 0.03 * ones, ones
+    costs, innovate = costs_and_innovations(joint, columns)
+    np.testing.assert_array_equal(jointly_compatible(costs, innovate), order)

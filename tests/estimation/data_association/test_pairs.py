@@ -13,7 +13,7 @@ from pipistrelle.estimation.data_association.pairs import (
     UNPLACED,
     Rows,
     pair_costs,
-    with_point,
+    with_points,
 )
 
 CHANCES = (1e9, 0.06, 1.2, 0.8, 0.06)
@@ -100,7 +100,7 @@ def test_a_bearing_is_compared_across_the_cut_behind():
 
 def test_a_new_point_is_correlated_with_the_pose_as_the_filter_makes_it():
     joint = joint_of(3, std=0.01)
-    more = with_point(joint, 9, 0.4, 3.0, (0.02, 0.1))
+    more = with_points(joint, [9], tuple(np.array([[0.4], [3.0], [0.02], [0.1]])))
     rng = np.random.default_rng(0)
     drawn = rng.multivariate_normal(joint.mean, joint.covariance, 200_000)
     bearing, far = rng.normal(0.4, 0.02, 200_000), rng.normal(3.0, 0.1, 200_000)
@@ -109,3 +109,14 @@ def test_a_new_point_is_correlated_with_the_pose_as_the_filter_makes_it():
     sampled = np.cov(np.column_stack([drawn, x, y]).T)
     np.testing.assert_allclose(more.covariance, sampled, atol=2e-4)
     assert more.landmark.tolist() == [*joint.landmark.tolist(), 9]
+
+
+def test_new_points_at_once_are_to_the_bit_new_points_one_by_one():
+    points = np.array([[0.4, -1.0, 2.0], [3.0, 0.5, 7.0], [0.02, 0.1, 0.01], [0.1, 0.2, 0.05]])
+    joint = one_by_one = joint_of(3, std=0.01)
+    for n in range(3):
+        one_by_one = with_points(one_by_one, [7 + n], tuple(points[:, [n]]))
+    at_once = with_points(joint, [7, 8, 9], tuple(points))
+    np.testing.assert_array_equal(at_once.mean, one_by_one.mean)
+    np.testing.assert_array_equal(at_once.covariance, one_by_one.covariance)
+    np.testing.assert_array_equal(at_once.landmark, one_by_one.landmark)

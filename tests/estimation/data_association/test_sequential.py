@@ -324,3 +324,12 @@ def test_no_world_of_four_hundred_landmarks_is_lost(seed):
     )  # fmt: skip
     assert found.position_rmse_aligned_m < 3.0 * known.position_rmse_aligned_m
     assert found.associated_right > 0.94
+
+
+@pytest.mark.parametrize("method", ["nearest", "joint", "marginal"])
+def test_a_scan_of_two_thousand_rows_begins_as_many_landmarks(method):
+    rng = np.random.default_rng(4)
+    places = rng.permutation(2000)[:, None] * np.array([0.0, 0.5]) + np.array([5.0, -500.0])
+    session = session_of("iekf", method)
+    session.hear(scan_of(places))
+    assert np.unique(session.labels[-1]).size == 2000

@@ -26,8 +26,9 @@ from pipistrelle.jit import Whole, kernel, no_alloc
 
 CONFIDENCE = 0.999
 """Share of right sets that are within the gate."""
-MOST_NODES = 3000
-"""How many pairs are tried at most in a scan of one caller."""
+MOST_NODES, MOST_ROWS = 3000, 100
+"""How many pairs are tried at most, and how many rows are tested together: the work grows with the
+cube of their number. Of each row only so many landmarks take part as can be tried."""
 
 
 @cache
@@ -55,10 +56,28 @@ def jointly_compatible(
         return found
     order = np.lexsort((costs[row, landmark], row))
     row, landmark = row[order], landmark[order]
+    rows, begins, counts = np.unique(row, return_index=True, return_counts=True)
+    likely = np.arange(row.size) - np.repeat(begins, counts) < MOST_NODES // min(
+        rows.size, MOST_ROWS
+    )
+    row, landmark = row[likely], landmark[likely]
+    for first in range(0, rows.size, MOST_ROWS):
+        part = (row >= rows[first]) & (row <= rows[first : first + MOST_ROWS][-1])
+        part &= ~np.isin(landmark, found)  # what rows before have taken
+        _match_together(found, row[part], landmark[part], innovate)
+    return found
+
+
+def _match_together(
+    found: Int[np.ndarray, " m"],
+    row: Int[np.ndarray, " p"],
+    landmark: Int[np.ndarray, " p"],
+    innovate: Innovate,
+) -> None:
+    """Write the landmarks of rows by the largest compatible set of some pairs, row by row."""
     options = np.append(np.flatnonzero(np.diff(row, prepend=-1)), row.size)
     pairs = _search(options, landmark, innovate((row, landmark)), gates(2 * (options.size - 1)))
     found[row[pairs]] = landmark[pairs]
-    return found
 
 
 @kernel

@@ -78,15 +78,18 @@ def marginal(
 @kernel
 def _what_is_sure(costs: Float[np.ndarray, "m n"]) -> Int[np.ndarray, " m"]:
     """Return the landmark of each row where that is sure, or NOTHING."""
-    shares, found = probabilities(costs), np.full(costs.shape[0], NOTHING)
-    for i in range(found.size):
-        best, of_any = NOTHING, 0.0
-        for j in range(costs.shape[1]):
-            of_any += shares[i, j]
-            if best == NOTHING or shares[i, j] > shares[i, best]:
-                best = j
-        if of_any > LIKELY and shares[i, best] >= SURE * of_any:
-            found[i] = best
+    rows, landmarks, shares = _shares(costs)
+    found, first = np.full(costs.shape[0], NOTHING), 0
+    while first < rows.size:
+        last, best, of_any = first, first, 0.0
+        while last < rows.size and rows[last] == rows[first]:
+            of_any += shares[last]
+            if shares[last] > shares[best]:
+                best = last
+            last += 1
+        if of_any > LIKELY and shares[best] >= SURE * of_any:
+            found[rows[first]] = landmarks[best]
+        first = last
     return found
 
 
@@ -97,42 +100,54 @@ def probabilities(costs: Float[np.ndarray, "m n"]) -> Float[np.ndarray, "m n"]:
     >>> probabilities(np.array([[0.0]]))
     array([[0.5]])
     """
-    weight, (rows, landmarks) = _weights(costs), costs.shape
-    to_row = np.ones((landmarks, rows))
-    for _ in range(MESSAGES):
-        moved, total = 0.0, np.ones(landmarks)
-        to_landmark = np.empty((rows, landmarks))
-        for i in range(rows):
-            sum_ = 1.0
-            for j in range(landmarks):
-                sum_ += weight[i, j] * to_row[j, i]
-            for j in range(landmarks):
-                others = max(sum_ - weight[i, j] * to_row[j, i], 1.0)
-                to_landmark[i, j] = weight[i, j] / others
-                total[j] += to_landmark[i, j]
-        for i in range(rows):
-            for j in range(landmarks):
-                message = 1.0 / max(total[j] - to_landmark[i, j], 1.0)
-                moved = max(moved, abs(message - to_row[j, i]))
-                to_row[j, i] = message
-        if moved < STAY:
-            break
-    shares = np.empty((rows, landmarks))
-    for i in range(rows):
-        sum_ = 1.0
-        for j in range(landmarks):
-            sum_ += weight[i, j] * to_row[j, i]
-        for j in range(landmarks):
-            shares[i, j] = weight[i, j] * to_row[j, i] / sum_
+    (rows, landmarks, values), shares = _shares(costs), np.zeros(costs.shape)
+    for p in range(rows.size):
+        shares[rows[p], landmarks[p]] = values[p]
     return shares
 
 
 @kernel
-def _weights(costs: Float[np.ndarray, "m n"]) -> Float[np.ndarray, "m n"]:
-    """Return the weight of each pair; most are beyond the gate, and have none."""
-    weight = np.zeros(costs.shape)
-    for i in range(costs.shape[0]):
-        for j in range(costs.shape[1]):
-            if costs[i, j] < np.inf:
-                weight[i, j] = math.exp(min(-0.5 * costs[i, j], LARGEST))
-    return weight
+def _shares(
+    costs: Float[np.ndarray, "m n"],
+) -> tuple[Int[np.ndarray, " p"], Int[np.ndarray, " p"], Float[np.ndarray, " p"]]:
+    """Return the pairs that are within the gate, row by row, and the probability of each."""
+    (m, n), (rows, landmarks) = costs.shape, np.nonzero(costs < np.inf)
+    size, beyond = rows.size, np.full(n, m)
+    weight, to_row, to_landmark = np.empty(size), np.ones(size), np.empty(size)
+    for p in range(size):
+        weight[p] = math.exp(min(-0.5 * costs[rows[p], landmarks[p]], LARGEST))
+        beyond[landmarks[p]] -= 1
+    sums, total, to_others = np.empty(m), np.empty(n), np.ones(n)
+    for _ in range(MESSAGES):
+        moved = 0.0
+        _sum_up(sums, rows, weight, to_row)
+        total[:] = 1.0
+        for p in range(size):
+            others = max(sums[rows[p]] - weight[p] * to_row[p], 1.0)
+            to_landmark[p] = weight[p] / others
+            total[landmarks[p]] += to_landmark[p]
+        for p in range(size):
+            message = 1.0 / max(total[landmarks[p]] - to_landmark[p], 1.0)
+            moved = max(moved, abs(message - to_row[p]))
+            to_row[p] = message
+        for j in range(n):
+            if beyond[j] > 0:  # rows of which this landmark is beyond the gate
+                moved = max(moved, abs(1.0 / total[j] - to_others[j]))
+                to_others[j] = 1.0 / total[j]
+        if moved < STAY:
+            break
+    _sum_up(sums, rows, weight, to_row)
+    return rows, landmarks, weight * to_row / sums[rows]
+
+
+@kernel
+def _sum_up(
+    sums: Float[np.ndarray, " m"],
+    rows: Int[np.ndarray, " p"],
+    weight: Float[np.ndarray, " p"],
+    to_row: Float[np.ndarray, " p"],
+) -> None:
+    """Write one and the weighted messages to each row."""
+    sums[:] = 1.0
+    for p in range(rows.size):
+        sums[rows[p]] += weight[p] * to_row[p]

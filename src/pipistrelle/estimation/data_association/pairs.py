@@ -190,45 +190,47 @@ def _spread(
     return across, both, along
 
 
-def with_point(
-    joint: JointGaussian, label: int, bearing: float, distance: float, stds: tuple[float, float]
+def with_points(
+    joint: JointGaussian, labels: list[int], points: tuple[Float[np.ndarray, " n"], ...]
 ) -> JointGaussian:
-    """Return a joint Gaussian with a landmark at a bearing and a range more.
+    """Return a joint Gaussian with new landmarks, each measured by bearing and range.
 
-    ``stds``: of bearing [rad] and range [m].
+    ``points``: bearings [rad], ranges [m], and the standard deviations of both.
 
     >>> here = JointGaussian(
     ...     landmark=np.empty(0, int), mean=np.zeros(3), covariance=np.diag([0.0, 0.0, 0.01]))
-    >>> there = with_point(here, 7, 0.0, 2.0, (0.1, 0.2))
+    >>> there = with_points(here, [7], tuple(np.array([[0.0], [2.0], [0.1], [0.2]])))
     >>> there.mean[3:], there.covariance[3:, 3:].round(9)
     (array([2., 0.]), array([[0.04, 0.  ],
            [0.  , 0.08]]))
     """
-    point = bearing, distance, *stds
-    mean, covariance = _with_point(joint.mean, joint.covariance, point)
-    landmark = np.append(joint.landmark, label)
+    mean, covariance = _with_points(joint.mean, joint.covariance, points)
+    landmark = np.append(joint.landmark, labels)
     return JointGaussian(landmark=landmark, mean=mean, covariance=covariance)
 
 
 @kernel
-def _with_point(
+def _with_points(
     mean: Float[np.ndarray, " d"],
     covariance: Float[np.ndarray, "d d"],
-    point: tuple[float, float, float, float],
-) -> tuple[Float[np.ndarray, " d+2"], Float[np.ndarray, "d+2 d+2"]]:
-    """Return mean and covariance with a point more: bearing, range and their deviations."""
-    d, (bearing, distance, bearing_std, range_std) = mean.size, point
-    towards = math.cos(mean[2] + bearing), math.sin(mean[2] + bearing)
-    turn = -distance * towards[1], distance * towards[0]
-    more, P = np.empty(d + 2), np.empty((d + 2, d + 2))
-    more[:d], P[:d, :d] = mean, covariance
-    for a in range(2):
-        more[d + a] = mean[a] + distance * towards[a]
-        for i in range(d):
-            P[d + a, i] = P[i, d + a] = covariance[a, i] + turn[a] * covariance[2, i]
-    for a in range(2):
-        for b in range(2):
-            across = (turn[a] * bearing_std) * (turn[b] * bearing_std)
-            along = (towards[a] * range_std) * (towards[b] * range_std)
-            P[d + a, d + b] = P[d + a, b] + P[d + a, 2] * turn[b] + (across + along)
+    points: tuple[Float[np.ndarray, " n"], ...],
+) -> tuple[Float[np.ndarray, " e"], Float[np.ndarray, "e e"]]:
+    """Return mean and covariance with new points: bearings, ranges and their deviations."""
+    bearing, distance, bearing_std, range_std = points
+    size, whole = mean.size, mean.size + 2 * bearing.size
+    more, P = np.empty(whole), np.empty((whole, whole))
+    more[:size], P[:size, :size] = mean, covariance
+    for n in range(bearing.size):
+        d, far = size + 2 * n, distance[n]
+        towards = math.cos(mean[2] + bearing[n]), math.sin(mean[2] + bearing[n])
+        turn = -far * towards[1], far * towards[0]
+        for a in range(2):
+            more[d + a] = mean[a] + far * towards[a]
+            for i in range(d):
+                P[d + a, i] = P[i, d + a] = P[a, i] + turn[a] * P[2, i]
+        for a in range(2):
+            for b in range(2):
+                across = (turn[a] * bearing_std[n]) * (turn[b] * bearing_std[n])
+                along = (towards[a] * range_std[n]) * (towards[b] * range_std[n])
+                P[d + a, d + b] = P[d + a, b] + P[d + a, 2] * turn[b] + (across + along)
     return more, P

@@ -56,7 +56,7 @@ from pipistrelle.estimation.data_association.pairs import (
     Rows,
     pair_costs,
     pair_innovations,
-    with_point,
+    with_points,
 )
 from pipistrelle.estimation.data_association.rows import (
     Joint,
@@ -218,8 +218,7 @@ class _Work:
         self._judge_caller(number, count)
         if begun.size and number in self.moves and self._is_elsewhere(number, count):
             return
-        for row in begun.tolist():
-            self._bear(number, row)
+        self._begin(number, begun)
 
     def _is_elsewhere(self, number: int, count: tuple[int, int]) -> bool:
         """Tell whether a caller must be elsewhere than expected: few of its rows are of landmarks.
@@ -394,14 +393,15 @@ class _Work:
                 return
         self.label[row] = label
 
-    def _bear(self, number: int, row: int) -> None:
-        """Begin a landmark with a row."""
-        label, rows = self._another(), self.rows
-        self.label[row] = label
-        self.new.append(label)
-        if number == OWN:
-            stds = rows.bearing_std[row], rows.way_std[row]
-            self.joint = with_point(self.joint, label, rows.bearing[row], rows.way[row], stds)
+    def _begin(self, number: int, begun: Int[np.ndarray, " b"]) -> None:
+        """Begin a landmark with each of some rows."""
+        labels, rows = [self._another() for _ in begun], self.rows
+        self.label[begun] = labels
+        self.new += labels
+        if number == OWN and labels:
+            numbers = (rows.bearing, rows.way, rows.bearing_std, rows.way_std)
+            points = tuple(column[begun] for column in numbers)
+            self.joint = with_points(self.joint, labels, points)
 
     def _judge_caller(self, number: int, count: tuple[int, int]) -> None:
         """Remember how many of a caller's sure rows are of landmarks, and how many there are."""
