@@ -49,6 +49,8 @@ def _field(store, description, value):
     (node_of_one, one), size = inner
     if int(node_of_one) == NAME:
         return [made(store, one, each) for each in value or ()]
+    if one[0] == "string":
+        return list(value or [""] * size)
     numbers = np.zeros(size if node == ARRAY else 0) if value is None else value
     return np.asarray(numbers, dtype=one[0])
 
@@ -104,6 +106,7 @@ def write_bag(path, messages, *, late=0.0, definitions=True, compression=None):
     """Write a bag: a .bag, a .mcap or .db3 alone, or a folder with the storage that it names.
 
     `messages`: topic, type, time and what is told, each; they are received `late` [s] later.
+    `definitions`: whether the bag has them, or the text of each topic that has another.
     """
     path = Path(path)
     if path.suffix == ".bag":
@@ -119,6 +122,8 @@ def write_bag(path, messages, *, late=0.0, definitions=True, compression=None):
         for topic, name, time, told in messages:
             if topic not in known:
                 said = {"typestore": store} if definitions else {"msgdef": "", "rihs01": "RIHS01_0"}
+                if isinstance(definitions, dict) and topic in definitions:
+                    said = {"msgdef": definitions[topic], "rihs01": "RIHS01_0"}
                 known[topic] = writer.add_connection(topic, name, **said)
             data = store.serialize_cdr(made(store, name, told), name)
             writer.write(known[topic], round((time + late) * 1e9), data)

@@ -1,9 +1,8 @@
 """ROS bags, opened without ROS: which topics they hold, and the messages of some.
 
 ROS 1 files (.bag) and those of ROS 2 (.mcap, .db3, and their folders) are read by the package
-rosbags, of the extra ``ros``. A type is read as the bag defines it, else as rosbags or
-`DEFINITIONS` do. What parses somebody's bytes may fail in any way, and each is refused with the
-file and topic.
+rosbags, of the extra ``ros``. `bag_definitions` says by which types messages are decoded. What
+parses a file's bytes may fail in any way, and each failure is refused with the file and topic.
 """
 
 from collections.abc import Callable, Iterable, Iterator
@@ -13,7 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from pipistrelle.config import InputError
-from pipistrelle.detection.logs.bag_messages import DEFINITIONS
+from pipistrelle.detection.logs.bag_definitions import types_of
 from pipistrelle.detection.logs.readers import storages
 from pipistrelle.files import check_ordinary
 from pipistrelle.refusals import meant, refusal, shown
@@ -23,8 +22,6 @@ if TYPE_CHECKING:
 
 MOST_METADATA = 1_000_000
 """Of what a folder says of its files [bytes]; more would take minutes to read."""
-_IDL = "=" * 80 + "\n"
-"""Line between the files of a definition in IDL; the name of the file follows it."""
 
 
 class Message(NamedTuple):
@@ -95,7 +92,7 @@ class Bag:
         decoders = {}
         for one in wanted:
             with faults_named(f"{self.path}, topic {one.topic}"):
-                decoders[one.topic, one.msgtype] = _decoder(one)
+                decoders[one.id] = _decoder(one)
         count = dict.fromkeys((one.topic for one in wanted), 0)
         raw = iter(self._reader.messages(connections=wanted))
         while True:
@@ -107,7 +104,7 @@ class Bag:
             topic = connection.topic
             count[topic] += 1
             with faults_named(f"{self.path}, topic {topic}, message {count[topic]}"):
-                content = decoders[topic, connection.msgtype](data)
+                content = decoders[connection.id](data)
             yield Message(topic, count[topic], stamp / 1e9, content)
 
     def _check_whole(self, count: dict[str, int]) -> None:
@@ -210,27 +207,15 @@ _MEND = "mend it (`ros2 bag reindex`, `mcap recover`, `rosbag reindex`), or reco
 
 
 def _decoder(connection: "Connection") -> Callable[[bytes], Any]:
-    """Return what reads the messages of a connection, by the bag's own definition if it has one."""
+    """Return what reads the messages of a connection."""
     from rosbags.interfaces import ConnectionExtRosbag1, MessageDefinitionFormat
-    from rosbags.typesys import Stores, get_types_from_idl, get_types_from_msg, get_typestore
 
-    first, name, told = isinstance(connection.ext, ConnectionExtRosbag1), connection.msgtype, {}
-    text = connection.msgdef.data
-    if text.strip() and connection.msgdef.format == MessageDefinitionFormat.MSG:
-        told = get_types_from_msg(text, name)
-    elif text.strip() and connection.msgdef.format == MessageDefinitionFormat.IDL:
-        parts = [part.partition("\n")[2] for part in text.split(_IDL) if part.startswith("IDL: ")]
-        for part in parts or [text]:
-            told |= get_types_from_idl(part)
-    if told:
-        store = get_typestore(Stores.EMPTY)
-        store.register(told)
-    else:
-        store = get_typestore(Stores.ROS1_NOETIC if first else Stores.ROS2_HUMBLE)
-        for known, fields in DEFINITIONS.items():
-            store.register(get_types_from_msg(fields, known))
+    first, name = isinstance(connection.ext, ConnectionExtRosbag1), connection.msgtype
     form = getattr(connection.ext, "serialization_format", "cdr")
     if form != "cdr":
         raise InputError(f"found messages as {form}, expected CDR; convert the bag")
+    language, text = connection.msgdef
+    idl, told = language == MessageDefinitionFormat.IDL, language != MessageDefinitionFormat.NONE
+    store = types_of(name, text if told else "", idl=idl, first=first)
     read = store.deserialize_ros1 if first else store.deserialize_cdr
     return lambda data: read(data, name)

@@ -11,7 +11,8 @@ from jaxtyping import Float
 from pipistrelle.detection.logs.bag_messages import Pose, pose_of
 
 TRANSFORMS = "/tf_static"
-"""The topic of the static transforms."""
+TRANSFORMS_TYPE = "tf2_msgs/msg/TFMessage"
+"""The topic of the static transforms, and the type of its messages."""
 
 
 class Frames:

@@ -17,7 +17,7 @@ from pipistrelle.config import BagConfig
 from pipistrelle.detection.logs.bag import Message, faults_named, opened
 from pipistrelle.detection.logs.bag_frames import TRANSFORMS, Frames, along_axis, bare, planar
 from pipistrelle.detection.logs.bag_messages import ANGLES, CONES, ECHOES, POSES, Echoes, Pose
-from pipistrelle.detection.logs.bag_topics import echoes_of, odometry_of, truth_of
+from pipistrelle.detection.logs.bag_topics import echoes_of, odometry_of, transforms_of, truth_of
 from pipistrelle.detection.logs.poses import MOTION_COVARIANCE, POSE
 from pipistrelle.detection.logs.recording import Log, assemble
 from pipistrelle.detection.logs.text_tables import Table, check_columns, place_of
@@ -71,7 +71,7 @@ def read_bag(
     with opened(path) as bag:
         odometry = odometry_of(bag, settings)
         heard = {name: TopicEchoes(bag.topics[name].type) for name in echoes_of(bag, settings)}
-        for message in bag.messages(dict.fromkeys([odometry, TRANSFORMS, *heard])):
+        for message in bag.messages(dict.fromkeys([odometry, *transforms_of(bag), *heard])):
             with faults_named(f"{path}, topic {message.topic}, message {message.number}"):
                 if message.topic == odometry:
                     driven.append((message.number, *step_row(message, settings)))

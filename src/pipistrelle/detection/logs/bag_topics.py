@@ -4,7 +4,7 @@ from collections.abc import Iterable
 
 from pipistrelle.config import BagConfig
 from pipistrelle.detection.logs.bag import Bag, Topic
-from pipistrelle.detection.logs.bag_frames import TRANSFORMS
+from pipistrelle.detection.logs.bag_frames import TRANSFORMS, TRANSFORMS_TYPE
 from pipistrelle.detection.logs.bag_messages import ECHOES, ODOMETRY, POSES
 from pipistrelle.refusals import refusal
 
@@ -31,6 +31,15 @@ def echoes_of(bag: Bag, settings: BagConfig) -> list[str]:
         expected = f"a topic of {', '.join(ECHOES)}"
         raise refusal(bag.path, "no echoes", expected, "--topics lists what there is")
     return names
+
+
+def transforms_of(bag: Bag) -> list[str]:
+    """Return the topic of the static transforms, if the bag has it."""
+    there = bag.topics.get(TRANSFORMS)
+    if there is not None and there.type != TRANSFORMS_TYPE:
+        where, fix = f"{bag.path}, topic {TRANSFORMS}", "leave the topic out of the bag"
+        raise refusal(where, f"the type {there.type}", TRANSFORMS_TYPE, fix)
+    return [] if there is None else [TRANSFORMS]
 
 
 def truth_of(bag: Bag, settings: BagConfig) -> str | None:
