@@ -145,10 +145,10 @@ def _labels(recorded: "Log") -> set[int]:
 
 
 def log_warnings(recorded: "Log", truth: "Truth", log: Path) -> list[str]:
-    """Warn of rows that were left out of a log or its truth, and of jumps in its odometry."""
+    """Warn of what a reader doubts, of rows that were left out, and of jumps in the odometry."""
     from pipistrelle.detection.logs.text_tables import FORMER_NAMES
 
-    notes = [f"{log}: {note}" for note in recorded.notes]
+    notes = [f"{log}: {doubt}" for doubt in recorded.doubts]
     if recorded.ignored_rows:
         reasons = (
             f"{count} {reason.replace('_', ' ')}" for reason, count in recorded.ignored_rows.items()

@@ -99,8 +99,10 @@ def prepare_slam(
     strategies: Sequence[Strategy],
     filters: Sequence[str],
     beamwidth: Given,
-) -> tuple[Conduct, list[str]]:
-    """Read a recorded log and settle what it decides; return what solves it, and notes on it.
+) -> tuple[Conduct, list[str], list[str]]:
+    """Read a recorded log and settle what it decides.
+
+    Returns what solves it, lines on what its reader chose, and warnings.
 
     The layers are the settings beneath, those by their own names, and those by short names; ranges
     outside the beamwidth [deg] about the heading are hidden, where it is not None.
@@ -128,7 +130,8 @@ def prepare_slam(
         notes = fit_warnings(recorded, mission.trials, place, config)
         return replace(mission, source=log_entry(place, robot, beam), notes=tuple(notes))
 
-    return conduct, [*overruled, *log_warnings(recorded, truth, place)]
+    warnings = [*overruled, *log_warnings(recorded, truth, place)]
+    return conduct, [f"{place}: {note}" for note in recorded.notes], warnings
 
 
 def failures(mission: Mission) -> list[str]:

@@ -328,7 +328,7 @@ def slam(
 ) -> Results:
     """Solve a recorded log, as `pipistrelle slam` does.
 
-    What looks odd in it is a warning, and what was chosen in reading a ROS bag.
+    What looks odd in it is a warning.
 
     Parameters
     ----------
@@ -365,8 +365,9 @@ def slam(
     beneath, usual = over_named(base_layer(config), flags)
     layers, chosen = (beneath, flags, short), named_strategies(strategies)
     ways = named_filters((usual or SLAM_TAKES) if filters is None else filters)
-    conduct, notes = prepare_slam(place, layers, robot, chosen, ways, Given(beamwidth, "beamwidth"))
-    for line in notes:
+    width = Given(beamwidth, "beamwidth")
+    conduct, _, odd = prepare_slam(place, layers, robot, chosen, ways, width)
+    for line in odd:
         warnings.warn(line, stacklevel=2)
     return _finished(conduct, progress, output, overwrite, f"pipistrelle.slam({str(log)!r}, ...)")
 

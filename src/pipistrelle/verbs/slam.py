@@ -21,7 +21,7 @@ from pipistrelle.verbs.options import (
     layers,
     setting_flags,
 )
-from pipistrelle.verbs.streams import warn
+from pipistrelle.verbs.streams import say, warn
 
 _FOLDERS = ", or ".join(reader.help for reader in READERS)
 FOLDERS = f"{_FOLDERS[0].upper()}{_FOLDERS[1:]}."
@@ -101,7 +101,8 @@ def slam(
     from pipistrelle.scripting.missions import prepare_slam
     from pipistrelle.verbs import delivery
 
-    conduct, notes = prepare_slam(
+    options = output or OutputOptions()
+    conduct, notes, odd = prepare_slam(
         log,
         (beneath, flags, short),
         robot,
@@ -109,5 +110,7 @@ def slam(
         filters(estimator or usual or SLAM_TAKES, particles),
         Given(beamwidth, "--beamwidth"),
     )
-    warn(*notes)
-    return delivery.conduct(conduct, output or OutputOptions(), "slam")
+    for note in () if options.quiet else notes:
+        say(f"pipistrelle: {note}")
+    warn(*odd)
+    return delivery.conduct(conduct, options, "slam")

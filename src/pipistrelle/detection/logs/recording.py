@@ -123,6 +123,8 @@ class Log:
     """Columns and keys that the log calls by former names (`text_tables.FORMER_NAMES`)."""
     notes: tuple[str, ...] = ()
     """What its reader chose or converted, for the user, a line each."""
+    doubts: tuple[str, ...] = ()
+    """What its reader took and finds odd: warnings for the user, a line each."""
 
 
 def assemble(
