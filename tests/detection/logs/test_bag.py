@@ -188,6 +188,48 @@ def test_a_cone_is_a_bearing_anywhere_in_its_width(tmp_path, name):
     assert log.ignored_rows == {"nothing_heard": 4}
 
 
+def cones(*ranges, far=6.0, **more):
+    """Tell what a sonar in front says, ten times a second."""
+    about = {"field_of_view": 0.15, "min_range": 0.1, "max_range": far} | more
+    return [
+        ("/front", RANGE, 0.1 * i, pinged(0.1 * i, **about, range=one))
+        for i, one in enumerate(ranges)
+    ]
+
+
+@pytest.mark.parametrize("far", [6.0, 4.1, 0.3, 25.599999, math.inf])
+def test_a_range_at_its_farthest_is_nothing_heard(tmp_path, far):
+    single = np.float32(far)
+    below = float(np.nextafter(single, np.float32(0.0)))
+    nothing = [far, float(single), below, math.inf, -math.inf, math.nan, 0.0, -1.0]
+    heard = [0.99 * far, 0.99999 * far] if far < math.inf else [2.0, 5000.0]
+    log = read(tmp_path / "one.mcap", *cones(*nothing, *heard, far=far), count=11)
+    assert log.ignored_rows == {"nothing_heard": len(nothing)}
+    np.testing.assert_allclose([scan.range[0] for scan in log.scans], heard, rtol=1e-6)
+
+
+def test_one_range_in_more_than_a_fifth_of_the_messages_is_asked_about(tmp_path):
+    def doubts(name, ranges):
+        return read(tmp_path / name, *cones(*ranges), count=31).doubts
+
+    far = np.linspace(1.0, 3.0, 30)
+    assert doubts("all.mcap", far) == ()
+    assert doubts("few.mcap", [*far[:24], *[5.9] * 6]) == ()
+    (odd,) = doubts("many.mcap", [*far[:23], *[5.9] * 7])
+    assert "/front: 7 of 30 messages hold the range 5.9 m; is this how the sensor says" in odd
+    assert doubts("short.mcap", [5.9] * 20) == ()
+
+
+def test_a_range_in_each_scan_is_asked_about_whatever_its_beam(tmp_path):
+    def ping(i):
+        ways = [{"x": math.cos(0.1 * i), "y": math.sin(0.1 * i)}, {"x": 0.6, "y": -0.8}]
+        told = pinged(0.1 * i, beam_unit_vec=ways, ranges=[7.3, 2.0 + 0.01 * i])
+        return ("/beams", RANGES, 0.1 * i, told)
+
+    log = read(tmp_path / "one.mcap", *map(ping, range(30)), count=31)
+    assert "30 of 30 messages hold the range 7.3 m" in log.doubts[0]
+
+
 def test_ranges_and_bearings_keep_labels_and_deviations_and_are_of_where_the_sensor_is(tmp_path):
     told = labelled(0.2, [(7, 0.5, 3.0), (-1, 0.1, 2.0)], at=(0.2, 0.0, 0.1), stds=(0.05, 0.01))
     row = only(read(tmp_path / "one.bag", ("/seen", LABELLED, 0.2, told)))

@@ -18,6 +18,7 @@ from reference.bags import (
     DETECTIONS,
     LABELLED,
     ODOMETRY,
+    RANGE,
     TRANSFORMS,
     header,
     labelled,
@@ -87,6 +88,18 @@ def test_scans_of_messages_are_those_of_their_bag(tmp_path):
         assert "landmark" not in scan.columns
         for name in ("bearing", "range", "bearing_std"):
             np.testing.assert_allclose(scan.columns[name], getattr(expected, name), atol=1e-12)
+
+
+@pytest.mark.parametrize("far", [4.1, 6.0, np.inf, -np.inf, np.nan, 0.05])
+def test_a_range_that_is_nothing_heard_in_a_bag_is_no_scan(far):
+    about = {"field_of_view": 0.15, "min_range": 0.1, "header": header(0.1, "base_link")}
+    about["max_range"] = far if 0.1 < far < 10.0 else 6.0
+    found = [
+        scans_in(RANGE, message(RANGE, about | {"range": one}), "base_link", Frames(), BagConfig())
+        for one in (far, 2.0)
+    ]
+    assert found[0] == []
+    assert found[1][0].columns["range"] == pytest.approx([2.0])
 
 
 def test_a_message_that_comes_again_is_refused():

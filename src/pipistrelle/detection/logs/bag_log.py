@@ -32,6 +32,18 @@ _STEEP = 0.1
 """Least level part of an echo's direction that has a bearing."""
 _LATE = 1e-3
 """Clocks that differ by more than this are reported [s]."""
+_ALIKE = 0.2
+"""Share of a topic's messages that may hold one and the same range before a warning asks; a topic
+of fewer than 25 messages is not asked about, as fewer than five of them would do."""
+
+
+@dataclass(slots=True)
+class Remarks:
+    """What the user is to know of how a bag was read; see `Log`."""
+
+    notes: list[str] = field(default_factory=list)
+    doubts: list[str] = field(default_factory=list)
+    ignored: Counter[str] = field(default_factory=Counter)
 
 
 @dataclass(slots=True)
@@ -81,13 +93,16 @@ def read_bag(
                     heard[message.topic].add(message, settings)
                 else:
                     frames.add(message.content)
-    table, notes = odometry_table(path, odometry, driven, settings)
-    notes += _clock(odometry, lags, settings)
-    measured, ignored = [], Counter[str]()
+    remarks = Remarks()
+    table = odometry_table(path, odometry, driven, settings, remarks)
+    remarks.notes += _clock(odometry, lags, settings)
+    measured = []
     for topic, rows in heard.items():
         mounts = mounts_of(path, topic, rows, frames, base, settings)
-        measured.append(rows_of(f"{path}, topic {topic}", rows, mounts, ignored))
-        notes += [*_clock(topic, rows.lag, settings), *_converted(topic, rows, mounts, base)]
+        measured.append(rows_of(f"{path}, topic {topic}", rows, mounts, remarks.ignored))
+        remarks.notes += _clock(topic, rows.lag, settings)
+        remarks.notes += _converted(topic, rows, mounts, base)
+        remarks.doubts += _alike(topic, rows)
     twist = settings.motion == "twist"
     noise = ("velocity", "angular_rate") if twist else ("forward", "sideways", "turn")
     return assemble(
@@ -96,7 +111,7 @@ def read_bag(
         step=settings.step or None,
         time_offset=settings.time_offset,
         span=span,
-        ignored_rows=dict(ignored),
+        ignored_rows=dict(remarks.ignored),
         name=path.resolve().name,
         motion="unicycle" if twist else "poses",
         control_std=tuple(getattr(settings, f"{name}_std") for name in noise),
@@ -105,7 +120,8 @@ def read_bag(
         range_std=settings.range_std,
         bearing_std=settings.bearing_std,
         range_bounds=settings.range_bounds,
-        notes=tuple(notes),
+        notes=tuple(remarks.notes),
+        doubts=tuple(remarks.doubts),
     )
 
 
@@ -167,9 +183,9 @@ def _table(where: str, columns: tuple[str, ...], rows: list[Any], stated: int = 
 
 
 def odometry_table(
-    path: Path, topic: str, rows: list[Any], settings: BagConfig
-) -> tuple[Table, list[str]]:
-    """Return the table of the odometry, and notes on it for the user."""
+    path: Path, topic: str, rows: list[Any], settings: BagConfig, remarks: Remarks
+) -> Table:
+    """Return the table of the odometry."""
     where, steps = f"{path}, topic {topic}", f"in steps of {settings.step:g} s"
     steps = steps if settings.step else "each a step"
     names = ("time", *POSE, "velocity", "sideways", "angular_rate", *MOTION_COVARIANCE)
@@ -177,9 +193,10 @@ def odometry_table(
     column = table.column
     if settings.motion == "twist":
         aside = float(np.abs(column["sideways"]).max())
-        notes = [f"{topic} is the odometry, its velocities as controls {steps}"]
+        remarks.notes.append(f"{topic} is the odometry, its velocities as controls {steps}")
         if aside > 0.0:
-            notes.append(f"{topic}: velocities to the side, up to {aside:.3g} m/s, are left out")
+            odd = f"velocities to the side, up to {aside:.3g} m/s, are left out"
+            remarks.doubts.append(f"{topic}: {odd}")
         used: tuple[str, ...] = ("time", *_TWIST)
     else:
         lasted = np.diff(column["time"], prepend=column["time"][0])
@@ -187,10 +204,10 @@ def odometry_table(
             column[name] = column[name] * lasted**2
         known = int(np.isfinite(column[MOTION_COVARIANCE[0]]).sum())
         sure = f", {known} of {len(lasted)} as sure as its twist says" * bool(known)
-        notes = [f"{topic} is the odometry, the ways between its poses {steps}{sure}"]
+        remarks.notes.append(f"{topic} is the odometry, the ways between its poses {steps}{sure}")
         used = ("time", *POSE, *MOTION_COVARIANCE)
     kept = {name: column[name] for name in used}
-    return Table(path=where, line=table.line, unit="message", column=kept), notes
+    return Table(path=where, line=table.line, unit="message", column=kept)
 
 
 def mounts_of(
@@ -275,8 +292,21 @@ def _clock(topic: str, lags: list[float], settings: BagConfig) -> list[str]:
     return [told] if abs(late) > _LATE else []
 
 
+def _alike(topic: str, rows: TopicEchoes) -> list[str]:
+    """Ask about a range that more messages have than what lies about would give."""
+    ranges = [np.unique(np.linalg.norm(one.point, axis=1).round(6)) for one in rows.echoes]
+    value, count = np.unique(np.concatenate([np.empty(0), *ranges]), return_counts=True)
+    if len(ranges) * _ALIKE < 1.0 / _ALIKE or count.max(initial=0) <= _ALIKE * len(ranges):
+        return []
+    most = int(np.argmax(count))
+    return [
+        f"{topic}: {count[most]} of {len(ranges)} messages hold the range {value[most]:g} m; is it "
+        "how the sensor says that it heard nothing? Then record infinity in its place"
+    ]
+
+
 def _converted(topic: str, rows: TopicEchoes, mounts: dict[str, Pose], base: str) -> list[str]:
-    """Tell what was converted in the echoes of a topic."""
+    """Say what was converted in the echoes of a topic."""
     notes = []
     if rows.type == ANGLES:
         notes.append(f"{topic}: its angles are positive to starboard, bearings to the left")

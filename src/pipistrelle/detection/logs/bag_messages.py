@@ -157,9 +157,14 @@ def _beams(
 
 
 def _range(message: Any, _: float | None) -> Echoes:
-    """Read a range in a cone: a bearing straight ahead, uniform over its width."""
+    """Read a range in a cone: a bearing straight ahead, uniform over its width.
+
+    Nothing is heard at infinity, nearer than the nearest range, and, as Gazebo and many drivers
+    write it, at the farthest range itself, which single precision may round down by a last place.
+    """
     distance, near, far = float(message.range), float(message.min_range), float(message.max_range)
-    heard = int(math.isfinite(distance) and max(near, 0.0) <= distance <= far and distance > 0.0)
+    below = float(np.nextafter(np.float32(far), np.float32(0.0)))
+    heard = int(math.isfinite(distance) and max(near, 0.0) <= distance < below and distance > 0.0)
     width, variance = float(message.field_of_view), float(getattr(message, "variance", 0.0))
     return _echoes(
         np.array([[distance, 0.0, 0.0]])[:heard],

@@ -15,6 +15,7 @@ from pipistrelle.config import BagConfig
 from pipistrelle.detection.logs.bag import Message, faults_named
 from pipistrelle.detection.logs.bag_frames import TRANSFORMS, Frames, bare
 from pipistrelle.detection.logs.bag_log import (
+    Remarks,
     TopicEchoes,
     mounts_of,
     odometry_table,
@@ -65,7 +66,7 @@ def stamp_and_pose(message: Any) -> tuple[float, tuple[float, float, float]]:
     """Return time [s] and pose [m, m, rad] of a ``nav_msgs/Odometry``, which may be the first."""
     with faults_named("ROS, odometry"):
         row = step_row(Message("odometry", 1, 0.0, message), BagConfig())
-    odometry_table(_HERE, "odometry", [(1, *row)], BagConfig())
+    odometry_table(_HERE, "odometry", [(1, *row)], BagConfig(), Remarks())
     time, x, y, heading, *_ = row
     return time, (x, y, heading)
 
@@ -81,7 +82,7 @@ def step_between(before: Any, now: Any, settings: BagConfig) -> Step:
     if not rows[1][1] > rows[0][1]:
         found, expected = f"the time {rows[1][1]} s", f"one after {rows[0][1]} s"
         raise refusal("ROS, odometry", found, expected, "leave out what comes late or twice")
-    table, _ = odometry_table(_HERE, "odometry", rows, settings)
+    table = odometry_table(_HERE, "odometry", rows, settings, Remarks())
     time, *columns = table.column.values()
     if settings.motion == "twist":
         return Step(np.column_stack(columns)[:1], float(time[1]))
