@@ -22,7 +22,18 @@ from pipistrelle.experiments.runs import replay
 from pipistrelle.experiments.runs import rerun as once_more
 from pipistrelle.experiments.runs.replay import motion_of
 from pipistrelle.settings import from_text
-from reference.bags import LABELLED, ODOMETRY, RANGES, header, labelled, odometry, write_bag
+from reference.bags import (
+    LABELLED,
+    ODOMETRY,
+    RANGE,
+    RANGES,
+    TRANSFORMS,
+    header,
+    labelled,
+    odometry,
+    static,
+    write_bag,
+)
 from reference.command_line import SHORT, summary, table, track
 from reference.odometry import as_motions, poses_file
 
@@ -534,3 +545,56 @@ def test_a_bag_without_labels_is_solved_by_an_association(obey, undrawn):
     words = ("--association.method", "marginal", "--quiet", "-o", "one")
     assert obey("slam", "walk.db3", *words, "--bag.bearing-std", "0.02")[0] == 0
     assert len(Path("one/map_fused_smoother.csv").read_text().splitlines()) == 4
+
+
+def sonars(path, width=0.3):
+    """Write a bag of a drive between posts, by two sonars of a cone that wide to either side."""
+    rng, posts = np.random.default_rng(3), np.array([[1.5, 2], [3, -2], [5, 1.8], [6.5, -1.5]])
+    mounts, told = {"left": (0.1, 0.6), "right": (-0.1, -0.6)}, []
+    for name, (aside, turned) in mounts.items():
+        tie = static("base_link", name, 0.1, aside, turned)
+        told.append(("/tf_static", TRANSFORMS, 0.0, tie))
+    for i in range(160):
+        time, x = 0.1 * i, 0.04 * i
+        told.append(("/odom", ODOMETRY, time, odometry(time, x, 0.0, 0.0)))
+        for name, (aside, turned) in mounts.items():
+            away = posts - [x + 0.1, aside]
+            far = np.hypot(*away.T) + rng.normal(0.0, 0.02, len(posts))
+            seen = np.abs(np.arctan2(away[:, 1], away[:, 0]) - turned) < width / 2.0
+            about = {"field_of_view": width, "min_range": 0.1, "max_range": 5.0}
+            about |= {"header": header(time, name), "range": np.min(far[seen], initial=5.0)}
+            told.append(("/" + name, RANGE, time, about))
+    write_bag(path, told)
+    return posts
+
+
+@pytest.mark.parametrize("width", [0.15, 0.3, 0.52])
+def test_a_bag_of_two_sonars_maps_landmarks_however_wide_their_cones_are(obey, undrawn, width):
+    posts = sonars(Path("walk.mcap"), width)
+    words = ("slam", "walk.mcap", "--association.method", "marginal", "-o")
+    _, _, said = obey(*words, "one")
+    (run,) = json.loads(Path("one/summary.json").read_text())["runs"]
+    found = pl.read_csv("one/map_fused_smoother.csv").select("x", "y").to_numpy()
+    assert len(found) >= 3
+    far = np.linalg.norm(found[:, None] - posts, axis=2).min(axis=1)
+    assert np.median(far) < 0.6
+    assert "unsure_bearing" not in run["ignored_rows"]
+    assert "sensing are left out" not in said
+    _, _, said = obey(*words, "two", "--association.bearing-std", "0.04")
+    (run,) = json.loads(Path("two/summary.json").read_text())["runs"]
+    rows = run["ignored_rows"]["unsure_bearing"]
+    assert rows + run["ignored_rows"]["nothing_heard"] == 320
+    assert f"none of the {rows} rows of fused sensing is of a landmark" in said
+    assert f"{rows} rows of fused sensing are left out" in said
+    assert "--association.bearing-std 0." in said
+    assert "nothing in it is heard" not in said
+
+
+def test_unsure_rows_are_counted_by_the_limits_of_their_own_filter(obey, undrawn):
+    sonars(Path("walk.mcap"))
+    words = ["slam", "walk.mcap", "--association.method", "marginal", "--filter", "ekf,smoother"]
+    Path("own.toml").write_text("[own.ekf.association]\nbearing_std = 0.04\n")
+    assert obey(*words, "--config", "own.toml", "-o", "out")[0] == 0
+    ekf, smoother = json.loads(Path("out/summary.json").read_text())["runs"]
+    assert ekf["ignored_rows"]["unsure_bearing"] > 10
+    assert "unsure_bearing" not in smoother["ignored_rows"]

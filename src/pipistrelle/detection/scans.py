@@ -9,6 +9,9 @@ from jaxtyping import Bool, Float, Int
 from pipistrelle.config import InputError
 from pipistrelle.refusals import shown
 
+WIDEST = math.pi / 2.0 / math.sqrt(12.0)
+"""Deviation of a bearing that is anywhere in a quarter turn [rad]. A less sure bearing is of no
+use: the mean of the places where its landmark may be is a tenth nearer than the range."""
 UNLABELLED = -1
 """Label of a measurement whose landmark is not known."""
 OWN = 0

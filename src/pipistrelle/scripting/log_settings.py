@@ -1,7 +1,7 @@
 """Settings that a recorded log decides, settings that it leaves open, and warnings on it."""
 
 from collections.abc import Sequence
-from math import hypot, inf, sqrt
+from math import ceil, floor, hypot, inf, log10, sqrt
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -9,7 +9,7 @@ from pydantic import create_model
 
 from pipistrelle.config import BagConfig, Config, InputError, Section
 from pipistrelle.detection.logs.readers import reader_of
-from pipistrelle.detection.scans import UNLABELLED
+from pipistrelle.detection.scans import UNLABELLED, WIDEST
 from pipistrelle.estimation.catalogue import SECTIONS, gate_of, short_name
 from pipistrelle.experiments.named_settings import each_its_own, laid, own_config
 from pipistrelle.settings import Given, Key, Layer, resolve
@@ -36,6 +36,9 @@ MAX_NIS = 2.0
 """NIS above which a warning is given; below 1 a filter is cautious, as with the paper's noise."""
 MIN_EXCESS_PATH = 0.2
 """Excess paths in metres are rarely smaller [m]; in seconds most are."""
+UNSURE = {"bearing_std": ("bearings", "rad", WIDEST), "way_std": ("ranges", "m", inf)}
+"""Settings by which an association leaves rows out: of which numbers, and up to which deviation a
+larger value is advised."""
 LOGGED = frozenset(
     {
         ("filter", "range_std"),
@@ -218,9 +221,7 @@ def fit_warnings(
     for trial in trials:
         heard, name = sum(len(scan.landmark) for scan in trial.scans), short_name(trial.filter)
         if not heard:
-            notes.append(
-                f"{log}: nothing in it is heard by {trial.strategy} sensing, so it maps nothing"
-            )
+            notes.append(f"{log}: {_nothing_used(trial)}, so it maps nothing")
         elif turned <= MAX_IGNORED_SHARE * rows and is_placed(trial):
             gated, who = trial.scores.gated, f"{trial.strategy} {name}"
             if MAX_IGNORED_SHARE * heard < gated:
@@ -241,7 +242,39 @@ def fit_warnings(
                 notes.append(f"{log}: {surprised}")
     if turned > MAX_IGNORED_SHARE * rows:
         notes.append(f"{log}: {turned} of {rows} bearings are beyond a turn; are they in radians?")
-    return notes + _out_of_bounds(recorded, log)
+    return notes + _out_of_bounds(recorded, log) + _unsure(trials, log, config)
+
+
+def _nothing_used(trial: "TrialResult") -> str:
+    """Say that a trial used no row: of none that it heard, or of some."""
+    rows = sum(scan.landmark.size for scan in trial.heard)
+    if not rows:
+        return f"nothing in it is heard by {trial.strategy} sensing"
+    return f"none of the {rows} rows of {trial.strategy} sensing is of a landmark"
+
+
+def _unsure(trials: "Sequence[TrialResult]", log: Path, config: Config) -> list[str]:
+    """Warn of rows that an association leaves out as too unsure, and name what would take them."""
+    notes = []
+    for trial in trials:
+        settings = own_config(config, trial.filter).association
+        for name, stds in trial.left_out.items():
+            what, unit, most = UNSURE[name]
+            limit, taken = getattr(settings, name), stds[stds <= most]
+            spread = dict.fromkeys(f"{std:.2g}" for std in (stds.min(), stds.max()))
+            note = (
+                f"{log}: {stds.size} rows of {trial.strategy} sensing are left out: the standard "
+                f"deviation of their {what}, {' to '.join(spread)} {unit}, is above "
+                f"association.{name}, {limit:g} {unit}"
+            )
+            if taken.size:
+                digit = 10.0 ** floor(log10(taken.max()))
+                flag = f"--association.{name.replace('_', '-')}"
+                value = ceil(taken.max() / digit) * digit
+                whole = "them" if taken.size == stds.size else f"{taken.size} of them"
+                note += f"; {flag} {value:g} takes {whole}"
+            notes.append(note)
+    return [*dict.fromkeys(notes)]
 
 
 def _gate(name: str, config: Config) -> float:

@@ -216,7 +216,7 @@ def test_one_range_in_more_than_a_fifth_of_the_messages_is_asked_about(tmp_path)
     assert doubts("all.mcap", far) == ()
     assert doubts("few.mcap", [*far[:24], *[5.9] * 6]) == ()
     (odd,) = doubts("many.mcap", [*far[:23], *[5.9] * 7])
-    assert "/front: 7 of 30 messages hold the range 5.9 m; is this how the sensor says" in odd
+    assert "/front: 7 of 30 messages hold the range 5.9 m; is it how the sensor says" in odd
     assert doubts("short.mcap", [5.9] * 20) == ()
 
 

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from pipistrelle.config import BagConfig
+from pipistrelle.config import AssociationConfig, BagConfig
 from pipistrelle.detection.logs.bag import Message, faults_named, opened
 from pipistrelle.detection.logs.bag_frames import TRANSFORMS, Frames, along_axis, bare, planar
 from pipistrelle.detection.logs.bag_messages import ANGLES, CONES, ECHOES, POSES, Echoes, Pose
@@ -21,6 +21,7 @@ from pipistrelle.detection.logs.bag_topics import echoes_of, odometry_of, transf
 from pipistrelle.detection.logs.poses import MOTION_COVARIANCE, POSE
 from pipistrelle.detection.logs.recording import Log, assemble
 from pipistrelle.detection.logs.text_tables import Table, check_columns, place_of
+from pipistrelle.detection.scans import WIDEST
 from pipistrelle.refusals import refusal
 
 _TWIST = ("velocity", "angular_rate")
@@ -103,26 +104,32 @@ def read_bag(
         remarks.notes += _clock(topic, rows.lag, settings)
         remarks.notes += _converted(topic, rows, mounts, base)
         remarks.doubts += _alike(topic, rows)
-    twist = settings.motion == "twist"
-    noise = ("velocity", "angular_rate") if twist else ("forward", "sideways", "turn")
+    rows = _merged(f"{path}, topic {', '.join(heard)}", measured)
     return assemble(
         table,
-        _merged(f"{path}, topic {', '.join(heard)}", measured),
+        rows,
         step=settings.step or None,
         time_offset=settings.time_offset,
         span=span,
         ignored_rows=dict(remarks.ignored),
         name=path.resolve().name,
-        motion="unicycle" if twist else "poses",
-        control_std=tuple(getattr(settings, f"{name}_std") for name in noise),
         initial_pose=tuple(driven[0][2:5]),
-        initial_pose_std=settings.initial_pose_std,
-        range_std=settings.range_std,
-        bearing_std=settings.bearing_std,
-        range_bounds=settings.range_bounds,
+        association=_surety(rows),
         notes=tuple(remarks.notes),
         doubts=tuple(remarks.doubts),
+        **_vehicle(settings),
     )
+
+
+def _vehicle(settings: BagConfig) -> dict[str, Any]:
+    """Return what the settings say of the vehicle and its sensors, by the names of a `Log`."""
+    twist = settings.motion == "twist"
+    noise = ("velocity", "angular_rate") if twist else ("forward", "sideways", "turn")
+    same = "initial_pose_std", "range_std", "bearing_std", "range_bounds"
+    return {name: getattr(settings, name) for name in same} | {
+        "motion": "unicycle" if twist else "poses",
+        "control_std": tuple(getattr(settings, f"{name}_std") for name in noise),
+    }
 
 
 def read_poses(
@@ -290,6 +297,18 @@ def _clock(topic: str, lags: list[float], settings: BagConfig) -> list[str]:
     when = "after" if late > 0.0 else "before"
     told = f"{topic}: times are of headers; messages were received {abs(late):.3g} s {when} them"
     return [told] if abs(late) > _LATE else []
+
+
+def _surety(rows: Table) -> dict[str, float]:
+    """Return how unsure a bearing may be to be associated: as the widest beam or cone makes it.
+
+    An association leaves rows out that are less sure than others because they are likelier noise.
+    The deviation of a row in a beam comes of the beam's width, for weak and loud echoes alike, so
+    none that still has a bearing is left out by it; the default holds where all are surer.
+    """
+    stds = rows.column["bearing_std"]
+    widest = float(stds[stds <= WIDEST].max(initial=0.0))
+    return {"bearing_std": widest} if widest > AssociationConfig().bearing_std else {}
 
 
 def _alike(topic: str, rows: TopicEchoes) -> list[str]:

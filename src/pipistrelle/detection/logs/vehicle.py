@@ -76,6 +76,7 @@ class _Association(Section):
 
     detection: Probability | None = None
     clutter: Positive | None = None
+    bearing_std: Positive | None = None
     max_range: Positive | None = None
     field_of_view: _Turn | None = None
 

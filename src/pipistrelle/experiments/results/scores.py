@@ -1,7 +1,7 @@
 """Scores: how good an estimate is, by the truth."""
 
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from jaxtyping import Float
@@ -139,6 +139,8 @@ class TrialResult:
     """The map under the names of the true landmarks, where an association has labels of its own."""
     online: PathScores | None = None
     """Scores of the path as it was believed at its time, where the filter revises it."""
+    left_out: Mapping[str, Float[np.ndarray, " n"]] = field(default_factory=dict)
+    """Deviations of a log's rows that the association left out as too unsure, by its setting."""
     error: str | None = None
     """The error with which the filter failed; its path is then NaN."""
 

@@ -214,7 +214,10 @@ def run_entry(trial: TrialResult, ignored_rows: Mapping[str, int]) -> dict[str, 
         "filter": trial.filter,
         **_finite(_told(trial.scores)),
         **({"calibration": calibrated} if (calibrated := calibration_of(trial.track)) else {}),
-        "ignored_rows": dict(ignored_rows),
+        "ignored_rows": {
+            **ignored_rows,
+            **{f"unsure_{name}".removesuffix("_std"): n.size for name, n in trial.left_out.items()},
+        },
         "wall_s": trial.wall_s,
     }
     return run if trial.online is None else run | {"online": _finite(asdict(trial.online))}

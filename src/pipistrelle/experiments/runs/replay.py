@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -27,6 +28,7 @@ from pipistrelle.detection.scans import (
 )
 from pipistrelle.estimation.association import KNOWN
 from pipistrelle.estimation.beliefs import Gaussian, Landmarks
+from pipistrelle.estimation.data_association.methods import left_out
 from pipistrelle.estimation.motion import Motion
 from pipistrelle.estimation.smoother.calibration import OF_ODOMETRY
 from pipistrelle.evaluation.association import Causes, causes_of
@@ -259,11 +261,11 @@ def replay(
     for own, names in apart:
         heard = _heard(log, strategies, beamwidth, own)
         causes = {} if own.association.method == KNOWN else _log_causes(log, heard)
-        trials += run_trials(
-            names, drive, heard, own, causes=causes, progress=progress, watch=watch
-        )
-    done = in_order(trials, strategies, filters)
-    return Mission(config=config, drive=drive, trials=done, beamwidth=beamwidth, log=log)
+        unsure = {s: left_out(own, map(noise_of(own.filter), scans)) for s, scans in heard.items()}
+        done = run_trials(names, drive, heard, own, causes=causes, progress=progress, watch=watch)
+        trials += [replace(trial, left_out=unsure[trial.strategy]) for trial in done]
+    trials = [*in_order(trials, strategies, filters)]
+    return Mission(config=config, drive=drive, trials=tuple(trials), beamwidth=beamwidth, log=log)
 
 
 def _heard(
