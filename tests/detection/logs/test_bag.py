@@ -11,6 +11,7 @@ import pytest
 
 from pipistrelle.__main__ import main
 from pipistrelle.config import BagConfig, Config, InputError
+from pipistrelle.detection.logs.bag import opened
 from pipistrelle.detection.logs.folder import read_log
 from pipistrelle.detection.logs.poses import poses_along
 from pipistrelle.experiments.drives import Truth
@@ -429,6 +430,86 @@ def test_messages_that_a_folder_counts_and_its_file_lacks_are_missed(tmp_path):
     assert told.count("message_count: 5") == 1
     (path / "metadata.yaml").write_text(told.replace("message_count: 5", "message_count: 9"))
     refused(path, "topic /odom", "found 5 messages, expected the 9")
+
+
+def records(data):
+    """Return the records of MCAP: opcodes and contents."""
+    found, at = [], 0
+    while at < len(data):
+        size = int.from_bytes(data[at + 1 : at + 9], "little")
+        found.append((data[at], data[at + 9 : at + 9 + size]))
+        at += 9 + size
+    return found
+
+
+def indexed(path, *, messages=True, chunks=None, statistics=True):
+    """Write an MCAP file again with only some of its index."""
+    magic, out, moved, kept = b"\x89MCAP0\r\n", b"\x89MCAP0\r\n", {}, b""
+    whole, at = path.read_bytes(), len(magic)
+    parts = records(whole[len(magic) : -len(magic)])
+    for op, content in parts:
+        record = bytes([op]) + len(content).to_bytes(8, "little") + content
+        if op in (3, 4) or (op == 11 and statistics):
+            kept += record
+        if op == 8:
+            entry = content if messages else content[:32] + bytes(4) + bytes(8)
+            if not messages:
+                size = int.from_bytes(content[32:36], "little")
+                entry += content[36 + size + 8 :]
+            start = moved[int.from_bytes(content[16:24], "little")]
+            entry = entry[:16] + start.to_bytes(8, "little") + entry[24:]
+            if chunks is None or (len(moved) and list(moved.values()).index(start) in chunks):
+                kept += bytes([op]) + len(entry).to_bytes(8, "little") + entry
+        if op in (1, 6, 15) or (op == 7 and messages):
+            if op == 6:
+                moved[at] = len(out)
+            out += record
+        at += len(record)
+    footer = len(out).to_bytes(8, "little") + bytes(12)
+    path.write_bytes(out + kept + b"\x02" + (20).to_bytes(8, "little") + footer + magic)
+    return path
+
+
+@pytest.mark.parametrize("statistics", [True, False])
+@pytest.mark.parametrize(
+    "index",
+    [
+        {},
+        {"messages": False},
+        {"chunks": (0,)},
+        {"chunks": (1,)},
+        {"messages": False, "chunks": (1,)},
+    ],
+    ids=str,
+)
+@pytest.mark.parametrize("how", [None, "STORAGE"])
+def test_an_mcap_is_read_whatever_its_index_lacks(tmp_path, how, index, statistics):
+    big = [
+        ("/big", "std_msgs/msg/String", 0.05 + 0.1 * i, {"data": "x" * 600_000}) for i in range(4)
+    ]
+    told = sorted([*drive(), *big, seen(0.2), seen(0.3)], key=lambda one: one[2])
+    path = write_bag(tmp_path / "one.mcap", told, compression=how)
+    whole, _ = load(path, bag=BagConfig(step=0.0))
+    indexed(path, statistics=statistics, **index)
+    if index.get("chunks") and not statistics:
+        return  # nothing in the file says that there is more
+    log, _ = load(path, bag=BagConfig(step=0.0))
+    np.testing.assert_array_equal(log.time, whole.time)
+    assert [scan.time for scan in log.scans] == [scan.time for scan in whole.scans]
+    with opened(path) as bag:
+        assert [topic.count for topic in bag.seen()] == [4, 5, 2]
+
+
+def test_an_mcap_that_counts_more_than_it_holds_is_refused_without_talk_of_folders(tmp_path):
+    path = write_bag(tmp_path / "one.mcap", sorted([*drive(), seen(0.2)], key=lambda one: one[2]))
+    data = path.read_bytes()
+    count = (1).to_bytes(2, "little") + (5).to_bytes(8, "little")
+    assert data.count(count) == 1
+    path.write_bytes(data.replace(count, count[:2] + (9).to_bytes(8, "little")))
+    with pytest.raises(InputError, match="topic /odom: found 5 messages, expected the 9") as error:
+        load(path)
+    assert "folder" not in str(error.value)
+    assert "mcap recover" in str(error.value)
 
 
 def test_metadata_that_would_take_minutes_to_read_are_refused(tmp_path):

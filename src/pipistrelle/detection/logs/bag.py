@@ -5,6 +5,7 @@ rosbags, of the extra ``ros``. `bag_definitions` says by which types messages ar
 parses a file's bytes may fail in any way, and each failure is refused with the file and topic.
 """
 
+from collections import Counter
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
@@ -115,7 +116,7 @@ class Bag:
         for name, found in count.items():
             said = sum(one.msgcount for one in self._by_topic[name])
             if found < said:
-                fix = "name its file (.mcap, .db3) in place of the folder, or mend it"
+                fix = f"name its file (.mcap, .db3), or {_MEND}" if self.path.is_dir() else _MEND
                 where = f"{self.path}, topic {name}"
                 raise refusal(where, f"{found} messages", f"the {said} that the bag counts", fix)
 
@@ -150,8 +151,32 @@ def opened(path: Path) -> Iterator[Bag]:
     kind: Any = Reader1 if whole.suffix == ".bag" and whole.is_file() else Reader2
     with ExitStack() as stack:
         with faults_named(str(path)):
-            bag = Bag(path, stack.enter_context(kind(whole)))
+            reader = stack.enter_context(kind(whole))
+            if kind is Reader2:
+                complete_index(getattr(reader.storage, "storages", [reader.storage]))
+            bag = Bag(path, reader)
         yield bag
+
+
+def complete_index(storages: Iterable[Any]) -> None:
+    """Let rosbags read all chunks of an MCAP file whose index names fewer messages than it has.
+
+    rosbags passes over a chunk in which the index counts no message of a topic; the index of a
+    chunk is optional. It reads a file without chunks in its index record by record.
+    """
+    for storage in storages:
+        if not (chunks := getattr(storage, "chunks", None)):
+            continue
+        if storage.statistics.chunk_count > len(chunks):
+            chunks.clear()
+        indexed = Counter[int]()
+        for chunk in chunks:
+            indexed.update(chunk.channel_count)
+        said = storage.statistics.channel_message_counts
+        lacks = any(indexed[channel] < count for channel, count in said.items())
+        for chunk in chunks:
+            if lacks or not chunk.channel_count:
+                chunk.channel_count.update(dict.fromkeys(storage.channels, 1))
 
 
 def need_rosbags(where: str) -> None:

@@ -4,6 +4,7 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -261,7 +262,8 @@ def replay(
     for own, names in apart:
         heard = _heard(log, strategies, beamwidth, own)
         causes = {} if own.association.method == KNOWN else _log_causes(log, heard)
-        unsure = {s: left_out(own, map(noise_of(own.filter), scans)) for s, scans in heard.items()}
+        noise = noise_of(own.filter)
+        unsure: dict[str, Any] = {s: left_out(own, map(noise, heard[s])) for s in heard}
         done = run_trials(names, drive, heard, own, causes=causes, progress=progress, watch=watch)
         trials += [replace(trial, left_out=unsure[trial.strategy]) for trial in done]
     trials = [*in_order(trials, strategies, filters)]
