@@ -287,3 +287,18 @@ def test_the_launch_file_hands_over_every_parameter(monkeypatch):
     assert [word for word in command if isinstance(word, list)] == [
         [f"{name}:=", f"<{name}>"] for name in parameters
     ]
+
+
+def test_messages_from_before_the_clock_began_are_forgotten(started, logs):
+    node = started(logs["poses"][0] / "log.toml")
+    for i in range(6):
+        time = 0.0 if i == 0 else 1000.0 + 0.1 * i
+        hand(node, "/odom", ODOMETRY, odometry(time, 0.1 * i, 0.0, 0.0))
+    assert not node.warned
+    assert node.slam.time == pytest.approx(1000.5)
+    x, y = node.slam.path.select("x_m", "y_m").to_numpy()[0]
+    assert math.hypot(node.slam.pose.x - x, node.slam.pose.y - y) == pytest.approx(0.4)
+    hand(node, "/odom", ODOMETRY, {"header": header(1000.6)})
+    assert "found the quaternion (0, 0, 0, 0) of length 0" in node.warned.pop()
+    hand(node, "/odom", ODOMETRY, odometry(1000.7, 0.7, 0.0, 0.0))
+    assert node.slam.time == pytest.approx(1000.7)

@@ -75,7 +75,7 @@ class SlamNode(Node):
 
     def drive(self, message):
         """Go to where the odometry is, and hear what came on the way."""
-        if self.last is None:
+        if self.last is None or live.clock_began(self.last, message):
             time, _ = live.stamp_and_pose(message)
             self.slam, self.began = self.begin(time=time), math.nextafter(time, -math.inf)
         else:

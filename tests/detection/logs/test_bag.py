@@ -362,6 +362,163 @@ def test_two_odometries_are_told_apart_by_a_name(tmp_path):
     refused(path, "/seen of the type mrpt", "nav_msgs", bag=BagConfig(odometry="/seen"))
 
 
+# Orientations
+
+
+def turned(topic, time, heading, q):
+    """Tell a pose at a time, by another quaternion where one is given."""
+    told = odometry(time, time, 0.1 * time, heading)
+    told["pose"]["pose"]["orientation"] = q if q is not None else quaternion(heading)
+    return (topic, ODOMETRY, time, told)
+
+
+def wrong(kind, heading):
+    """Return a quaternion as a wrong driver fills it in."""
+    z, w = math.sin(heading / 2.0), math.cos(heading / 2.0)
+    return {
+        "no w": {"z": z},
+        "empty": {},
+        "no number": {"z": z, "w": math.nan},
+        "scaled": {"z": 512.0 * z, "w": 512.0 * w},
+        "a little long": {"z": 1.011 * z, "w": 1.011 * w},
+        "w first": {"x": w, "w": z},
+        "upside down": {"x": z, "y": w},
+    }[kind]
+
+
+ODD = ("no w", "empty", "no number", "scaled", "a little long", "w first", "upside down")
+
+
+@pytest.mark.parametrize("topic", ["/odom", "/true"])
+@pytest.mark.parametrize("kind", ODD)
+def test_orientations_that_are_none_are_refused_or_left_out(tmp_path, kind, topic):
+    def bag(name, odd):
+        rows = []
+        for i in range(12):
+            time, heading = round(0.1 * i, 1), 0.5 + 0.02 * i
+            for one in ("/odom", "/true"):
+                q = wrong(kind, heading) if one == topic and i in odd else None
+                rows.append(turned(one, time, heading, q))
+        return write_bag(tmp_path / name, sorted([*rows, seen(1.0)], key=lambda one: one[2]))
+
+    settings = BagConfig(odometry="/odom", truth="/true", step=0.0)
+    for odd in (range(12), range(7)):
+        part = "upside down" if kind in ("w first", "upside down") else "of length "
+        parts = f"topic {topic}, message 1: found the quaternion (", part, "expected"
+        path = bag("all.mcap", {*odd})
+        refused(path, *parts, f"; {len(odd)} of 12 messages are like it", bag=settings)
+    log, truth = load(bag("some.mcap", {3, 7}), bag=settings)
+    assert log.ignored_rows == {"odd_orientation": 2}
+    (doubt,) = log.doubts
+    assert f"{topic}: 2 left out: message 4: found the quaternion (" in doubt
+    whole, right = load(bag("good.mcap", set()), bag=settings)
+    kept = np.isin(whole.time, log.time)
+    assert kept.sum() == len(log.time) == 12 - 2 * (topic == "/odom")
+    np.testing.assert_allclose(
+        poses_along(log.controls), poses_along(whole.controls)[kept], atol=1e-9
+    )
+    np.testing.assert_allclose(truth.path, right.path[kept], atol=1e-3)
+
+
+@pytest.mark.parametrize("steps", [2**14, 2**30, 127])
+def test_quaternions_of_fixed_point_are_turns(tmp_path, steps):
+    rows = []
+    for i in range(12):
+        q = {name: round(v * steps) / steps for name, v in quaternion(0.3 * i).items()}
+        rows.append(turned("/odom", 0.1 * i, 0.0, q))
+    path = write_bag(tmp_path / "one.mcap", sorted([*rows, seen(1.0)], key=lambda one: one[2]))
+    log, _ = load(path, bag=BagConfig(step=0.0))
+    assert not log.ignored_rows
+    np.testing.assert_allclose(log.controls[:, 2], 0.3, atol=4.0 / steps)
+
+
+def test_transforms_that_are_no_turns_are_left_out_or_refused(tmp_path):
+    good = ("/tf_static", TRANSFORMS, 0.0, static("base_link", "front", 0.3, 0.2))
+    camera = static("base_link", "camera", 0.1, 0.0, q={"z": 0.2})
+    bad = ("/tf_static", TRANSFORMS, 0.01, camera)
+    log = read(tmp_path / "one.mcap", *cones(2.0, 2.1), good, bad)
+    assert log.ignored_rows == {"odd_orientation": 1}
+    words = "/tf_static: 1 left out: from 'base_link' to 'camera': found the quaternion (0, 0, 0.2"
+    assert words in log.doubts[0]
+    with pytest.raises(InputError, match=r"topic /tf_static, from .* of length 0.2, expected"):
+        read(tmp_path / "two.mcap", *cones(2.0, 2.1), bad)
+    under = static("base_link", "under", 0.0, 0.0, q={"x": 1.0})  # a sensor may hang so
+    read(tmp_path / "three.mcap", *cones(2.0), ("/tf_static", TRANSFORMS, 0.0, under))
+
+
+# Clocks that had not begun
+
+
+def stamped(path, count=20, start=1000.0, early=3, truth=False, heard=False):
+    """Write a bag of a simulation that began its clock late; reception is right."""
+    told = []
+    for i in range(count):
+        time, stamp = start + 0.1 * i, start + 0.1 * i if i >= early else 0.0
+        for topic in ("/odom", "/true") if truth else ("/odom",):
+            told.append((topic, ODOMETRY, time, odometry(stamp, 0.1 * i, 0.0, 0.0, 1.0)))
+        told.append(("/seen", LABELLED, time, labelled(stamp if heard else time, [(7, 0.3, 3.0)])))
+    return write_bag(path, told)
+
+
+@pytest.mark.parametrize("start", [1.5, 1000.0, 1e5, 1.78e9])
+@pytest.mark.parametrize("more", [{}, {"heard": True}, {"truth": True}])
+def test_stamps_of_zero_before_the_clock_begins_are_left_out(tmp_path, start, more):
+    path = stamped(tmp_path / "one.mcap", start=start, **more)
+    named = {"odometry": "/odom", "truth": "/true"} if more.get("truth") else {}
+    log, _ = load(path, bag=BagConfig(step=0.1, **named))
+    assert log.ignored_rows["before_clock"] == 3 * (1 + bool(more))
+    assert log.time[0] == pytest.approx(start + 0.3, abs=1e-6)
+    assert len(log.dt) <= 17
+    words = "/odom: 3 left out: their stamp is 0, from before the clock began; others are"
+    assert words in " ".join(log.doubts)
+    assert log.initial_pose[0] == pytest.approx(0.3)
+
+
+def test_a_clock_that_begins_with_the_drive_has_a_time_zero(tmp_path):
+    log = read(tmp_path / "one.mcap", seen(0.0), seen(0.2))
+    assert log.time[0] == 0.0
+    assert (log.ignored_rows, log.doubts) == ({}, ())
+    assert len(log.scans) == 2
+
+
+def test_stamps_that_are_all_zero_are_refused_with_what_helps(tmp_path):
+    path = stamped(tmp_path / "one.mcap", early=20)
+    refused(path, "topic /odom: found the stamp 0 in all 20 messages", "--bag.stamps received")
+    assert len(load(path, bag=BagConfig(stamps="received", step=0.0))[0].dt) == 19
+    rows = [odometry(5.0 + 0.1 * i, 0.1 * i, 0.0, 0.0) for i in range(5)]
+    told = [("/odom", ODOMETRY, 5.0 + 0.1 * i, row) for i, row in enumerate(rows)]
+    unset = [("/seen", LABELLED, row[2], labelled(0.0, [(7, 0.3, 3.0)])) for row in told]
+    path = write_bag(tmp_path / "two.mcap", [*told, *unset])
+    refused(path, "topic /seen: found the stamp 0 in all 5 messages", "--bag.stamps received")
+
+
+def test_a_stamp_of_zero_in_between_is_left_out(tmp_path):
+    rows = [odometry(1000.0 + 0.1 * i if i != 7 else 0.0, 0.1 * i, 0.0, 0.0) for i in range(20)]
+    told = [("/odom", ODOMETRY, 1000.0 + 0.1 * i, row) for i, row in enumerate(rows)]
+    path = write_bag(tmp_path / "one.mcap", [*told, seen(1001.0)])
+    log, _ = load(path, bag=BagConfig(step=0.0))
+    assert log.ignored_rows == {"before_clock": 1}
+    np.testing.assert_allclose(log.controls[:, 0].sum(), 1.9)
+
+
+@pytest.mark.parametrize(("pause", "asked"), [(90.0, False), (110.0, True)])
+def test_a_silence_of_the_odometry_is_asked_about_before_the_work(tmp_path, pause, asked):
+    times = [round(0.1 * i + pause * (i >= 20), 1) for i in range(40)]
+    told = [("/odom", ODOMETRY, t, odometry(t, 0.1 * i, 0.0, 0.0)) for i, t in enumerate(times)]
+    log, _ = load(write_bag(tmp_path / "one.mcap", [*told, seen(times[-1])]))
+    assert bool(log.doubts) == asked
+    if asked:
+        assert "silent for 110.1 s, from 1.9 s to 112.0 s, which is 1101 steps" in log.doubts[0]
+        assert "was its clock set" in log.doubts[0]
+
+
+def test_too_many_steps_are_refused_by_the_gap_that_makes_them(tmp_path):
+    times = [5.0 + round(0.1 * i, 1) + 1.78e9 * (i >= 20) for i in range(40)]
+    told = [("/odom", ODOMETRY, t, odometry(t, 0.1 * i, 0.0, 0.0)) for i, t in enumerate(times)]
+    path = write_bag(tmp_path / "one.mcap", [*told, seen(times[-1])])
+    refused(path, "topic /odom", "without a row, from 6.9 s to 1780000007.0 s", "the clock was set")
+
+
 # What is wrong in a bag
 
 
@@ -402,15 +559,11 @@ def test_what_is_no_sound_bag_is_refused_by_its_name(tmp_path):
         ),
         (
             [*drive(), ("/odom", ODOMETRY, 0.5, odometry(0.2, 0.0, 0.0, 0.0)), seen(0.2)],
-            ("topic /odom, message 6", "run backwards"),
+            ("topic /odom, message 6", "run backwards", "--bag.stamps received"),
         ),
         (
             [*drive(), seen(0.2), ("/seen", LABELLED, 0.3, labelled(0.1, [(7, 0.0, 1.0)]))],
             ("topic /seen, message 2", "run backwards"),
-        ),
-        (
-            [*drive(), ("/odom", ODOMETRY, 0.5, {"header": header(0.5)}), seen(0.2)],
-            ("topic /odom, message 6", "quaternion (0, 0, 0, 0)"),
         ),
         (
             [*drive(), ("/seen", LABELLED, 0.2, labelled(0.2, [(7, 0.0, 1.0), (7, 0.2, 1.0)]))],

@@ -929,4 +929,4 @@ def drives(draw):
 def test_any_log_survives_being_written(tmp_path_factory, log):
     folder = tmp_path_factory.mktemp("logs") / log.name
     write_log(folder, log)
-    assert same(read_log(folder), log)
+    assert same(replace(read_log(folder), doubts=()), log)  # a drawn drive may be silent for long

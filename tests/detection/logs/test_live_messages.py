@@ -8,6 +8,7 @@ import pytest
 from pipistrelle.config import BagConfig, InputError
 from pipistrelle.detection.logs.bag_frames import Frames
 from pipistrelle.detection.logs.live_messages import (
+    clock_began,
     learn_transforms,
     scans_in,
     stamp_and_pose,
@@ -100,6 +101,34 @@ def test_a_range_that_is_nothing_heard_in_a_bag_is_no_scan(far):
     ]
     assert found[0] == []
     assert found[1][0].columns["range"] == pytest.approx([2.0])
+
+
+@pytest.mark.parametrize("q", [{"z": 0.2}, {}, {"x": 1.0}, {"z": 512.0, "w": 512.0}])
+def test_an_orientation_that_is_none_is_refused_as_in_a_bag(q):
+    told = odometry(0.5, 1.0, 0.0, 0.0)
+    told["pose"]["pose"]["orientation"] = q
+    odd = message(ODOMETRY, told)
+    with pytest.raises(InputError, match=r"ROS, odometry: found the quaternion .*, expected"):
+        stamp_and_pose(odd)
+    with pytest.raises(InputError, match=r"ROS, odometry: found the quaternion .*, expected"):
+        step_between(message(ODOMETRY, odometry(0.0, 0.0, 0.0, 0.0)), odd, BagConfig())
+
+
+def test_a_transform_that_is_no_turn_is_refused_when_the_others_are_learnt():
+    frames, tie = Frames(), static("base_link", "camera", 0.0, 0.0, q={"z": 0.2})
+    tie["transforms"] += static("base_link", "sonar", 0.4, 0.0)["transforms"]
+    with pytest.raises(InputError, match=r"/tf_static: from 'base_link' to 'camera': found"):
+        learn_transforms(frames, message(TRANSFORMS, tie))
+    assert frames.pose("sonar", "base_link")[1][0] == 0.4
+    assert frames.pose("camera", "base_link") is None
+
+
+@pytest.mark.parametrize(
+    ("times", "began"), [((0.0, 1000.0), True), ((0.0, 0.1), False), ((0.5, 1000.0), False)]
+)
+def test_a_clock_begins_where_a_stamp_of_zero_ends(times, began):
+    pair = [message(ODOMETRY, odometry(time, 0.0, 0.0, 0.0)) for time in times]
+    assert clock_began(*pair) == began
 
 
 def test_a_message_that_comes_again_is_refused():

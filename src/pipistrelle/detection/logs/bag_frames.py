@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from pipistrelle.detection.logs.bag_messages import Pose, pose_of
+from pipistrelle.detection.logs.bag_messages import Pose, TurnError, pose_of
 
 TRANSFORMS = "/tf_static"
 TRANSFORMS_TYPE = "tf2_msgs/msg/TFMessage"
@@ -21,15 +21,25 @@ class Frames:
     def __init__(self) -> None:
         self._beside: dict[str, dict[str, Pose]] = {}
 
-    def add(self, message: Any) -> None:
-        """Learn the transforms of a message."""
+    def add(self, message: Any) -> list[str]:
+        """Learn the transforms of a message; say which are left out as no turns."""
+        odd = []
         for one in message.transforms:
-            pose = pose_of(one.transform.translation, one.transform.rotation)
+            parent, child = bare(one.header.frame_id), bare(one.child_frame_id)
+            try:
+                pose = pose_of(one.transform.translation, one.transform.rotation)
+            except TurnError as error:
+                odd.append(f"from {parent!r} to {child!r}: {error}")
+                continue
             if not np.isfinite(pose[1]).all():
                 raise ValueError(f"the translation {pose[1].tolist()}")
-            parent, child = bare(one.header.frame_id), bare(one.child_frame_id)
             self._beside.setdefault(parent, {})[child] = pose
             self._beside.setdefault(child, {})[parent] = inverse(pose)
+        return odd
+
+    def __bool__(self) -> bool:
+        """Return whether any transform is known."""
+        return bool(self._beside)
 
     def pose(self, frame: str, base: str) -> Pose | None:
         """Return what takes points of a frame to another; None where nothing ties them."""

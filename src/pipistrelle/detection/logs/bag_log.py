@@ -6,6 +6,7 @@ chosen and what was converted is told in the log's `notes`.
 
 import math
 from collections import Counter
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -13,10 +14,18 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from pipistrelle.config import AssociationConfig, BagConfig
+from pipistrelle.config import AssociationConfig, BagConfig, InputError
 from pipistrelle.detection.logs.bag import Message, faults_named, opened
 from pipistrelle.detection.logs.bag_frames import TRANSFORMS, Frames, along_axis, bare, planar
-from pipistrelle.detection.logs.bag_messages import ANGLES, CONES, ECHOES, POSES, Echoes, Pose
+from pipistrelle.detection.logs.bag_messages import (
+    ANGLES,
+    CONES,
+    ECHOES,
+    POSES,
+    Echoes,
+    Pose,
+    TurnError,
+)
 from pipistrelle.detection.logs.bag_topics import echoes_of, odometry_of, transforms_of, truth_of
 from pipistrelle.detection.logs.poses import MOTION_COVARIANCE, POSE
 from pipistrelle.detection.logs.recording import Log, assemble
@@ -33,6 +42,8 @@ _STEEP = 0.1
 """Least level part of an echo's direction that has a bearing."""
 _LATE = 1e-3
 """Clocks that differ by more than this are reported [s]."""
+BEGUN = 1.0
+"""A clock that has begun with the drive shows less than this at its first pose [s]."""
 _ALIKE = 0.2
 """Share of a topic's messages that may hold one and the same range before a warning asks; a topic
 of fewer than 25 messages is not asked about, as fewer than five of them would do."""
@@ -45,6 +56,67 @@ class Remarks:
     notes: list[str] = field(default_factory=list)
     doubts: list[str] = field(default_factory=list)
     ignored: Counter[str] = field(default_factory=Counter)
+
+    def leave_out(self, topic: str, reason: str, number: int, words: str) -> None:
+        """Count messages of a topic that are left out, and say so."""
+        self.ignored[reason] += number
+        self.doubts.append(f"{topic}: {number} left out: {words}")
+
+
+@dataclass(slots=True)
+class TopicPoses:
+    """The poses of a topic, message by message."""
+
+    path: Path
+    topic: str
+    rows: list[tuple[float, ...]] = field(default_factory=list)
+    """The number of a message, its time [s], x, y [m], heading [rad] and what follows."""
+    lag: list[float] = field(default_factory=list)
+    """How much later each was received [s]."""
+    odd: list[str] = field(default_factory=list)
+    """What was found in messages whose orientation is none."""
+
+    def add(self, message: Message, settings: BagConfig, read: Callable[..., Any]) -> None:
+        """Take in a message; `read` returns its row."""
+        try:
+            row = read(message, settings)
+        except TurnError as error:
+            self.odd.append(f"message {message.number}: {error}")
+            return
+        self.rows.append((message.number, *row))
+        self.lag.append(message.received - row[0])
+
+    def sound(self, remarks: Remarks) -> list[tuple[float, ...]]:
+        """Return the rows without what cannot be used; refuse a topic that is mostly so."""
+        where, count = f"{self.path}, topic {self.topic}", len(self.rows) + len(self.odd)
+        if 2 * len(self.odd) > count:
+            some = f"{len(self.odd)} of {count} messages are like it"
+            raise InputError(f"{where}, {self.odd[0]}; {some}")
+        if self.odd:
+            remarks.leave_out(self.topic, "odd_orientation", len(self.odd), self.odd[0])
+        stamps = [row[1] for row in self.rows]
+        running = [stamp for stamp in stamps if stamp != 0.0]
+        began = min(running) if running else math.inf if len(stamps) > 1 else 0.0
+        kept = _kept(where, self.topic, stamps, began, remarks)
+        return [row for row, keep in zip(self.rows, kept, strict=True) if keep]
+
+
+def _kept(
+    where: str, topic: str, stamps: list[float], began: float, remarks: Remarks
+) -> list[bool]:
+    """Return which stamps are of a clock that ran; `began` [s]: when the first pose was.
+
+    Messages that are sent before a simulation publishes its clock have the stamp 0. Where a clock
+    begins with the drive, at less than a second, 0 is a time.
+    """
+    kept = [stamp != 0.0 or began <= BEGUN for stamp in stamps]
+    if (early := kept.count(False)) == len(stamps) and early:
+        found, expected = f"the stamp 0 in all {early} messages", "times of a clock"
+        raise refusal(where, found, expected, "--bag.stamps received takes the times of reception")
+    if early:
+        words = f"their stamp is 0, from before the clock began; others are {began:.15g} s or later"
+        remarks.leave_out(topic, "before_clock", early, words)
+    return kept
 
 
 @dataclass(slots=True)
@@ -72,6 +144,13 @@ class TopicEchoes:
         self.frame.append(bare(content.header.frame_id))
         self.echoes.append(echoes)
 
+    def begin(self, path: Path, topic: str, began: float, remarks: Remarks) -> None:
+        """Leave out messages from before the clock began."""
+        kept = _kept(f"{path}, topic {topic}", topic, self.time, began, remarks)
+        columns: tuple[list[Any], ...] = self.time, self.lag, self.number, self.frame, self.echoes
+        for rows in columns:
+            rows[:] = [row for row, keep in zip(rows, kept, strict=True) if keep]
+
 
 def read_bag(
     path: Path, settings: BagConfig, span: tuple[float, float] = (-math.inf, math.inf)
@@ -80,25 +159,26 @@ def read_bag(
 
     `span` [s]: the log is cut to it.
     """
-    frames, driven, lags, base = Frames(), [], [], ""
+    frames, remarks, base, odd = Frames(), Remarks(), "", []
     with opened(path) as bag:
         odometry = odometry_of(bag, settings)
+        driven = TopicPoses(path, odometry)
         heard = {name: TopicEchoes(bag.topics[name].type) for name in echoes_of(bag, settings)}
         for message in bag.messages(dict.fromkeys([odometry, *transforms_of(bag), *heard])):
             with faults_named(f"{path}, topic {message.topic}, message {message.number}"):
                 if message.topic == odometry:
-                    driven.append((message.number, *step_row(message, settings)))
-                    lags.append(message.received - driven[-1][1])
+                    driven.add(message, settings, step_row)
                     base = base or bare(message.content.child_frame_id)
                 elif message.topic in heard:
                     heard[message.topic].add(message, settings)
                 else:
-                    frames.add(message.content)
-    remarks = Remarks()
-    table = odometry_table(path, odometry, driven, settings, remarks)
-    remarks.notes += _clock(odometry, lags, settings)
+                    odd += frames.add(message.content)
+    _check_tied(path, frames, odd, remarks)
+    table = odometry_table(path, odometry, sound := driven.sound(remarks), settings, remarks)
+    remarks.notes += _clock(odometry, driven.lag, settings)
     measured = []
     for topic, rows in heard.items():
+        rows.begin(path, topic, table.column["time"][0], remarks)
         mounts = mounts_of(path, topic, rows, frames, base, settings)
         measured.append(rows_of(f"{path}, topic {topic}", rows, mounts, remarks.ignored))
         remarks.notes += _clock(topic, rows.lag, settings)
@@ -113,12 +193,20 @@ def read_bag(
         span=span,
         ignored_rows=dict(remarks.ignored),
         name=path.resolve().name,
-        initial_pose=tuple(driven[0][2:5]),
+        initial_pose=tuple(sound[0][2:5]),
         association=_surety(rows),
         notes=tuple(remarks.notes),
         doubts=tuple(remarks.doubts),
         **_vehicle(settings),
     )
+
+
+def _check_tied(path: Path, frames: Frames, odd: list[str], remarks: Remarks) -> None:
+    """Refuse transforms of which none is a turn; say where some are not."""
+    if odd and not frames:
+        raise InputError(f"{path}, topic {TRANSFORMS}, {odd[0]}")
+    if odd:
+        remarks.leave_out(TRANSFORMS, "odd_orientation", len(odd), odd[0])
 
 
 def _vehicle(settings: BagConfig) -> dict[str, Any]:
@@ -133,20 +221,20 @@ def _vehicle(settings: BagConfig) -> dict[str, Any]:
 
 
 def read_poses(
-    path: Path, settings: BagConfig
+    path: Path, settings: BagConfig, remarks: Remarks | None = None
 ) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, "n 3"]] | None:
     """Read times [s] and poses [m, m, rad] of the truth, the heading unwrapped; None without one.
 
-    Of two poses of one time the later wins.
+    Of two poses of one time the later wins. `remarks` get what is to be known of the topic.
     """
-    rows = []
     with opened(path) as bag:
         if (topic := truth_of(bag, settings)) is None:
             return None
-        pose = POSES[bag.topics[topic].type]
+        pose, true = POSES[bag.topics[topic].type], TopicPoses(path, topic)
         for message in bag.messages([topic]):
             with faults_named(f"{path}, topic {topic}, message {message.number}"):
-                rows.append((message.number, _time(message, settings), *pose(message.content)))
+                true.add(message, settings, lambda m, s: (_time(m, s), *pose(m.content)))
+    rows = true.sound(remarks or Remarks())
     column = _table(f"{path}, topic {topic}", ("time", *POSE), rows).column
     last = np.append(np.diff(column["time"]) > 0.0, True)
     heading = np.unwrap(column["heading"][last])

@@ -44,6 +44,9 @@ DEFINITIONS = MappingProxyType(
 
 Pose = tuple[Float[np.ndarray, "3 3"], Float[np.ndarray, " 3"]]
 """Rotation and translation [m] from a frame to another."""
+_ROUNDING = 0.01
+"""How far the length of a quaternion may be from 1: components of 8 bits, the coarsest of drivers,
+are each off by half of 1/127 and the length by up to 1/127."""
 _UNIFORM = 12.0**-0.5
 """Standard deviation of what lies anywhere within a width, as a share of it."""
 
@@ -67,11 +70,18 @@ class Echoes:
     """Echoes left out, by reason."""
 
 
+class TurnError(InputError):
+    """The orientation of a message is none, or that of a vehicle upside down."""
+
+
 def yaw_of(q: Any) -> float:
-    """Return the heading of a quaternion, of any length but zero [rad]."""
+    """Return the heading of a quaternion, of length 1 but for rounding [rad]."""
     x, y, z, w = q.x, q.y, q.z, q.w
-    if not 1e-6 < x * x + y * y + z * z + w * w < 1e6:
-        raise InputError(f"found the quaternion ({x:g}, {y:g}, {z:g}, {w:g}), expected one of 1")
+    if not abs((length := math.hypot(x, y, z, w)) - 1.0) <= _ROUNDING:
+        raise TurnError(
+            f"found the quaternion ({x:g}, {y:g}, {z:g}, {w:g}) of length {length:.3g}, expected "
+            "the length 1; fill in x, y, z and w"
+        )
     return float(np.arctan2(2.0 * (w * z + x * y), w * w + x * x - y * y - z * z))
 
 
@@ -94,7 +104,14 @@ def pose_of(place: Any, q: Any) -> Pose:
 
 
 def _planar(place: Any, q: Any) -> tuple[float, float, float]:
-    return place.x, place.y, yaw_of(q)
+    """Return x, y and heading of a vehicle that is not upside down."""
+    heading = yaw_of(q)
+    if q.x * q.x + q.y * q.y > q.z * q.z + q.w * q.w:
+        raise TurnError(
+            f"found the quaternion ({q.x:g}, {q.y:g}, {q.z:g}, {q.w:g}), a vehicle upside down, "
+            "expected its z upwards; is the order x, y, z, w, and the frame's z up?"
+        )
+    return place.x, place.y, heading
 
 
 POSES: dict[str, Callable[[Any], tuple[float, float, float]]] = {

@@ -11,10 +11,11 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from pipistrelle.config import BagConfig
+from pipistrelle.config import BagConfig, InputError
 from pipistrelle.detection.logs.bag import Message, faults_named
 from pipistrelle.detection.logs.bag_frames import TRANSFORMS, Frames, bare
 from pipistrelle.detection.logs.bag_log import (
+    BEGUN,
     Remarks,
     TopicEchoes,
     mounts_of,
@@ -71,6 +72,12 @@ def stamp_and_pose(message: Any) -> tuple[float, tuple[float, float, float]]:
     return time, (x, y, heading)
 
 
+def clock_began(before: Any, now: Any) -> bool:
+    """Return whether the clock began between two messages, the first of which has the stamp 0."""
+    times = [one.header.stamp.sec + one.header.stamp.nanosec / 1e9 for one in (before, now)]
+    return times[0] == 0.0 and times[1] > BEGUN
+
+
 def step_between(before: Any, now: Any, settings: BagConfig) -> Step:
     """Return the step from one ``nav_msgs/Odometry`` to the next.
 
@@ -90,9 +97,13 @@ def step_between(before: Any, now: Any, settings: BagConfig) -> Step:
 
 
 def learn_transforms(frames: Frames, message: Any) -> None:
-    """Learn the transforms of a ``tf2_msgs/TFMessage`` that do not change."""
+    """Learn the transforms of a ``tf2_msgs/TFMessage`` that do not change.
+
+    A transform that is no turn is refused when the others are learnt.
+    """
     with faults_named(f"ROS, {TRANSFORMS}"):
-        frames.add(message)
+        if odd := frames.add(message):
+            raise InputError(odd[0])
 
 
 def scans_in(

@@ -52,6 +52,8 @@ MAX_TIME = 1e11
 _RESOLUTION = 1e-6  # [s], of the boundaries of merged steps
 _MAX_STEPS = 10_000_000
 _MAX_GAP = 10.0  # [s], typically between two rows of odometry, or of the truth
+_LONG_GAP = 1000.0  # times what is typical: a recording that drops but one row in ten, each by
+# itself, loses so many in a row with a chance of 1e-1000
 _UNITS = (1e-3, 1e-6, 1e-9)  # [s], of other clocks
 
 
@@ -196,6 +198,7 @@ def assemble(
         raise refusal(measurements.path, found, expected, "use the odometry's clock")
     said = (*MEASUREMENT, CALLER, *(name for name in STATED if name in measurements.column))
     measured = {name: measurements.column[name][inside] for name in said}
+    doubts = (*settings.pop("doubts", ()), *_silence(rows, step))
     return Log(
         time=time,
         controls=controls,
@@ -204,6 +207,7 @@ def assemble(
             time, measured, 0.0 if step is None else _RESOLUTION, settings.get("callers", ())
         ),
         ignored_rows={reason: count for reason, count in ignored.items() if count},
+        doubts=doubts,
         turned=int(np.sum(np.abs(measured["bearing"]) > 2.0 * np.pi)),
         **settings,
     )
@@ -295,9 +299,34 @@ def _merged(path: Path | str, time: np.ndarray, step: float) -> np.ndarray:
     """Return the times of the start and of the ends of steps of one length."""
     count = max(1.0, np.ceil((time[-1] - time[0] - _RESOLUTION) / step))
     if count > _MAX_STEPS:
-        found = f"{time[-1] - time[0]:g} s in steps of {step:g} s"
-        raise refusal(path, found, f"at most {_MAX_STEPS} steps", "correct the times or the step")
+        gap, start, end, _ = _widest_gap(time)
+        found = (
+            f"{time[-1] - time[0]:g} s in steps of {step:g} s, {gap:g} s of them without a row, "
+            f"from {start!r} s to {end!r} s"
+        )
+        fix = "correct the times there, if the clock was set, or the step"
+        raise refusal(path, found, f"at most {_MAX_STEPS} steps", fix)
     return np.append(time[0] + step * np.arange(count), time[-1])
+
+
+def _widest_gap(time: np.ndarray) -> tuple[float, float, float, float]:
+    """Return the widest gap between times, its start and end, and what is typical [s]."""
+    gaps = np.diff(time)
+    row = int(np.argmax(gaps))
+    start, end = time[row : row + 2].tolist()
+    return end - start, start, end, float(np.median(gaps))
+
+
+def _silence(time: np.ndarray, step: float | None) -> list[str]:
+    """Ask about a gap that no recorder leaves by chance."""
+    gap, start, end, typical = _widest_gap(time)
+    if not gap > max(_LONG_GAP * typical, _MAX_GAP):
+        return []
+    steps = "" if step is None else f", which is {math.ceil(gap / step)} steps"
+    return [
+        f"the odometry is silent for {gap:.6g} s, from {start!r} s to {end!r} s{steps}, and its "
+        f"rows are typically {typical:.3g} s apart; was its clock set, or the recording paused?"
+    ]
 
 
 def _mean_controls(

@@ -277,6 +277,8 @@ def check_columns(table: Table) -> None:
             if name == "time":
                 found += f" after {values[row - 1].item()!r}"
             fix = _LABEL_IT if np.isnan(values[row]) else "correct or remove the row"
+            if name == "time" and table.unit == "message":
+                fix = "its clock was set back; --bag.stamps received takes the times of reception"
             raise refusal(where, found, promise, fix)
         if name in _LABELS:
             table.column[name] = values.astype(np.int64)

@@ -7,6 +7,7 @@ not say, when a drive began and where.
 """
 
 import math
+from collections import Counter
 from collections.abc import Callable, Mapping
 from dataclasses import replace
 from os.path import lexists
@@ -54,9 +55,10 @@ def with_bag_truth(read: Read, path: Path, settings: BagConfig) -> tuple[Log, Tr
 
     What was driven before the truth is known is left out.
     """
-    from pipistrelle.detection.logs.bag_log import read_poses
+    from pipistrelle.detection.logs.bag_log import Remarks, read_poses
 
-    if (known := read_poses(path, settings)) is None:
+    remarks = Remarks()
+    if (known := read_poses(path, settings, remarks)) is None:
         log = read(path, settings)
         return log, Truth(time=log.time)
     time, path_there = known
@@ -67,7 +69,9 @@ def with_bag_truth(read: Read, path: Path, settings: BagConfig) -> tuple[Log, Tr
         where = f"{path}, topic {settings.truth}"
         raise refusal(where, "none", expected, "name another topic, or --bag.stamps received")
     x, y, heading = there[0].tolist()
-    return replace(log, initial_pose=(x, y, heading)), Truth(time=log.time, path=there)
+    ignored = Counter(log.ignored_rows) + remarks.ignored
+    odd = {"ignored_rows": dict(ignored), "doubts": (*log.doubts, *remarks.doubts)}
+    return replace(log, initial_pose=(x, y, heading), **odd), Truth(time=log.time, path=there)
 
 
 WithTruth = Callable[..., tuple[Log, Truth]]
