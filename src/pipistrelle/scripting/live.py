@@ -54,6 +54,8 @@ OF_ITSELF = {"format": 1, "initial_pose": [0.0, 0.0, 0.0], "initial_pose_std": [
 """Keys that a table need not have: the frame begins where the vehicle stands."""
 KEPT = 100_000
 """Of how many of the last steps the poses are kept."""
+ROUNDING = float(np.finfo(float).eps) ** 0.5
+"""Half of the digits of a number."""
 OWN_WORDS = ("filter", "config", "time", "kept")
 """Keywords that are no settings."""
 R = TypeVar("R")
@@ -174,8 +176,9 @@ class Slam:
     def pose(self) -> Pose:
         """Where the vehicle is, as it is believed now."""
         pose = self._at_vehicle(self._session.belief.pose())
-        x, y, heading = pose.mean.tolist()
-        return Pose(self._time, x, y, heading, pose.covariance.copy())
+        values, axes = np.linalg.eigh(pose.covariance)
+        covariance = pose.covariance if values[0] >= 0.0 else (axes * values.clip(0.0)) @ axes.T
+        return Pose(self._time, *pose.mean.tolist(), covariance.copy())
 
     @property
     def map(self) -> "pl.DataFrame":
@@ -380,14 +383,9 @@ class Slam:
         before = self._session.state()
         try:
             result = act()
-            pose = self._session.belief.pose()
-            if not (np.isfinite(pose.mean).all() and np.isfinite(pose.covariance).all()):
-                raise refusal(
-                    f"at {self._time:g} s",
-                    "a pose that is no number",
-                    "a finite one",
-                    "this step or scan was not taken in; is it in metres, seconds and radians?",
-                )
+            if fault := _fault(self._session.belief.pose()):
+                fix = "this step or scan was not taken in; is it in metres, seconds and radians?"
+                raise refusal(f"at {self._time:g} s", *fault, fix)
             return result
         except BaseException:
             self._session.go_on_from(before)
@@ -404,6 +402,19 @@ class Slam:
         """Return the steps of the sensor, by those of its vehicle."""
         time = np.array([self._time, *ends])
         return at_sensor(replace(self._drive, time=time, controls=steps)).controls
+
+
+def _fault(pose: Gaussian) -> tuple[str, str] | None:
+    """Return how a pose is wrong, and what is expected; None where it is sound.
+
+    Rounding makes an eigenvalue of 0 slightly negative; half of the digits are more than rounding.
+    """
+    if not (np.isfinite(pose.mean).all() and np.isfinite(pose.covariance).all()):
+        return "a pose that is no number", "a finite one"
+    least, *_, largest = np.linalg.eigvalsh(pose.covariance).tolist()
+    if least < -ROUNDING * largest:
+        return f"a pose unsure to {largest**0.5:.3g} m, beyond what numbers can hold", "a surer one"
+    return None
 
 
 def _log_of(vehicle: Vehicle, time: float) -> tuple[Log, Path]:

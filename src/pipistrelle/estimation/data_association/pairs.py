@@ -101,7 +101,7 @@ def pair_costs(
                 det = a * c - b * b
                 squared = (c * nu * nu - 2.0 * b * nu * off + a * off * off) / det
                 size, density = (2.0 * math.pi) ** 2 * det, made.clutter * heard.clutter[m]
-            if squared < made.gate:
+            if squared < made.gate and size > 0.0:  # else lost to rounding
                 costs[m, n] = squared + math.log(size) + 2.0 * math.log(density / made.detection)
     return costs
 
