@@ -13,6 +13,7 @@ import pipistrelle
 from pipistrelle.config import Config, DetectionConfig, InputError
 from pipistrelle.detection.logs.folder import read_log
 from pipistrelle.detection.logs.heard_rows import RowsHeard
+from pipistrelle.detection.sounds.check import check_recording
 from pipistrelle.detection.sounds.description import read_description
 from pipistrelle.detection.sounds.hearing import hear_recording, log_callers
 from pipistrelle.experiments.hearing.listening import listen
@@ -198,6 +199,41 @@ def test_calls_are_found_where_calls_csv_would_have_said(tmp_path, way):
         assert abs(a.time - b.time) <= late
         i, j = int(a.level_db.argmax()), int(b.level_db.argmax())
         assert abs(a.range[i] - b.range[j]) <= 170.0 * late + 2e-3
+
+
+@pytest.mark.parametrize("left", [1, 60, 121, 122, 200, 241, 242, 251, 400])
+@pytest.mark.parametrize("header", ["sample", "sample,time"])
+def test_hear_and_its_check_leave_out_a_call_at_the_end_of_the_sound(tmp_path, left, header):
+    folder, out = foreign(tmp_path / "tape"), tmp_path / "log"
+    samples = soundfile.info(folder / "tape.wav").frames
+    rows = ["1000,", "25000,", "47000,10.3", f"{samples - left},"]
+    rows = [row.partition(",")[0] for row in rows] if header == "sample" else rows
+    (folder / "calls.csv").write_text("\n".join([header, *rows, ""]))
+    times = {*pipistrelle.hear(folder, output=out).measurements["time"].to_list()}
+    third = 10.0 + 47_000 / 192e3 if header == "sample" else 10.3
+    expected = [10.0 + 1000 / 192e3, 10.0 + 25_000 / 192e3, third]
+    np.testing.assert_allclose(sorted(times)[:3], expected)
+    assert len(times) == 3 or left == 400, "a whole echo fits into 400 samples, and into no fewer"
+    assert check_recording(folder, read_description(folder), Config()) == []
+
+
+def test_hear_leaves_out_a_call_at_the_end_where_others_call_too(own, tmp_path):
+    shutil.copytree(own, tmp_path / "tape")
+    with (tmp_path / "tape" / "calls.csv").open("a") as file:
+        file.write("799900,4.1\n")
+    done = pipistrelle.hear(tmp_path / "tape", output=tmp_path / "log")
+    assert done.measurements.equals(pipistrelle.hear(own).measurements)
+
+
+def test_hear_refuses_a_sole_call_at_the_end_of_the_sound(tmp_path):
+    folder = foreign(tmp_path / "tape")
+    samples = soundfile.info(folder / "tape.wav").frames
+    (folder / "calls.csv").write_text(f"sample\n{samples - 100}\n")
+    refused(folder, "calls.csv", "100 samples follow the first")
+    (folder / "calls.csv").write_text(f"sample\n1000\n{samples}\n")
+    refused(folder, "calls.csv, line 3", "outside the sound")
+    (folder / "calls.csv").write_text("sample\n-1\n1000\n")
+    refused(folder, "calls.csv, line 2", "outside the sound")
 
 
 def as_one_place(folder):

@@ -50,11 +50,14 @@ class Calls(NamedTuple):
 
 
 def calls_of(folder: Path, about: Description, sound: Sound, blocks: Blocks, sent: Call) -> Calls:
-    """Return when the vehicle called: told by a file or a setting, else found in the sound."""
+    """Return when the vehicle called: told by a file or a setting, else found in the sound.
+
+    A call is left out where the sound ends before a whole echo could be heard after it.
+    """
     path, call = folder / FILE, about.call
-    time = None
+    stated = None
     if os.path.lexists(path):
-        sample, time = _told(path, sound)
+        sample, stated = _told(path, sound)
         where = str(path)
     elif call.period is not None:
         count = max((sound.samples / sound.rate - call.first) / call.period, 0.0)
@@ -66,12 +69,18 @@ def calls_of(folder: Path, about: Description, sound: Sound, blocks: Blocks, sen
     else:
         where = f"{folder}, the call's leak into the microphones"
         sample = _leaks(sound, sent, 2 * blocks.blank)
-    sample = sample[sample + blocks.blank < sound.samples].astype(np.int64)
-    if not sample.size:
-        raise refusal(where, "no call in the sound", "one or more", "say when it calls")
-    stamp = about.start + sample / sound.rate
-    time = stamp if time is None else np.where(np.isnan(time), stamp, time)[: sample.size]
-    return Calls(sample, time, _lengths(sample, sound, blocks, where))
+    time = about.start + sample / sound.rate
+    if stated is not None:
+        time = np.where(np.isnan(stated), time, stated)
+    heard = sample + blocks.blank + (blocks.pulse + 1) * blocks.block <= sound.samples
+    if not heard.any():
+        found = "no call in the sound"
+        if sample.size:
+            left = sound.samples - int(sample[0])
+            found = f"no call after which an echo could be heard: {left} samples follow the first"
+        raise refusal(where, found, "one or more", "say when it calls")
+    sample = sample[heard].astype(np.int64)
+    return Calls(sample, time[heard], _lengths(sample, sound, blocks, where))
 
 
 def _told(path: Path, sound: Sound) -> tuple[Float[np.ndarray, " k"], Float[np.ndarray, " k"]]:
