@@ -110,3 +110,43 @@ def _pulse(time, frequency, duration):
     """Return a tone burst at times since its start [s]."""
     inside = (time >= 0.0) & (time < duration)
     return np.where(inside, np.cos(2.0 * np.pi * frequency * time), 0.0)
+
+
+def swept(folder, late, *, deaf=3e-3, faint=10e-3, period=0.05, rate=96_000, loud=3.0, seed=1):
+    """Write a recording of a sweep by eight microphones in a circle of 2 cm, as others would.
+
+    After each call an echo from ahead comes so late as `late` has it [s], 75 dB over the noise in
+    a beam, and from the left a faint one. Returns the folder, and when each call comes.
+    """
+    import soundfile
+
+    duration, turn = 2e-3, np.arange(8) * np.pi / 4
+    place = 0.02 * np.stack((np.cos(turn), np.sin(turn)), axis=1)
+    step = round(period * rate)
+    begin = 1000 + step * np.arange(len(late))
+    time = np.arange(begin[-1] + step) / rate
+    sound = 1e-3 * np.random.default_rng(seed).standard_normal((time.size, 8))
+    for first, delay in zip(begin, late, strict=True):
+        sound += 0.5 * _swept(time - first / rate, duration)[:, None]
+        for level, after, toward in ((loud, delay, place[:, 0]), (0.02, faint, place[:, 1])):
+            for m in range(8):
+                sound[:, m] += level * _swept(
+                    time - first / rate - after + toward[m] / 340, duration
+                )
+    folder.mkdir(exist_ok=True)
+    soundfile.write(folder / "tape.wav", sound.astype(np.float32), rate, subtype="FLOAT")
+    rows = [f"{m + 1},{x!r},{y!r}" for m, (x, y) in enumerate(place.tolist())]
+    write_beside(
+        folder, 29e3, duration, 340.0, "\n".join(["channel,x,y", *rows, ""]), begin, until=20
+    )
+    about = (folder / "recording.toml").read_text()
+    sweep = f'call = "sweep"\nband = [36000.0, 22000.0]\ntaper = 0.2\ndeaf = {deaf}\n'
+    (folder / "recording.toml").write_text(about.replace("frequency = 29000.0\n", sweep))
+    return folder, 10.0 + begin / rate
+
+
+def _swept(time, duration):
+    """Return a sweep from 36 to 22 kHz at times since its start [s]; its ends fade."""
+    inside, share = (time >= 0.0) & (time < duration), np.clip(time / duration, 0.0, 1.0)
+    edge = np.sin(0.5 * np.pi * np.clip(np.minimum(share, 1.0 - share) / 0.1, 0.0, 1.0)) ** 2
+    return np.where(inside, edge * np.sin(2.0 * np.pi * (36e3 - 7e3 * share) * time), 0.0)

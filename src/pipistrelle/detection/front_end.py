@@ -10,8 +10,9 @@ of a louder detection of the other is dropped.
 """
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import cache, partial
 
 import numpy as np
 from jaxtyping import Bool, Complex, Float, Int
@@ -145,13 +146,18 @@ def find_calls(
     start: float,
     interval: float,
     pulse: int,
+    around: Callable[[], Complex[np.ndarray, "l f c e"]] | None = None,
 ) -> Detections:
-    """Find bearings and delays of everything that stands out of the noise, as `detect` does."""
+    """Find bearings and delays of everything that stands out of the noise, as `detect` does.
+
+    `around`: returns the outputs also at lags where a call is only partly in the record, as many
+    more at each end (`BandFilters.around`); without it, sound that the record cuts is not known.
+    """
     lags = Lags(start, interval, pulse)
     if isinstance(end, Detector):
         return detect(matched, end, **lags._asdict())
     if isinstance(end, Mixed):
-        return _of_mixed(matched, end, lags)
+        return _of_mixed(matched, end, lags, around and cache(around))
     found = joined([_of_group(matched, end, g, lags) for g in range(len(end.finders))])
     return replace(found, direct=_direct_of_groups(matched, end, found, lags))
 
@@ -234,16 +240,25 @@ def _tones_of(matched: Complex[np.ndarray, "l f c e"], end: Mixed) -> Complex[np
     return outputs
 
 
-def _of_mixed(matched: Complex[np.ndarray, "l f c e"], end: Mixed, lags: Lags) -> Detections:
-    """Find the calls of tones and others."""
-    parts = []
+def _of_mixed(
+    matched: Complex[np.ndarray, "l f c e"],
+    end: Mixed,
+    lags: Lags,
+    around: Callable[[], Complex[np.ndarray, "l f c e"]] | None,
+) -> Detections:
+    """Find the calls of tones and others; those that the record cuts only hide fainter ones."""
+    parts, whole = [], []
     if len(end.narrow) > end.silent:
         found = find_calls(_tones_of(matched, end), end.tones, **lags._asdict())
         parts.append(replace(found, caller=end.narrow[found.caller]))
+        whole.append(np.ones(found.caller.size, dtype=bool))
     for caller, g, finder in end.wide:
         row, members = end.layout.members(g)
-        outputs = np.ascontiguousarray(matched[:, row, caller, members])
-        delay, bearing, power, across, late, angle = find_wide(outputs, finder, lags)
+        outputs = _of_members(lambda: matched, row, caller, members)
+        more = around and partial(_of_members, around, row, caller, members)
+        numbers, heard = find_wide(outputs, finder, lags, more)
+        delay, bearing, power, across, late, angle = numbers
+        whole.append(heard)
         parts.append(
             Detections(
                 face=np.full(delay.size, g),
@@ -257,8 +272,19 @@ def _of_mixed(matched: Complex[np.ndarray, "l f c e"], end: Mixed, lags: Lags) -
             )
         )
     found = joined(parts)
-    found = detections_at(replace(found, direct=None), ~_cross_talk_in(found, end, lags))
+    kept = np.concatenate(whole) & ~_cross_talk_in(found, end, lags)
+    found = detections_at(replace(found, direct=None), kept)
     return replace(found, direct=_direct_of(matched, end, found, lags))
+
+
+def _of_members(
+    outputs: Callable[[], Complex[np.ndarray, "l f c e"]],
+    row: int,
+    caller: int,
+    members: Int[np.ndarray, " k"],
+) -> Complex[np.ndarray, "l k"]:
+    """Return a caller's outputs of the microphones of a group."""
+    return np.ascontiguousarray(outputs()[:, row, caller, members])
 
 
 def _cross_talk_in(found: Detections, end: Mixed, lags: Lags) -> Bool[np.ndarray, " m"]:

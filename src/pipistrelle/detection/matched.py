@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Sequence
+from functools import lru_cache
 
 import numpy as np
 from jaxtyping import Complex, Float, Int
@@ -103,8 +104,7 @@ class BandFilters:
         """Lags in a call."""
         longest = max(replica(call, rate).size for call in calls)
         self.length = max(longest, self.pulse * self.step)
-        self._count: int = 0
-        self._replicas: list[tuple[Int[np.ndarray, " k"], Complex[np.ndarray, " k"]]] = []
+        self._replicas = lru_cache(maxsize=2)(self._in_bands)
 
     def __call__(
         self, samples: Float[np.ndarray, "t f e"], noise_std: float = 1.0
@@ -122,16 +122,27 @@ class BandFilters:
         if not lags:
             return outputs
         count, heard = self.step * next_fast_len(-(-len(samples) // self.step)), None
-        if count != self._count:
-            self._count = count
-            self._replicas = [self._in_band(call) for call in self.calls]
+        replicas = self._replicas(count)
         for c, call in enumerate(self.calls):
             if isinstance(call, ToneBurst):
                 outputs[:, :, c] = self._summed(samples, call.frequency)[:lags] / noise_std
             else:
                 heard = rfft(samples, count, axis=0) if heard is None else heard
-                outputs[:, :, c] = self._filtered(heard, c)[:lags] / whole.type(noise_std)
+                filtered = self._filtered(heard, count, *replicas[c])
+                outputs[:, :, c] = filtered[:lags] / whole.type(noise_std)
         return outputs
+
+    def around(
+        self, samples: Float[np.ndarray, "t f e"], noise_std: float = 1.0
+    ) -> Complex[np.ndarray, "l f c e"]:
+        """Return the outputs also at lags where a call is only partly among the samples.
+
+        These lags precede and follow the others, as many at each end as a call is long: the samples
+        are filtered as if silence surrounded them.
+        """
+        more = self.step * -(-self.length // self.step)
+        silence = np.zeros((more, *samples.shape[1:]), samples.dtype)
+        return self(np.concatenate((silence, samples, silence)), noise_std)
 
     def _summed(
         self, samples: Float[np.ndarray, "t f e"], tone: float
@@ -147,23 +158,31 @@ class BandFilters:
         return filter_blocks(summed, **each).reshape(-1, *samples.shape[1:])
 
     def _filtered(
-        self, heard: Complex[np.ndarray, "k f e"], c: int
+        self,
+        heard: Complex[np.ndarray, "k f e"],
+        count: int,
+        bins: Int[np.ndarray, " b"],
+        sent: Complex[np.ndarray, " b"],
     ) -> Complex[np.ndarray, "l f e"]:
-        """Return the outputs of another call from the samples' transform, of unit noise."""
+        """Return the outputs of another call from the transform of `count` samples."""
         from scipy.fft import ifft
 
-        bins, sent = self._replicas[c]
-        fewer = np.zeros((self._count // self.step, *heard.shape[1:]), heard.dtype)
+        fewer = np.zeros((count // self.step, *heard.shape[1:]), heard.dtype)
         fewer[bins % len(fewer)] = heard[bins] * sent.astype(heard.dtype)[:, None, None]
         return ifft(fewer, axis=0, overwrite_x=True)
 
-    def _in_band(self, call: Call) -> tuple[Int[np.ndarray, " k"], Complex[np.ndarray, " k"]]:
-        """Return the bins of a call's band in the samples' transform, and what weighs them."""
-        band, length = band_of(call, self.rate), self._count / self.rate
-        bins = np.arange(math.ceil(band.low * length), math.floor(band.high * length) + 1)
-        own = np.fft.fft(replica(call, self.rate), self._count)[bins].conj()
-        own *= 2.0 / self.step / math.sqrt(np.sum(np.abs(own) ** 2) / self._count)
-        return bins, own
+    def _in_bands(
+        self, count: int
+    ) -> list[tuple[Int[np.ndarray, " b"], Complex[np.ndarray, " b"]]]:
+        """Return the bins of each call's band in the transform of `count` samples, and weights."""
+        found = []
+        for call in self.calls:
+            band, length = band_of(call, self.rate), count / self.rate
+            bins = np.arange(math.ceil(band.low * length), math.floor(band.high * length) + 1)
+            own = np.fft.fft(replica(call, self.rate), count)[bins].conj()
+            own *= 2.0 / self.step / math.sqrt(np.sum(np.abs(own) ** 2) / count)
+            found.append((bins, own))
+        return found
 
 
 @kernel

@@ -28,6 +28,13 @@ louder than what all louder ones leave there at most, their amplitudes added up:
 answer to the call alone, as the set-up computes it, from several directions and of moving sources,
 and 3 dB more.
 
+**Calls that the record cuts**, as the vehicle is deaf while it calls, are peaks at lags before its
+first or after its last. Their skirts reach into it, wider than a whole call's, for the part that is
+heard has less of the band; and a record of outputs that begins or ends amid a peak is a step, which
+a transform's brick-wall band spreads over all lags, round its ends too. So where something loud is
+near an end, outputs are taken as far as a call reaches beyond both, of samples between silence;
+peaks there hide what their cut call leaves at most, and make no rows themselves.
+
 **How sure.** With the power over the noise p of the beam (`pipistrelle.detection.certainty`),
 
 .. math:: \sigma_\phi^2 = \frac{1 + 1/p}{2 p \kappa}, \qquad
@@ -42,11 +49,11 @@ Sources: Van Trees, Optimum Array Processing (2002), Secs. 6.13 and 8.4; Davies,
 """
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Complex, Float, Int
+from jaxtyping import Bool, Complex, Float, Int
 
 from pipistrelle.acoustics.call import Call, coupling
 from pipistrelle.arrays.bands import Band, band_of, lag_step, replica
@@ -74,6 +81,8 @@ MARGIN = 2.0
 """How much louder than what a louder call leaves at most a peak must be, as a ratio of powers."""
 LOBE = 0.7
 """A lobe this much as loud as the loudest, half a lag off, may be louder at its own time."""
+PARTS_CUT = 16
+"""Parts of a call that is cut, by how many of which are missing its lobes are looked up."""
 SHIFT = 0.01
 """Largest Doppler shift of the calls whose lobes the set-up looks at, as a share."""
 _ANGLES = (0.0, 0.7, 1.3)
@@ -106,6 +115,8 @@ class Wide(NamedTuple):
     """Standard deviation of a delay, by the call's Doppler shift [s]."""
     lobes: Float[np.ndarray, " l"]
     """Largest share of its power that a call leaves so many lags away."""
+    cut_lobes: Float[np.ndarray, "s l"]
+    """The same of calls of which the record holds only a part; the last row of the shortest."""
 
 
 def wide_of(
@@ -140,23 +151,37 @@ def wide_of(
         band=band,
         doppler_std=abs(coupling(calls[caller])) * moving,
         lobes=np.empty(0),
+        cut_lobes=np.empty((0, 0)),
     )
-    return wide._replace(lobes=_lobes_of(calls[caller], wide, lag_step(calls, rate), rate))
+    step = lag_step(calls, rate)
+    lobes = _lobes_of(calls[caller], wide, step, rate)
+    cut = _cut_lobes_of(calls[caller], wide, step, rate)
+    return wide._replace(lobes=lobes, cut_lobes=cut)
 
 
 def find_wide(
-    matched: Complex[np.ndarray, "l k"], wide: Wide, lags: Lags
-) -> Float[np.ndarray, "6 m"]:
+    matched: Complex[np.ndarray, "l k"],
+    wide: Wide,
+    lags: Lags,
+    around: Callable[[], Complex[np.ndarray, "n k"]] | None = None,
+) -> tuple[Float[np.ndarray, "6 m"], Bool[np.ndarray, " m"]]:
     """Find the calls that a group hears, one at each time.
 
-    Returns delay at the vehicle's centre [s], bearing [rad], power, the standard deviations of
-    bearing and delay, and the angle off a face's normal, or for other groups the arctangent of the
-    bearing's slope by the logarithm of the speed of sound.
+    `around`: returns the outputs also at lags where a call is only partly in the record, as many
+    more at each end; they are asked for where something loud is near an end. Returns delay at the
+    vehicle's centre [s], bearing [rad], power, the standard deviations of bearing and delay, and
+    the angle off a face's normal, or for other groups the arctangent of the bearing's slope by the
+    logarithm of the speed of sound; and which calls are wholly in the record.
     """
     if not len(matched):
-        return np.empty((6, 0))
-    loudness = _loudness(matched, wide, lags.interval)
-    peaks = _peaks(loudness, wide.threshold, wide.lobes)
+        return np.empty((6, 0)), np.empty(0, dtype=bool)
+    loudness, cut = _loudness(matched, wide, lags.interval), 0
+    ends = loudness[: wide.lobes.size], loudness[-wide.lobes.size :]
+    if around is not None and max(end.max() for end in ends) > wide.threshold:
+        cut, matched = -len(matched), around()
+        cut = (len(matched) + cut) // 2
+        loudness = _loudness(matched, wide, lags.interval)
+    peaks = _peaks(loudness, wide.threshold, wide.lobes, wide.cut_lobes, cut)
     turn = np.exp(-2j * np.pi * wide.band.centre * lags.interval * np.arange(len(matched)))
     silence = np.zeros(
         (TAPS + margin_of(wide.position, wide.speed_of_sound * lags.interval), matched.shape[1]),
@@ -167,10 +192,13 @@ def find_wide(
     delay, bearing = numbers[:2]
     ahead = wide.middle[0] * np.cos(bearing) + wide.middle[1] * np.sin(bearing)
     numbers[0] = lags.start + delay + ahead / wide.speed_of_sound
+    numbers[0] -= cut * lags.interval
+    whole = (cut <= peaks) & (peaks < len(matched) - cut)
     if math.isnan(wide.normal):
-        return numbers
+        return numbers, whole
     numbers[5] = wrap(bearing - wide.normal)
-    return numbers[:, np.abs(np.sin(numbers[5])) <= wide.sine_limit]
+    seen = np.abs(np.sin(numbers[5])) <= wide.sine_limit
+    return numbers[:, seen], whole[seen]
 
 
 def _loudness(
@@ -226,6 +254,33 @@ def _lobes_of(call: Call, wide: Wide, step: int, rate: float) -> Float[np.ndarra
     return MARGIN * np.maximum.accumulate(most[::-1])[::-1]
 
 
+def _cut_lobes_of(call: Call, wide: Wide, step: int, rate: float) -> Float[np.ndarray, "s l"]:
+    """Return what a call that the record cuts leaves so many lags from its peak, at most.
+
+    A row for each share of the call that is missing, at its beginning or its end. A beam adds the
+    microphones' outputs, each as far from its peak as the delay of the beam is wrong, two margins
+    at most: it is no louder, beside its peak, than the loudest of them.
+    """
+    sent = replica(call, rate)
+    margin = 2 * margin_of(wide.position, wide.speed_of_sound * step / rate)
+    reach, count = math.ceil(sent.size / step), 8 * sent.size
+    most = np.ones((PARTS_CUT + 1, reach + margin))
+    frequency = np.arange(count) * rate / count
+    own = np.fft.fft(sent, count).conj()
+    own[(frequency < wide.band.low) | (frequency > wide.band.high)] = 0.0
+    away = np.minimum(np.arange(count), count - np.arange(count)) // step
+    for row, part in enumerate([*range(PARTS_CUT), PARTS_CUT - 0.5]):
+        missing, left = round(part / PARTS_CUT * sent.size), np.zeros(away.max() + 1)
+        for gone in (slice(missing), slice(sent.size - missing, None)):
+            heard = sent.copy()
+            heard[gone] = 0.0
+            power = np.abs(np.fft.ifft(np.fft.fft(heard, count) * own)) ** 2
+            if power[0] > 0.0:  # a file may end in silence
+                np.maximum.at(left, away, power / power[0])
+        most[row, margin:] = np.maximum.accumulate(left[::-1])[::-1][:reach]
+    return MARGIN * np.maximum(most[:-1], most[1:])
+
+
 def _sinc() -> Float[np.ndarray, "p t"]:
     """Return the windowed sinc at places between two outputs, a row each."""
     away = np.arange(TAPS) - (TAPS // 2 - 1) - np.arange(PARTS + 1)[:, np.newaxis] / PARTS
@@ -262,11 +317,30 @@ def _steer(
             beams[b, (first + i) % count] = total[i]
 
 
+@no_alloc
+def _left(lobes: Float[np.ndarray, " r"], away: Whole) -> float:
+    """Return the share of a call's power so many lags away.
+
+    Beyond the table it falls with the square of the time: so do the ends of a band that ends at
+    once.
+    """
+    last = lobes.size - 1
+    return lobes[away] if away <= last else lobes[last] * (last / away) ** 2
+
+
 @kernel
 def _peaks(
-    loudness: Float[np.ndarray, " l"], threshold: float, lobes: Float[np.ndarray, " r"]
+    loudness: Float[np.ndarray, " l"],
+    threshold: float,
+    lobes: Float[np.ndarray, " r"],
+    cut_lobes: Float[np.ndarray, "s q"],
+    cut: Whole,
 ) -> Int[np.ndarray, " m"]:
-    """Return the lags, the loudest first, that are louder than what louder ones leave there."""
+    """Return the lags, the loudest first, that are louder than what louder ones leave there.
+
+    At so many lags of either end (`cut`) calls are only partly in the record. Loudness comes from a
+    transform: what a call leaves far away goes on at the other end.
+    """
     peaks, count = np.empty(loudness.size, dtype=np.int64), 0
     for b in range(loudness.size):
         before = loudness[b - 1] if b > 0 else -1.0
@@ -281,8 +355,13 @@ def _peaks(
         b, left = peaks[i], 0.0
         for k in range(kept):
             away = abs(found[k] - b)
-            if away < lobes.size:
-                left += math.sqrt(lobes[away] * loudness[found[k]])
+            away = min(away, loudness.size - away)
+            missing = max(cut - found[k], found[k] - (loudness.size - cut - 1))
+            if missing > 0:
+                row = min(missing * len(cut_lobes) // cut, len(cut_lobes) - 1)
+                left += math.sqrt(_left(cut_lobes[row], away) * loudness[found[k]])
+            else:
+                left += math.sqrt(_left(lobes, away) * loudness[found[k]])
         if loudness[b] > left * left:
             found[kept] = b
             kept += 1

@@ -16,7 +16,7 @@ from pipistrelle.detection.sounds.hearing import hear_recording, log_callers
 from pipistrelle.experiments.hearing.listening import listen
 from pipistrelle.experiments.hearing.scenario import world_of
 from pipistrelle.verbs.options import MissionOptions, mission_config
-from reference.sounds import UNLABELLED, record
+from reference.sounds import UNLABELLED, record, swept
 
 LOUD = {"level_db": 65.0}  # else nothing is near enough for an echo of the vehicle's own
 SWEEP = {"emitter": LOUD | {"call": "sweep", "taper": 0.2}}
@@ -162,3 +162,26 @@ def test_a_sweep_that_nobody_says_when_it_comes_is_found_by_its_leak(tmp_path):
     soundfile.write(tape / "recording.wav", samples, rate, subtype="FLOAT")
     with pytest.raises(InputError, match=r"say in calls\.csv when"):
         heard(tape)  # no leak: echoes are all that there is
+
+
+CUT = (-0.5, -0.05, 0.05, 0.1, 0.25, 0.5, 0.75, 0.9, 0.97)
+"""Shares of a loud echo that the vehicle is deaf to, or that the next call cuts off."""
+
+
+@pytest.mark.parametrize("deaf", [3e-3, 2.2e-3])
+@pytest.mark.parametrize("loud", [0.5, 10.0])
+@pytest.mark.parametrize("end", ["begins", "ends"])
+def test_an_echo_that_the_window_cuts_leaves_no_rows(tmp_path, deaf, loud, end):
+    period = 0.05
+    whole = {"begins": deaf, "ends": period - 2e-3}[end]
+    late = [whole + 2e-3 * share * (1 if end == "ends" else -1) for share in CUT]
+    folder, times = swept(tmp_path / "tape", late, deaf=deaf, period=period, loud=loud)
+    rows = pipistrelle.hear(folder, detection__false_alarm=1e-9).measurements
+    for time, delay, share in zip(times, late, CUT, strict=True):
+        found = rows.filter((rows["time"] - time).abs() < 1e-6)["range"].to_numpy()
+        assert np.min(np.abs(found - 170.0 * 10e-3)) < 0.01, "the faint echo is heard"
+        ghosts = np.abs(found - 170.0 * 10e-3) > 0.01
+        if share <= 0.0:
+            assert np.min(np.abs(found - 170.0 * delay)) < 0.01, "a whole echo is heard"
+            ghosts &= np.abs(found - 170.0 * delay) > 0.01
+        assert found[ghosts].size == 0

@@ -36,12 +36,18 @@ class CallOutputs:
         self.mean = np.zeros(int(channel.max()) + 1)
         """Of the samples of each channel; taken away."""
 
-    def __call__(self, samples: Float[np.ndarray, "t m"]) -> Complex[np.ndarray, "l f c e"]:
-        """Return the outputs after the call with which the samples begin."""
+    def __call__(
+        self, samples: Float[np.ndarray, "t m"], *, around: bool = False
+    ) -> Complex[np.ndarray, "l f c e"]:
+        """Return the outputs after the call with which the samples begin.
+
+        `around`: also those at lags where a call is only partly heard (`BandFilters.around`).
+        """
         heard = samples[self.blocks.blank :]
         if len(heard) < self._filters.length:
             return np.empty((0, *self.gain.shape), dtype=np.complex64)
         heard = heard - self.mean.astype(heard.dtype)[: heard.shape[1]]
-        outputs = self._filters(heard[:, self.channel])
+        filtered = self._filters.around if around else self._filters
+        outputs = filtered(heard[:, self.channel])
         outputs *= self.gain.astype(np.float32)
         return outputs

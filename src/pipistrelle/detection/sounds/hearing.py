@@ -3,6 +3,7 @@
 import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -99,7 +100,8 @@ class Hearing:
         for k in numbers:
             first = int(calls.sample[k])
             samples = self.sound.read(first, int(calls.length[k]))
-            yield self._frame(float(calls.time[k]), self._matched(first, samples, room))
+            matched = self._matched(first, samples, room)
+            yield self._frame(float(calls.time[k]), matched, samples)
 
     def _matched(
         self, first: int, samples: Float[np.ndarray, "t m"], room: Workspace
@@ -116,11 +118,20 @@ class Hearing:
         out = room.array("matched", (max(count - on.pulse + 1, 0), *shape))
         return filter_blocks(blocks, pulse=on.pulse, block=1, noise_std=1.0, out=out)
 
-    def _frame(self, time: float, matched: Complex[np.ndarray, "l f c e"]) -> Frame:
+    def _frame(
+        self,
+        time: float,
+        matched: Complex[np.ndarray, "l f c e"],
+        samples: Float[np.ndarray, "t m"],
+    ) -> Frame:
         """Detect the echoes of one call."""
-        on = self.blocks
+        on, around = self.blocks, None
         start = on.blank / on.rate
-        found = find_calls(matched, self.end, start=start, interval=on.interval, pulse=on.pulse)
+        if isinstance(self.sums, CallOutputs):
+            around = partial(self.sums, samples, around=True)
+        found = find_calls(
+            matched, self.end, start=start, interval=on.interval, pulse=on.pulse, around=around
+        )
         if self.own_clock.any():
             found = detections_at(found, ~self.own_clock[found.caller])
         found = with_edge_floor(found, self.config)

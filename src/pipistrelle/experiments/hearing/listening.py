@@ -131,7 +131,8 @@ def listen(
         for timed in frame.calls:
             calls.setdefault(timed.number, (timed, [[] for _ in radii]))
         for r, record in enumerate(engine(frame.aimed, rig, key)):
-            found = rig.find(record.matched, rig.front_end, **record.lags)
+            more = {"around": record.around} if record.around else {}
+            found = rig.find(record.matched, rig.front_end, **record.lags, **more)
             if keep is not None and record.sums is not None:
                 keep(number, frame.aimed[r], record.sums)
             for timed in frame.calls:
@@ -161,6 +162,8 @@ class _Record(NamedTuple):
     """Lags in which the matched filter's answer falls off to either side."""
     sums: Complex[np.ndarray, "b f c e"] | Float[np.ndarray, "t f e"] | None = None
     """The block sums, or real samples, that were filtered, where there are any."""
+    around: Callable[[], Complex[np.ndarray, "l f c e"]] | None = None
+    """Returns the output also where a call is only partly heard (`BandFilters.around`)."""
 
     @property
     def lags(self) -> dict[str, Any]:
@@ -350,7 +353,8 @@ def _dense(aimed: Sequence[Arrivals], rig: _Rig, key: int) -> Iterator[_Record]:
         if rig.filters is not None:
             interval, pulse = rig.filters.step / settled.rate, rig.filters.pulse
             matched = rig.filters(samples, settled.noise_std)
-            yield _Record(matched, start=start, interval=interval, pulse=pulse, sums=samples)
+            around = partial(rig.filters.around, samples, settled.noise_std)
+            yield _Record(matched, start, interval, pulse, sums=samples, around=around)
         else:
             matched = filter_samples(
                 samples, calls=settled.calls, rate=settled.rate, noise_std=settled.noise_std
