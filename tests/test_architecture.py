@@ -93,6 +93,7 @@ AT_THE_DISK = {
     "experiments/runs/rerun.py": {"open"},  # sums of a log's files, of ordinary ones alone
     "experiments/studies/store.py": {"unlink"},  # what a killed writer left, by its name
     "experiments/studies/world_files.py": {"scan_parquet", "unlink"},  # checked; left by a kill
+    "detection/sounds/sound_header.py": {"open"},  # a few bytes of an ordinary file
     "detection/logs/text_tables.py": {"loadtxt"},  # of lines that were read
     "figures/player/page.py": {"read_text"},  # the package's own pages
     "report/page/page.py": {"read_text"},

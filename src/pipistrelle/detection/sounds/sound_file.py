@@ -10,6 +10,7 @@ from jaxtyping import Float
 
 from pipistrelle.config import InputError
 from pipistrelle.detection.sounds.description import FILE, Description
+from pipistrelle.detection.sounds.sound_header import check_header, header_of
 from pipistrelle.files import check_ordinary
 from pipistrelle.refusals import refusal
 
@@ -113,15 +114,18 @@ def _opened(path: Path) -> "SoundFile":
         ) from None
     check_ordinary(path)
     if not path.exists():
-        raise refusal(path, "no such file", "a sound file", f"add it, or correct {FILE}")
+        found = "a link to no file" if path.is_symlink() else "no such file"
+        raise refusal(path, found, "a sound file", f"add it, or correct {FILE}")
     with faults_named(path):
+        if not path.stat().st_size:
+            raise refusal(path, "an empty file", "a sound file", "copy it again")
+        header = header_of(path)
         file = soundfile.SoundFile(path)
-    cut = [line for line in file.extra_info.splitlines() if "should be" in line]
-    if cut or not 1 <= file.frames < 2**50:
-        found = f"a header that does not fit the file ({' '.join(cut[0].split())})" if cut else ""
+    try:
+        check_header(path, file, header)
+    except BaseException:
         file.close()
-        found = found or "no samples"
-        raise refusal(path, found, "a whole sound file", "copy it anew, or mend its header")
+        raise
     return file
 
 
@@ -132,6 +136,11 @@ def faults_named(path: Path) -> Iterator[None]:
 
     try:
         yield
+    except InputError:
+        raise
+    except PermissionError:
+        fix = "give yourself the permission to read it"
+        raise refusal(path, "a file that may not be read", "a sound file", fix) from None
     except (SoundFileError, OSError, ValueError, TypeError, OverflowError) as error:
         what: Any = str(error).strip().splitlines() or [type(error).__name__]
         found = what[-1].removeprefix("Error opening ").strip(" .")
