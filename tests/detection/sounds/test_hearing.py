@@ -1,6 +1,7 @@
 """Sound in: own recordings give the run's own rows, foreign ones what is in them."""
 
 import shutil
+import time
 import tracemalloc
 from pathlib import Path
 from types import SimpleNamespace
@@ -13,6 +14,7 @@ import pipistrelle
 from pipistrelle.config import Config, DetectionConfig, InputError
 from pipistrelle.detection.logs.folder import read_log
 from pipistrelle.detection.logs.heard_rows import RowsHeard
+from pipistrelle.detection.sounds.calls import _loudest_around, calls_of
 from pipistrelle.detection.sounds.check import check_recording
 from pipistrelle.detection.sounds.description import read_description
 from pipistrelle.detection.sounds.hearing import hear_recording, log_callers
@@ -223,6 +225,33 @@ def test_hear_leaves_out_a_call_at_the_end_where_others_call_too(own, tmp_path):
         file.write("799900,4.1\n")
     done = pipistrelle.hear(tmp_path / "tape", output=tmp_path / "log")
     assert done.measurements.equals(pipistrelle.hear(own).measurements)
+
+
+def test_leaks_are_the_loudest_around_as_if_each_were_compared_with_all():
+    rng = np.random.default_rng(3)
+    for apart in (1, 7, 40):
+        sample = np.sort(rng.uniform(0.0, 1000.0, 300).round(rng.integers(3)))
+        sample[5:8] = sample[[7, 5, 6]]
+        level = rng.integers(1, 6, 300) / 2.0
+        expected = [
+            i == np.where(np.abs(sample - sample[i]) <= apart, level, 0.0).argmax()
+            for i in range(300)
+        ]
+        assert _loudest_around(sample, level, apart).tolist() == expected
+
+
+def test_leaks_of_hours_of_a_loud_tone_are_found_in_seconds():
+    sample = np.arange(400_000) * 700.0
+    begin = time.perf_counter()
+    assert _loudest_around(sample, np.ones(sample.size), 700).sum() == 1
+    assert time.perf_counter() - begin < 60.0, "each with all took hours"
+
+
+def test_hear_refuses_more_calls_of_a_period_than_memory_holds(tmp_path):
+    about = SimpleNamespace(start=0.0, call=SimpleNamespace(first=0.0, period=1e-3, trigger=None))
+    sound = SimpleNamespace(samples=2**40, rate=192e3, channels=1)
+    with pytest.raises(InputError, match="period': found 5726623061 calls"):
+        calls_of(tmp_path, about, sound, None, None)
 
 
 def test_hear_refuses_a_sole_call_at_the_end_of_the_sound(tmp_path):

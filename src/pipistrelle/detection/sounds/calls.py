@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 
 from pipistrelle.acoustics.call import Call
 from pipistrelle.detection.logs.text_tables import place_of, read_table
@@ -28,6 +28,8 @@ LONGEST = 2.0
 """How long is listened after a call at most [s]."""
 MIN_GAP = 2
 """Fewest lengths of a call from the end of one to the beginning of the next."""
+MOST_CALLS = 10_000_000
+"""Most calls of a period: a day of a hundred a second, half a gigabyte of numbers."""
 ONSET = 0.35
 """Share of the usual amplitude of a leak or a trigger that counts as a call."""
 _STRETCH = 10.0
@@ -61,8 +63,11 @@ def calls_of(folder: Path, about: Description, sound: Sound, blocks: Blocks, sen
         where = str(path)
     elif call.period is not None:
         count = max((sound.samples / sound.rate - call.first) / call.period, 0.0)
-        sample = np.rint((call.first + np.arange(np.ceil(count)) * call.period) * sound.rate)
         where = f"{folder / ABOUT}, key 'call.period'"
+        if count > MOST_CALLS:
+            expected = f"{MOST_CALLS} or fewer"
+            raise refusal(where, f"{count:.0f} calls in the sound", expected, "part the recording")
+        sample = np.rint((call.first + np.arange(np.ceil(count)) * call.period) * sound.rate)
     elif call.trigger is not None:
         where = f"{folder / ABOUT}, key 'call.trigger'"
         sample = _triggered(sound, call.trigger - 1, where, blocks.blank)
@@ -128,8 +133,9 @@ def _pieces(sound: Sound, step: int, more: int) -> Iterator[tuple[int, Float[np.
 
 def _least(sound: Sound, sample: Float[np.ndarray, " k"], level: Float[np.ndarray, " k"]) -> float:
     """Return the least level of a call, from the loudest of stretches."""
-    stretch = (sample / sound.rate // _STRETCH).astype(np.int64)
-    loudest = [level[stretch == one].max() for one in np.unique(stretch)]
+    stretches, stretch = np.unique(sample / sound.rate // _STRETCH, return_inverse=True)
+    loudest = np.zeros(stretches.size)
+    np.maximum.at(loudest, stretch, level)
     return ONSET * float(np.median(loudest))
 
 
@@ -164,11 +170,28 @@ def _leaks(sound: Sound, sent: Call, apart: int) -> Float[np.ndarray, " k"]:
     if not loudest:
         return np.empty(0)
     sample, level = np.array(loudest).T
-    loud = level >= _least(sound, sample, level)
-    sample, level = sample[loud], level[loud]
-    alone = [i == np.where(np.abs(sample - sample[i]) <= apart, level, 0.0).argmax()
-             for i in range(sample.size)]  # fmt: skip
-    return np.rint(np.maximum(sample[alone], 0.0))
+    loud = (level >= _least(sound, sample, level)) & (level > 0.0)
+    kept = _loudest_around(sample[loud], level[loud], apart)
+    return np.rint(np.maximum(sample[loud][kept], 0.0))
+
+
+def _loudest_around(
+    sample: Float[np.ndarray, " k"], level: Float[np.ndarray, " k"], apart: int
+) -> Bool[np.ndarray, " k"]:
+    """Return which are the loudest within so many samples, the first of several that are.
+
+    Only neighbours in time are compared: of hours of a loud tone there are millions.
+    """
+    order = np.argsort(sample, kind="stable")
+    place = sample[order]
+    begin = np.searchsorted(place, place - apart - 1.0)
+    until = np.searchsorted(place, place + apart + 1.0)
+    kept = np.zeros(sample.size, dtype=bool)
+    for i, first, last in zip(order, begin, until, strict=True):
+        near = np.sort(order[first:last])
+        near = near[np.abs(sample[near] - sample[i]) <= apart]
+        kept[i] = i == near[level[near].argmax()]
+    return kept
 
 
 def _aside(level: Float[np.ndarray, " n"]) -> float:
