@@ -1,5 +1,6 @@
 """Sound recordings for Python: heard into a log, and drawn."""
 
+import warnings
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from os.path import lexists
@@ -55,6 +56,8 @@ class Heard:
     """How many rows there are; what else a log of them says."""
     text: str | None
     """The rows, where they are not kept in a folder."""
+    odd: tuple[str, ...] = ()
+    """Why the echoes may be wrong, a line each."""
     folder: Path | None = None
     """Where the log is kept, if anywhere."""
 
@@ -128,10 +131,14 @@ def hear(
     asked = place, config, frames, "frames", progress
     if output is None:
         parts: list[str] = []
-        return heard_of(*asked, parts.append, lambda: "".join(parts))
-    flags = ("output=", "overwrite=True")
-    own = claim(folder_named(output, "output"), LOG, overwrite=overwrite, flags=flags)
-    return heard_into(own, *asked)
+        heard = heard_of(*asked, parts.append, lambda: "".join(parts))
+    else:
+        flags = ("output=", "overwrite=True")
+        own = claim(folder_named(output, "output"), LOG, overwrite=overwrite, flags=flags)
+        heard = heard_into(own, *asked)
+    for line in heard.odd:
+        warnings.warn(f"{place}: {line}", stacklevel=2)
+    return heard
 
 
 def heard_into(
@@ -189,11 +196,11 @@ def heard_of(
         overview.look(frame)
         write(log.text(frame.scan))
 
-    hear_recording(
+    odd = hear_recording(
         folder, about, config, lambda count: frames_named(frames, count, where), look, progress
     )
     log.files()  # refuses a log without rows
-    return Heard(overview=overview, log=log, text=text())
+    return Heard(overview=overview, log=log, text=text(), odd=tuple(odd))
 
 
 def faults_of(folder: Path, config: Config) -> list[str]:

@@ -71,6 +71,7 @@ def hear(
     announce(None if quiet else say)
     with progress(quiet) as show:
         heard = heard_into(own, recording, config, frames, "--frames", show)
+    warn(*(f"{recording}: {line}" for line in heard.odd))
     outside = heard.log.rows - heard.log.inside
     if outside:
         warn(f"{recording}: {outside} rows are before or after the odometry, and left out by slam")

@@ -10,7 +10,7 @@ import soundfile
 from pipistrelle.config import Config
 from pipistrelle.detection.sounds.check import check_recording
 from pipistrelle.detection.sounds.description import read_description
-from reference.sounds import record
+from reference.sounds import foreign, record
 
 DRIVE = ("--landmarks", "20", "--duration", "4", "--seed", "7")
 SWEEPS = ("--emitter.call", "sweep", "--emitter.level-db", "65", "--beacon.call", "sweep")
@@ -138,3 +138,75 @@ def test_a_clock_that_jumps_is_told_where_it_does(tape):
     assert any(
         "from call 4 to the next" in fault and "0.0035 s" in fault for fault in checked(tape)
     )
+
+
+def respelled(folder, change, subtype="PCM_16"):
+    samples, rate = soundfile.read(folder / "tape.wav", dtype="float32")
+    samples = change(samples)
+    soundfile.write(folder / "tape.wav", samples, rate, subtype=subtype)
+    return checked(folder)
+
+
+def copied(source, target, scale=1.0, late=0):
+    def change(samples):
+        samples[:, target] = scale * np.roll(samples[:, source], late)
+        return samples
+
+    return change
+
+
+@pytest.mark.parametrize("subtype", ["FLOAT", "PCM_24", "PCM_16"])
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        (copied(0, 1), ": of one"),
+        (copied(0, 1, -1.0), ", times -1: of one"),
+        (copied(0, 1, 0.3), ", times 0.3: of one"),
+        (copied(0, 1, 1.0, 1), ", 1 samples late: of one"),
+        (copied(0, 1, -0.5, -1), ", times -0.5, 1 samples early: of one"),
+    ],
+)
+def test_the_check_names_a_channel_that_is_a_copy(tmp_path, change, words, subtype):
+    faults = respelled(foreign(tmp_path / "tape"), change, subtype)
+    named = [fault for fault in faults if "copy" in fault]
+    assert len(named) == 1
+    assert named[0].startswith(f"channel 2 is a copy of channel 1{words}")
+
+
+def test_the_check_names_all_channels_where_all_are_one(tmp_path):
+    def same(samples):
+        return np.repeat(samples[:, :1], 16, axis=1)
+
+    faults = respelled(foreign(tmp_path / "tape"), same)
+    copies = [fault for fault in faults if "is a copy of channel 1:" in fault]
+    assert len(copies) == 15
+
+
+@pytest.mark.parametrize("noise", [1.0, 0.5, 0.3, 0.1, 0.01])
+def test_independent_noise_near_a_files_quantum_is_no_copy(tmp_path, noise):
+    def faint(samples):
+        rng = np.random.default_rng(5)
+        return samples * 1e-9 + noise / 32768 * rng.standard_normal(samples.shape)
+
+    faults = respelled(foreign(tmp_path / "tape"), faint)
+    assert not [fault for fault in faults if "copy" in fault]
+
+
+def test_noise_that_all_microphones_hear_is_no_copy(tmp_path):
+    def humming(samples):
+        hum = np.sin(np.arange(len(samples)) / 50.0)[:, np.newaxis]
+        return 0.3 * hum + samples * 0.01
+
+    faults = respelled(foreign(tmp_path / "tape"), humming, "FLOAT")
+    assert not [fault for fault in faults if "copy" in fault]
+
+
+@pytest.mark.parametrize("value", [0.0, 0.1])
+def test_the_check_names_a_channel_that_is_constant_as_dead(tmp_path, value):
+    def constant(samples):
+        samples[:, 3:5] = value
+        return samples
+
+    faults = respelled(foreign(tmp_path / "tape"), constant, "FLOAT")
+    assert [fault[:17] for fault in faults[:2]] == ["channel 4 is dead", "channel 5 is dead"]
+    assert not [fault for fault in faults if "copy" in fault]

@@ -405,6 +405,25 @@ def test_samples_that_are_no_numbers_are_named_by_channel_and_place(tmp_path):
     refused(folder, "tape.wav, channel 5", "nan as sample 30000")
 
 
+def test_hear_warns_of_a_channel_that_is_a_copy(tmp_path):
+    folder = foreign(tmp_path / "tape")
+    samples, rate = soundfile.read(folder / "tape.wav", dtype="float32")
+    samples[:, 6] = samples[:, 2]
+    soundfile.write(folder / "tape.wav", samples, rate, subtype="PCM_16")
+    with pytest.warns(UserWarning, match="channel 7 is a copy of channel 3:"):
+        done = pipistrelle.hear(folder)
+    assert len(done.odd) == 1
+
+
+@pytest.mark.parametrize("value", [0.1, 1.0 / 3.0])
+def test_hear_refuses_a_channel_that_is_constant(tmp_path, value):
+    folder = foreign(tmp_path / "tape")
+    samples, rate = soundfile.read(folder / "tape.wav", dtype="float32")
+    samples[:, 6] = value
+    soundfile.write(folder / "tape.wav", samples, rate, subtype="FLOAT")
+    refused(folder, "channel 7", "no noise")
+
+
 def test_a_silent_channel_is_named(tmp_path):
     folder = foreign(tmp_path / "tape", gain=np.array([1.0] * 6 + [0.0] + [1.0] * 9))
     refused(folder, "channel 7", "no noise")

@@ -11,6 +11,7 @@ from pipistrelle.arrays.bands import extent_of, replica
 from pipistrelle.config import Config
 from pipistrelle.detection.sounds.calls import Calls, calls_of
 from pipistrelle.detection.sounds.check_array import BETTER, array_faults
+from pipistrelle.detection.sounds.copied_channels import copied_channels
 from pipistrelle.detection.sounds.description import Description
 from pipistrelle.detection.sounds.hearing import Hearing, sums_of
 from pipistrelle.detection.sounds.recorded_array import RecordedArray, recorded_array
@@ -37,6 +38,7 @@ def check_recording(folder: Path, about: Description, config: Config) -> list[st
         calls = calls_of(folder, about, sound, blocks, sent[0])
         gaps = np.unique(np.linspace(0, calls.sample.size - 1, GAPS).round().astype(np.int64))
         dead, faults = _channels(sound, calls, gaps, array)
+        faults += copied_channels(sound, calls, blocks.blank, array.used)
         look = _tone_rate if isinstance(sent[0], ToneBurst) else _call_rate
         faults += look(sound, calls, gaps, sent[0])
         faults += _clock(calls, blocks)
@@ -60,7 +62,7 @@ def _channels(
         top = (np.abs(samples) == most) & (most > 0.0)
         flat += (top[1:] & top[:-1] & (np.sign(samples[1:]) == np.sign(samples[:-1]))).sum(axis=0)
     level, offset = np.median(noise, axis=0), np.mean(mean, axis=0)
-    used = np.sort(array.channel.ravel())
+    used = array.used
     usual = float(np.median(level[used]))
     faults, dead = [], [m for m in used if level[m] <= _FAINT * usual]
     for m in used:

@@ -20,6 +20,7 @@ from pipistrelle.detection.scans import Scan
 from pipistrelle.detection.snapshots import Detections, detections_at
 from pipistrelle.detection.sounds.call_outputs import CallOutputs
 from pipistrelle.detection.sounds.calls import Calls, calls_of
+from pipistrelle.detection.sounds.copied_channels import copied_channels
 from pipistrelle.detection.sounds.description import FILE, Description
 from pipistrelle.detection.sounds.noise_level import set_noise
 from pipistrelle.detection.sounds.recorded_array import FILE as ARRAY
@@ -167,18 +168,20 @@ def hear_recording(
     frames: Callable[[int], range],
     look: Callable[[Frame], None],
     progress: Progress | None = None,
-) -> None:
-    """Hear a recording, call by call.
+) -> list[str]:
+    """Hear a recording, call by call; return why its echoes may be wrong, a line each.
 
     `frames`: given the number of calls, which of them are heard; `look`: given each.
     """
     with open_sound(folder, about) as sound:
         hearing = Hearing.of(folder, sound, about, config)
         numbers = frames(hearing.calls.sample.size)
+        odd = [*copied_channels(sound, hearing.calls, hearing.blocks.blank, hearing.array.used)]
         for done, frame in enumerate(hearing.frames(numbers), start=1):
             look(frame)
             if progress:
                 progress("hearing", done, len(numbers))
+    return odd
 
 
 def log_callers(about: Description) -> list[dict[str, Any]]:

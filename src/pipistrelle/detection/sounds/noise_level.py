@@ -40,10 +40,11 @@ def set_noise(sums: ToneSums | CallOutputs, sound: Sound, calls: Calls, folder: 
         np.unique(np.linspace(0, last, most).round().astype(np.int64))
         for most in (FIRST_GAPS, sums.gaps)
     )
-    means = [
-        samples[sums.blocks.blank :].mean(axis=0, dtype=np.float64)
-        for samples in _gaps(sound, calls, first)
-    ]
+    means, constant = [], np.ones(sound.channels, dtype=bool)
+    for samples in _gaps(sound, calls, first):
+        heard = samples[sums.blocks.blank :]
+        means.append(heard.mean(axis=0, dtype=np.float64))
+        constant &= (heard == heard[0]).all(axis=0)
     sums.mean = np.mean(means, axis=0)
     quiet = _quiet(_powers(sums, sound, calls, first, range(STRETCHES)))
     groups = np.array_split(gaps, math.ceil(gaps.size / GROUP))
@@ -57,8 +58,9 @@ def set_noise(sums: ToneSums | CallOutputs, sound: Sound, calls: Calls, folder: 
     if count < MIN_SUMS * len(groups):
         found = f"{count} blocks in the quietest part of the gaps between calls"
         raise refusal(folder, found, f"{MIN_SUMS} or more", "record for longer")
-    if not level.all():
-        f, _, e = (int(one[0]) for one in np.nonzero(level == 0.0))
+    silent = (level == 0.0) | constant[sums.channel][:, np.newaxis]
+    if silent.any():
+        f, _, e = (int(one[0]) for one in np.nonzero(silent))
         where = f"{folder}, channel {sums.channel[f, e] + 1}"
         raise refusal(where, "no noise at all", "a microphone", "take it out of array.csv")
     sums.gain /= np.sqrt(_alike(level, count))

@@ -22,6 +22,11 @@ class RecordedArray(NamedTuple):
     face: tuple[str, ...]
     """Names of the groups of microphones that are scanned together."""
 
+    @property
+    def used(self) -> Int[np.ndarray, " m"]:
+        """The channels that are microphones, in order."""
+        return np.unique(self.channel)
+
 
 def recorded_array(folder: Path, channels: int, *, one_centre: bool) -> RecordedArray:
     """Read ``array.csv`` of a recording that has some channels.

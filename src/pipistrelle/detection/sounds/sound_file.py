@@ -34,6 +34,10 @@ class Sound:
         self.rate, self.channels = float(files[0].samplerate), files[0].channels
         self.samples = int(self._begin[-1])
         """Of each channel."""
+        kinds = [file.subtype for file in files if file.subtype.startswith("PCM_")]
+        widths = [int(kind.removeprefix("PCM_").strip("SU")) for kind in kinds]
+        self.quantum = max((2.0 ** (1 - bits) for bits in widths), default=0.0)
+        """Largest step of a sample, in units of 1; 0 of floats, and where steps differ."""
 
     def read(self, first: int, count: int) -> Float[np.ndarray, "t m"]:
         """Read samples of all channels, float32, from number `first` on."""
