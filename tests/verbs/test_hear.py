@@ -5,8 +5,9 @@ from pathlib import Path
 import pytest
 import soundfile
 
+import pipistrelle
 from pipistrelle.own_files import SOUND, OwnFiles
-from reference.sounds import FEW, foreign, record
+from reference.sounds import FEW, foreign, record, swept
 
 
 @pytest.fixture(scope="module")
@@ -96,6 +97,38 @@ def test_a_check_says_nothing_of_a_sound_recording_and_names_a_fault(obey, tmp_p
     assert printed.startswith("channel 4 is off zero by 0.2")
 
 
+def test_hear_names_a_log_before_it_asks_for_an_output(obey, tape):
+    assert obey("hear", tape, "-o", "log", "--quiet")[0] == 0
+    for words in (("log",), ("log", "--check"), ("log", "-o", "other")):
+        status, _, said = obey("hear", *words)
+        assert status == 2
+        assert "log: found a log" in said
+        assert "pipistrelle slam log" in said
+    assert "found no folder for the log" in obey("hear", tape)[2]
+
+
+def test_hear_says_the_band_of_a_sweep_whose_edges_pass_half_the_rate(obey, tmp_path):
+    folder, _ = swept(tmp_path / "tape", [5e-3, 5e-3])
+    about = (folder / "recording.toml").read_text()
+    about = about.replace("36000.0, 22000.0", "40000.0, 20000.0").replace("taper = 0.2\n", "")
+    about = about.replace("duration = 0.002", "duration = 0.0003")
+    (folder / "recording.toml").write_text(about)
+    status, _, said = obey("hear", folder, "-o", "log")
+    assert status == 2
+    assert "a sweep of 20000 to 40000 Hz, whose edges reach from" in said
+    assert "half the sample rate of 96000 Hz" in said
+
+
+def test_the_figure_ends_where_echoes_do_though_noise_makes_a_row_later(tmp_path):
+    folder, _ = swept(tmp_path / "tape", [5e-3] * 30, period=0.1, loud=0.2)
+    heard = pipistrelle.hear(folder, detection__false_alarm=1e-4)
+    latest = max(found.delay.max() for found in heard.overview.detections)
+    left, right = heard.figure().axes[0].get_xlim()
+    assert left == 0.0
+    assert latest > 0.03
+    assert 10.0 < right < 30.0
+
+
 def test_what_is_no_recording_is_refused(obey):
     Path("file").touch()
     Path("empty").mkdir()
@@ -106,5 +139,5 @@ def test_what_is_no_recording_is_refused(obey):
         assert (status, printed) == (2, "")
         assert words in said
     assert obey("hear", "empty", "--rays.power", "3", "-o", "log")[0] == 2
-    assert "found no folder for the log" in obey("hear", "empty")[2]
+    assert "recording.toml" in obey("hear", "empty")[2]
     assert not Path("log").exists()

@@ -11,6 +11,8 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
+NEARLY_ALL, SILENCE = 0.98, 1.1
+"""Share of the echoes' levels that the axis shows, and how much longer it is."""
 _QUIETEST, _LOUDEST = 0.0, 50.0
 """Levels [dB] between which the output is shaded."""
 
@@ -41,9 +43,20 @@ def draw_hearing(overview: Overview) -> "Figure":
 
 
 def _end(overview: Overview) -> float:
-    """Return the delay up to which nearly all was heard, and some silence more [ms]."""
-    delays = np.concatenate([np.empty(0), *(found.delay for found in overview.detections)])
-    return 1.25e3 * float(np.quantile(delays, 0.995)) if delays.size else 0.0
+    """Return the delay up to which nearly all was heard [ms], each echo by its level.
+
+    What noise makes is faint and comes at any delay: few such rows do not stretch the axis.
+    """
+    delay = np.concatenate([np.empty(0), *(found.delay for found in overview.detections)])
+    if not delay.size:
+        return 0.0
+    power = np.concatenate([found.power for found in overview.detections])
+    order, level = np.argsort(delay), np.log(np.maximum(power, 1.0))
+    heard = np.cumsum(level[order])
+    last = delay[order][np.searchsorted(heard, NEARLY_ALL * heard[-1])]
+    return 1e3 * float(
+        min(SILENCE * last, max(found[-1] for found in overview.delay if found.size))
+    )
 
 
 def _output(axes: "Axes", overview: Overview, number: int) -> None:

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 from pipistrelle.config import Config, InputError
 from pipistrelle.detection.logs.heard_rows import RowsHeard
+from pipistrelle.detection.sounds.description import FILE as ABOUT
 from pipistrelle.detection.sounds.description import Description, read_description
 from pipistrelle.detection.sounds.hearing import Frame, hear_recording, log_callers
 from pipistrelle.detection.sounds.overview import Overview
@@ -186,7 +187,7 @@ def heard_of(
     text: Callable[[], str | None] = lambda: None,
 ) -> Heard:
     """Hear a recording; `write` is given the rows as text, and `text` returns them all."""
-    about = _described(folder)
+    about = described(folder)
     overview = Overview(names=("vehicle", *(one.name for one in about.callers)))
     log = RowsHeard(folder, about.log, log_callers(about))
     read_truth(folder, log.time)  # refuses odd truth, which is kept beside the log
@@ -207,12 +208,15 @@ def faults_of(folder: Path, config: Config) -> list[str]:
     """Return what is odd about a recording, a line each."""
     from pipistrelle.detection.sounds.check import check_recording
 
-    return check_recording(folder, _described(folder), config)
+    return check_recording(folder, described(folder), config)
 
 
-def _described(folder: Path) -> Description:
+def described(folder: Path) -> Description:
     """Return what a recording says of itself; refuse what is no folder."""
     if not folder.is_dir():
         found = "a file" if folder.exists() else "no such folder"
         raise refusal(folder, found, "a sound recording's", "check the path")
+    if lexists(folder / "log.toml") and not lexists(folder / ABOUT):
+        found, fix = "a log, which was heard already", f"solve it by 'pipistrelle slam {folder}'"
+        raise refusal(folder, found, f"a sound recording's {ABOUT}", fix)
     return read_description(folder)

@@ -7,7 +7,7 @@ from cyclopts import Parameter
 
 from pipistrelle.config import InputError
 from pipistrelle.own_files import LOG, claim
-from pipistrelle.scripting.hearing import faults_of, heard_into, heard_settings, is_heard
+from pipistrelle.scripting.hearing import described, faults_of, heard_into, heard_settings, is_heard
 from pipistrelle.settings import from_flags
 from pipistrelle.verbs.console import progress
 from pipistrelle.verbs.options import setting_flags
@@ -62,6 +62,7 @@ def hear(
         if faults:
             warn(f"{recording}: odd in {len(faults)} ways")
         return 1 if faults else 0
+    described(recording)
     if output is None:
         raise InputError("hear: found no folder for the log; name one with -o LOG")
     own = claim(output, LOG, overwrite=overwrite, flags=("-o LOG", "--overwrite"))

@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Bool, Complex, Float
 
-from pipistrelle.acoustics.call import Call, ToneBurst
+from pipistrelle.acoustics.call import Call, Sweep, ToneBurst
 from pipistrelle.arrays.bands import extent_of
 from pipistrelle.config import Config
 from pipistrelle.detection.echoes import unlabelled_scan, with_edge_floor
@@ -152,9 +152,14 @@ def sums_of(
     for call in calls:
         low, high = extent_of(call, sound.rate)
         if not 0.0 < low <= high < sound.rate / 2.0:
-            found = f"a call of {low:.0f} to {high:.0f} Hz"
-            expected = f"one below half the sample rate of {sound.rate:g} Hz"
-            raise refusal(where, found, expected, "correct the one that is wrong")
+            found = f"a call of {low:.0f} to {high:.0f} Hz, the edges of its spectrum included"
+            if isinstance(call, Sweep):
+                begin, end = sorted((call.start, call.end))
+                found = f"a sweep of {begin:g} to {end:g} Hz, whose edges reach from {low:.0f} to"
+                found += f" {high:.0f} Hz, as those of a short one with an abrupt beginning do"
+            expected = f"all below half the sample rate of {sound.rate:g} Hz"
+            fix = "correct the one that is wrong, or fade the call's ends in and out ('taper')"
+            raise refusal(where, found, expected, fix)
     blank = about.call.deaf or about.call.duration
     return CallOutputs(
         calls, sound.rate, math.ceil(blank * sound.rate - 1e-6), array.channel
