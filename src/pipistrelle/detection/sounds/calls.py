@@ -164,12 +164,14 @@ def _leaks(sound: Sound, sent: Call, apart: int) -> Float[np.ndarray, " k"]:
         some_channels = samples[:, :: math.ceil(sound.channels / _LISTEN)]
         outputs = filters((some_channels - some_channels.mean(axis=0))[:, np.newaxis])
         level = np.sqrt((outputs.real**2 + outputs.imag**2).sum(axis=(1, 2, 3)))
-        for begin in range(0, len(level), some):
+        found = np.empty((-(-len(level) // some), 2))
+        for i, begin in enumerate(range(0, len(level), some)):
             k = begin + int(level[begin : begin + some].argmax())
-            loudest.append((first + step * (k + _aside(level[max(k - 1, 0) : k + 2])), level[k]))
-    if not loudest:
+            found[i] = first + step * (k + _aside(level[max(k - 1, 0) : k + 2])), level[k]
+        loudest.append(found)
+    if not sum(map(len, loudest)):
         return np.empty(0)
-    sample, level = np.array(loudest).T
+    sample, level = np.concatenate(loudest).T
     loud = (level >= _least(sound, sample, level)) & (level > 0.0)
     kept = _loudest_around(sample[loud], level[loud], apart)
     return np.rint(np.maximum(sample[loud][kept], 0.0))
