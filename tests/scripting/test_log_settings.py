@@ -1,5 +1,6 @@
 """What looks odd in a recorded log is asked about, and what does not is not."""
 
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -7,18 +8,25 @@ import numpy as np
 import pytest
 
 from pipistrelle.config import Config
-from pipistrelle.scripting.log_settings import fit_warnings
+from pipistrelle.experiments.drives import NO_TRUTH
+from pipistrelle.scripting.log_settings import fit_warnings, log_warnings
 from reference.missions import scan_with
+from reference.spoilt_logs import noisy_log
+
+LOG = noisy_log(steps=5)
 
 
 def log_of(**columns):
     """A log of one scan of ten rows, from half a metre to 20 m."""
-    scan = scan_with(np.arange(10), np.zeros(10), **columns)
-    return SimpleNamespace(scans=[scan], turned=0, range_bounds=(0.5, 20.0), motion="unicycle")
+    return replace(LOG, scans=(scan_with(np.arange(10), np.zeros(10), **columns),))
 
 
-def trial_of(scan, gated, **more):
-    track = SimpleNamespace(pose=SimpleNamespace(mean=np.zeros((2, 3))))
+def trial_of(scan, gated, labels=(), **more):
+    track = SimpleNamespace(
+        pose=SimpleNamespace(mean=np.zeros((2, 3))),
+        labels=labels,
+        landmarks=SimpleNamespace(landmark=np.array([1])),
+    )
     scores = SimpleNamespace(gated=gated, nis_mean=None)
     return SimpleNamespace(
         scans=[scan], scores=scores, filter="ekf", strategy="active", track=track,
@@ -34,6 +42,34 @@ def test_units_are_asked_about_by_the_share_of_what_a_strategy_heard(gated, aske
     )
     assert any(f"{gated} of 5 measurements do not fit" in line for line in lines) == asked
     assert len(lines) == 1, "else it is said that the gate rejects more than its share"
+
+
+@pytest.mark.parametrize(("mapped", "asked"), [(5, False), (4, True)])
+def test_units_are_asked_about_where_few_rows_of_an_association_are_on_the_map(mapped, asked):
+    labels = (np.where(np.arange(10) < mapped, 1, -1),)
+    log = log_of(distance=np.ones(10))
+    lines = fit_warnings(log, [trial_of(log.scans[0], 0, labels)], Path("log"), Config())
+    assert [line.split(" (")[0] for line in lines] == [
+        "log: 4 of 10 rows are of landmarks of the map at the end"
+    ] * asked
+
+
+def test_few_rows_on_the_map_are_no_question_where_the_columns_of_a_log_are_right():
+    log = noisy_log(labels=False)
+    trial = trial_of(log.scans[0], 0, tuple(np.full(scan.landmark.size, -1) for scan in log.scans))
+    assert fit_warnings(log, [trial], Path("log"), Config()) == []
+    spoilt = noisy_log(labels=False, spoil="clockwise:")
+    (line,) = fit_warnings(spoilt, [trial], Path("log"), Config())
+    assert "0 of " in line
+    assert "bearings seem to be clockwise: negated" in line
+
+
+@pytest.mark.parametrize("name", ["initial_pose", "sensor_pose"])
+@pytest.mark.parametrize(("heading", "asked"), [(45.0, True), (-7.0, True), (6.2, False)])
+def test_a_heading_beyond_a_turn_is_asked_about(name, heading, asked):
+    lines = log_warnings(replace(LOG, **{name: (1.0, 2.0, heading)}), NO_TRUTH, Path("log"))
+    words = f"log: the heading of {name}, {heading:g} rad, is beyond a turn; is it in degrees?"
+    assert [line.startswith(words) for line in lines] == [True] * asked
 
 
 @pytest.mark.parametrize(("short", "asked"), [(8, False), (9, True)])

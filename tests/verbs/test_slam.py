@@ -301,7 +301,7 @@ def test_measurements_that_do_not_fit_are_asked_about(obey, log, undrawn):
     gated = summary("two")["runs"][0]["gated"]
     assert re.fullmatch(
         rf"pipistrelle: warning: log: {gated} of \d+ measurements do not fit what was expected "
-        r"\(fused ekf\); are bearings in radians and ranges in metres, "
+        r"\(fused ekf\); are bearings in radians and counter-clockwise, ranges in metres, "
         r"and all labels right\?\n",
         said,
     )

@@ -1,7 +1,7 @@
 """Settings that a recorded log decides, settings that it leaves open, and warnings on it."""
 
 from collections.abc import Sequence
-from math import ceil, floor, hypot, inf, log10, sqrt
+from math import ceil, floor, hypot, inf, log10, pi, radians, sqrt
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -34,6 +34,8 @@ MAX_GATED_SHARE = 0.01
 """Share of rows that the gate rejects, beyond what it should, above which a warning is given."""
 MAX_NIS = 2.0
 """NIS above which a warning is given; below 1 a filter is cautious, as with the paper's noise."""
+TURN = 2.0 * pi
+"""No bearing or heading need be larger [rad]."""
 MIN_EXCESS_PATH = 0.2
 """Excess paths in metres are rarely smaller [m]; in seconds most are."""
 UNSURE = {"bearing_std": ("bearings", "rad", WIDEST), "way_std": ("ranges", "m", inf)}
@@ -161,7 +163,7 @@ def log_warnings(recorded: "Log", truth: "Truth", log: Path) -> list[str]:
         f"{log}: {name} is read as {FORMER_NAMES[name]}, as it is called now"
         for name in dict.fromkeys(recorded.former_names)
     ]
-    notes += [*_jumps(recorded, log), *_unheard(recorded, log)]
+    notes += [*_turned_poses(recorded, log), *_jumps(recorded, log), *_unheard(recorded, log)]
     if truth.path is not None:
         steps = len(truth.time) - 1
         known_steps = sum(1 for pose in truth.path[1:] if pose[0] == pose[0])
@@ -170,6 +172,17 @@ def log_warnings(recorded: "Log", truth: "Truth", log: Path) -> list[str]:
                 f"{log}: the truth covers {known_steps} of {steps} steps; only these are scored"
             )
     return notes
+
+
+def _turned_poses(recorded: "Log", log: Path) -> list[str]:
+    """Ask whether the heading of a pose in ``log.toml`` that is beyond a turn is in degrees."""
+    headings = {name: getattr(recorded, name)[2] for name in ("initial_pose", "sensor_pose")}
+    return [
+        f"{log}: the heading of {name}, {heading:g} rad, is beyond a turn; is it in degrees? "
+        f"{heading:g} degrees are {radians(heading):.4g} rad"
+        for name, heading in headings.items()
+        if abs(heading) > TURN
+    ]
 
 
 def _jumps(recorded: "Log", log: Path) -> list[str]:
@@ -212,37 +225,90 @@ def _unheard(recorded: "Log", log: Path) -> list[str]:
 def fit_warnings(
     recorded: "Log", trials: "Sequence[TrialResult]", log: Path, config: Config
 ) -> list[str]:
-    """Warn where much of a log does not fit, as with wrong units or labels."""
-    from pipistrelle.experiments.results.scores import is_placed
+    """Warn where much of a log does not fit; name the mistake in its columns that explains it.
 
-    rows, turned, notes = sum(len(scan.landmark) for scan in recorded.scans), recorded.turned, []
+    Without such a mistake the warnings ask about units and labels.
+    """
+    beyond, odd_ranges = _beyond_a_turn(recorded), _out_of_bounds(recorded, "ranges")
+    questions, unmapped = beyond + odd_ranges, []
+    notes = [
+        f"{log}: {_nothing_used(trial)}, so it maps nothing"
+        for trial in trials
+        if not any(len(scan.landmark) for scan in trial.scans)
+    ]
+    for trial in trials if not beyond else ():
+        questions += _rejected(trial, recorded, config)
+        unmapped += _unmapped(trial, recorded)
+    if questions or unmapped:
+        from pipistrelle.scripting.misreadings import misreading
+
+        mistake, fits = misreading(recorded)
+        questions += [] if fits else unmapped
+        if mistake:
+            questions = [(questions[0][0], mistake)]
+    questions += _out_of_bounds(recorded, "excess paths")
+    notes += [f"{log}: {found}; {question}" for found, question in questions]
+    return notes + _unsure(trials, log, config)
+
+
+Question = tuple[str, str]
+"""What was found, and what is asked or advised."""
+
+
+def _units(recorded: "Log") -> str:
+    """Ask whether a log's numbers have the units and the sense that they ought to have."""
     metric = "ranges and excess paths" if has_excess_paths(recorded) else "ranges"
     angles = "bearings and headings" if recorded.motion == "poses" else "bearings"
-    for trial in trials:
-        heard, name = sum(len(scan.landmark) for scan in trial.scans), short_name(trial.filter)
-        if not heard:
-            notes.append(f"{log}: {_nothing_used(trial)}, so it maps nothing")
-        elif turned <= MAX_IGNORED_SHARE * rows and is_placed(trial):
-            gated, who = trial.scores.gated, f"{trial.strategy} {name}"
-            if MAX_IGNORED_SHARE * heard < gated:
-                notes.append(
-                    f"{log}: {gated} of {heard} measurements do not fit what was expected ({who}); "
-                    f"are {angles} in radians and {metric} in metres, and all labels right?"
-                )
-            elif (
-                MAX_GATED_SHARE + (expected := 1.0 - _gate(trial.filter, config))
-            ) * heard < gated:
-                notes.append(
-                    f"{log}: the gate rejects {gated / heard:.1%} of the measurements ({who}), "
-                    f"expected {expected:.1%}: they are less sure than they say, or something was "
-                    "placed wrong before; larger standard deviations help, or a gate of 1 with "
-                    'filter.robust = "huber"'
-                )
-            elif surprised := nis_warning(trial):
-                notes.append(f"{log}: {surprised}")
-    if turned > MAX_IGNORED_SHARE * rows:
-        notes.append(f"{log}: {turned} of {rows} bearings are beyond a turn; are they in radians?")
-    return notes + _out_of_bounds(recorded, log) + _unsure(trials, log, config)
+    labels = ", and all labels right" if _labels(recorded) != {UNLABELLED} else ""
+    return f"are {angles} in radians and counter-clockwise, {metric} in metres{labels}?"
+
+
+def _rejected(trial: "TrialResult", recorded: "Log", config: Config) -> list[Question]:
+    """Question measurements that a trial's gate rejects, or else that surprise its estimator."""
+    from pipistrelle.experiments.results.scores import is_placed
+
+    heard = sum(len(scan.landmark) for scan in trial.scans)
+    if not heard or not is_placed(trial):
+        return []
+    gated, who = trial.scores.gated, f"{trial.strategy} {short_name(trial.filter)}"
+    if MAX_IGNORED_SHARE * heard < gated:
+        found = f"{gated} of {heard} measurements do not fit what was expected ({who})"
+        return [(found, _units(recorded))]
+    expected = 1.0 - _gate(trial.filter, config)
+    if (MAX_GATED_SHARE + expected) * heard < gated:
+        found = (
+            f"the gate rejects {gated / heard:.1%} of the measurements ({who}), expected "
+            f"{expected:.1%}: they are less sure than they say, or something was placed wrong "
+            "before"
+        )
+        return [
+            (found, 'larger standard deviations help, or a gate of 1 with filter.robust = "huber"')
+        ]
+    found, _, advice = nis_warning(trial).partition("; ")
+    return [(found, advice)] if found else []
+
+
+def _unmapped(trial: "TrialResult", recorded: "Log") -> list[Question]:
+    """Question a map to which an association gave fewer than half of the rows."""
+    import numpy as np
+
+    if not trial.track.labels:
+        return []
+    labels = np.concatenate(trial.track.labels)
+    mapped = np.count_nonzero(np.isin(labels, trial.track.landmarks.landmark))
+    if 2 * mapped >= labels.size:
+        return []
+    found = f"{mapped} of {labels.size} rows are of landmarks of the map at the end"
+    return [(f"{found} ({trial.strategy} {short_name(trial.filter)})", _units(recorded))]
+
+
+def _beyond_a_turn(recorded: "Log") -> list[Question]:
+    """Question bearings that are beyond a turn."""
+    bearings = recorded.recorded_bearings()
+    turned = int((abs(bearings) > TURN).sum())
+    if not turned > MAX_IGNORED_SHARE * bearings.size:
+        return []
+    return [(f"{turned} of {bearings.size} bearings are beyond a turn", "are they in radians?")]
 
 
 def _nothing_used(trial: "TrialResult") -> str:
@@ -294,8 +360,8 @@ def nis_warning(trial: "TrialResult") -> str:
     )
 
 
-def _out_of_bounds(recorded: "Log", log: Path) -> list[str]:
-    """Warn of ranges and excess paths that are probably not in metres.
+def _out_of_bounds(recorded: "Log", name: str) -> list[Question]:
+    """Question ranges or excess paths that are probably not in metres.
 
     An excess path is no more than twice the range of its landmark.
     """
@@ -303,26 +369,18 @@ def _out_of_bounds(recorded: "Log", log: Path) -> list[str]:
 
     near, far = recorded.range_bounds
     bounds = f"range_bounds ({near:g} to {far:g} m)"
-    ranges = np.concatenate([scan.range for scan in recorded.scans])
-    excess_paths = np.concatenate([scan.excess_path for scan in recorded.scans])
-    ranges, excess_paths = ranges[~np.isnan(ranges)], excess_paths[~np.isnan(excess_paths)]
-    odd = (
-        ("ranges", (ranges < near) | (ranges > far), MAX_IGNORED_SHARE, f"not within {bounds}"),
-        (
-            "excess paths",
-            excess_paths > 2.0 * far,
-            MAX_IGNORED_SHARE,
-            f"more than twice the far end of {bounds}",
+    column = name.replace(" ", "_").removesuffix("s")
+    values = np.concatenate([getattr(scan, column) for scan in recorded.scans])
+    values = values[~np.isnan(values)]
+    odd = {
+        "ranges": (((values < near) | (values > far), MAX_IGNORED_SHARE, f"not within {bounds}"),),
+        "excess paths": (
+            (values > 2.0 * far, MAX_IGNORED_SHARE, f"more than twice the far end of {bounds}"),
+            (values < MIN_EXCESS_PATH, 1.0 - MAX_IGNORED_SHARE, f"below {MIN_EXCESS_PATH:g} m"),
         ),
-        (
-            "excess paths",
-            excess_paths < MIN_EXCESS_PATH,
-            1.0 - MAX_IGNORED_SHARE,
-            f"below {MIN_EXCESS_PATH:g} m",
-        ),
-    )
+    }[name]
     return [
-        f"{log}: {np.count_nonzero(rows)} of {rows.size} {what} are {where}; are {what} in metres?"
-        for what, rows, share, where in odd
+        (f"{np.count_nonzero(rows)} of {rows.size} {name} are {where}", f"are {name} in metres?")
+        for rows, share, where in odd
         if np.count_nonzero(rows) > share * rows.size
     ]

@@ -350,7 +350,12 @@ def test_rows_of_clutter_may_be_of_one_time(tmp_path):
 ROWS = {
     "unsquarable": ("0.1,7,1e155,1", "line 3", "bearing 1e+155", "between -1e+09 and 1e+09"),
     "far": ("0.1,7,0.5,1e10", "line 3", "range 10000000000.0", "up to 1e+06 m"),
-    "no clutter": ("0.1,-2,0.5,1", "line 3", "landmark -2.0", "from 0 on, or -1 for clutter"),
+    "no clutter": (
+        "0.1,-2,0.5,1",
+        "line 3",
+        "landmark -2.0",
+        "from 0 to 9007199254740991, or -1 for",
+    ),
     "missing field": ("0.1,7,0.5", "line 3", "3 fields", "4: time, landmark, bearing, range"),
     "extra field": ("0.1,7,0.5,1,2", "line 3", "5 fields", "4"),
     "text": ("0.1,7,left,1", "line 3", "bearing 'left'", "a finite number"),
@@ -362,7 +367,14 @@ ROWS = {
     "overflow": ("0.1,7,1e999,1", "line 3", "bearing '1e999'", "a finite number"),
     "no range": ("0.1,7,0.5,0", "line 3", "range 0.0", "above 0 m"),
     "negative range": ("0.1,7,0.5,-2", "line 3", "range -2.0", "above 0 m"),
+    "swapped": ("0.1,7,4.0,-2", "line 3", "range -2.0", "exchange bearing and range"),
     "label": ("0.1,7.5,0.5,1", "line 3", "landmark 7.5", "an integer"),
+    "large label": (
+        "0.1,9007199254740992,0.5,1",
+        "line 3",
+        "landmark 9007199254740992.0",
+        "to 9007",
+    ),
     "no label": ("0.1,,0.5,1", "line 3", "landmark ''", "clutter -1; or leave the field empty"),
     "name": ("0.1,tree,0.5,1", "line 3", "landmark 'tree'", "a finite number"),
     "backwards": ("0.05,7,0.5,1", "line 3", "time 0.05 after 0.06", "backwards"),
@@ -921,6 +933,7 @@ def drives(draw):
         controls=controls,
         dt=np.diff(time),
         scans=tuple(scans),
+        bearings=np.concatenate([scan.bearing for scan in scans]),
     )
 
 

@@ -119,3 +119,18 @@ def test_a_vehicle_faster_than_sound_is_refused_by_what_makes_it_so():
     with pytest.raises(InputError, match=r"^motion\.speed_std: the vehicle reaches"):
         checked_scenario(settings(motion=("speed_std", 300.0)))
     checked_scenario(settings(scenario=("speed", 30.0)))
+
+
+@pytest.mark.parametrize(
+    ("settings", "keys"),
+    [
+        ({"emitter": {"frequency": 40.0}}, ["emitter.frequency"]),
+        ({"beacon": {"band": (28.0, 18.0)}}, ["beacon.band", "beacon.band"]),
+        ({"callers": ({"frequency": 30.0},)}, ["callers.1.frequency"]),
+        ({"emitter": {"frequency": 1e3}}, []),
+    ],
+)
+def test_any_frequency_below_a_kilohertz_is_asked_about(settings, keys):
+    config = Config.model_validate(settings)
+    asked = [line for line in warnings_of(config) if "is it in kHz?" in line]
+    assert [line.split(":")[0] for line in asked] == keys

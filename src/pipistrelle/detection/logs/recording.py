@@ -119,14 +119,23 @@ class Log:
     """Share of a measurement's predicted distribution that is accepted; None: not said."""
     ignored_rows: dict[str, int]
     """Rows that were dropped, by reason."""
-    turned: int = 0
-    """Bearings beyond a whole turn, which are wrapped as any."""
+    bearings: Float[np.ndarray, " n"] | None = None
+    """Bearings of all scans' rows before they were wrapped; None: as they are in the scans."""
     former_names: tuple[str, ...] = ()
     """Columns and keys that the log calls by former names (`text_tables.FORMER_NAMES`)."""
     notes: tuple[str, ...] = ()
     """What its reader chose or converted, for the user, a line each."""
     doubts: tuple[str, ...] = ()
     """What its reader took and finds odd: warnings for the user, a line each."""
+
+    def recorded_bearings(self) -> Float[np.ndarray, " n"]:
+        """Return the bearings of all rows in the order of the scans, as they were recorded.
+
+        Where the rows of scans are others than those that were read, their bearings are returned.
+        """
+        wrapped = np.concatenate([np.empty(0), *(scan.bearing for scan in self.scans)])
+        read = wrapped if self.bearings is None else self.bearings
+        return read if np.array_equal(wrap(read), wrap(wrapped), equal_nan=True) else wrapped
 
 
 def assemble(
@@ -197,7 +206,7 @@ def assemble(
         expected = f"some of landmarks, between {time[0].item()!r} s and {time[-1].item()!r} s"
         raise refusal(measurements.path, found, expected, "use the odometry's clock")
     said = (*MEASUREMENT, CALLER, *(name for name in STATED if name in measurements.column))
-    measured = {name: measurements.column[name][inside] for name in said}
+    measured = _in_order({name: measurements.column[name][inside] for name in said})
     doubts = (*settings.pop("doubts", ()), *_silence(rows, step))
     return Log(
         time=time,
@@ -208,7 +217,7 @@ def assemble(
         ),
         ignored_rows={reason: count for reason, count in ignored.items() if count},
         doubts=doubts,
-        turned=int(np.sum(np.abs(measured["bearing"]) > 2.0 * np.pi)),
+        bearings=measured["bearing"],
         **settings,
     )
 
@@ -248,7 +257,7 @@ def scan_at(time: float, rows: Table, callers: tuple[LogCaller, ...]) -> Scan:
     labelled = rows_kept(rows, rows.column["landmark"] != UNLABELLED)
     check_unique(labelled, "landmark", besides=CALLER)
     measured = rows.column | {"time": np.full(len(rows.line), time)}
-    (scan,) = _scans(np.array([time]), measured, 0.0, callers)
+    (scan,) = _scans(np.array([time]), _in_order(measured), 0.0, callers)
     return scan
 
 
@@ -377,19 +386,19 @@ def _of_callers(measurements: Table, callers: tuple[LogCaller, ...]) -> Table:
     return replace(measurements, column=column | {CALLER: number})
 
 
+def _in_order(measured: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+    """Return measurements in the order of time; rows without a bearing are the last of theirs."""
+    order = np.lexsort((np.isnan(measured["bearing"]), measured["time"]))
+    return {name: column[order] for name, column in measured.items()}
+
+
 def _scans(
     time: np.ndarray,
     measured: dict[str, np.ndarray],
     resolution: float,
     callers: tuple[LogCaller, ...],
 ) -> tuple[Scan, ...]:
-    """Return one scan for each time of measurement, at the end of the step that holds it.
-
-    Rows without a bearing go to its end.
-    """
-    stamp = measured["time"]
-    order = np.lexsort((np.isnan(measured["bearing"]), stamp))
-    measured = {name: column[order] for name, column in measured.items()}
+    """Return a scan for each time of ordered measurements, at the end of the step that holds it."""
     labels = (
         np.array([UNLABELLED, *(caller.landmark for caller in callers)]) if callers else NO_CALLERS
     )

@@ -266,7 +266,7 @@ def check_columns(table: Table) -> None:
             if np.isnan(values).all():  # nobody has labelled anything
                 values[:] = UNLABELLED
             wrong = (values != np.rint(values)) | (values < UNLABELLED) | (values >= 2**53)
-            promise = f"an integer, from 0 on, or {UNLABELLED} for clutter"
+            promise = f"an integer from 0 to {2**53 - 1}, or {UNLABELLED} for clutter"
         else:
             wrong = np.abs(values) > LARGEST
             promise = f"a number between -{LARGEST:g} and {LARGEST:g}"
@@ -279,6 +279,8 @@ def check_columns(table: Table) -> None:
             fix = _LABEL_IT if np.isnan(values[row]) else "correct or remove the row"
             if name == "time" and table.unit == "message":
                 fix = "its clock was set back; --bag.stamps received takes the times of reception"
+            if name == "range" and not (table.column.get("bearing", values) < 0.0).any():
+                fix = "exchange bearing and range, if these are swapped; else correct the row"
             raise refusal(where, found, promise, fix)
         if name in _LABELS:
             table.column[name] = values.astype(np.int64)

@@ -12,7 +12,7 @@ from pipistrelle.acoustics.callers import VEHICLE, Caller, callers_of, moves
 from pipistrelle.arrays.layout import Scattered, layout_of
 from pipistrelle.arrays.pattern import pattern_of
 from pipistrelle.arrays.sampling import off_raster, sampling
-from pipistrelle.config import SQUARE, Config, InputError
+from pipistrelle.config import SQUARE, Config, InputError, Section
 from pipistrelle.detection.front_end import front_end
 from pipistrelle.experiments.hearing.scenario import Scenario, world_of
 from pipistrelle.experiments.hearing.world import ALL_DRAWN, World
@@ -23,6 +23,8 @@ MANY_DOUBLES = 0.1
 """Share of the bearings with a double from which on a warning is given."""
 CLOSEST = 0.25
 """Spacing of hydrophones below which they warn, in waves."""
+KILOHERTZ = 1e3
+"""Sonars call at 1 kHz to 1 MHz, so a smaller number of hertz is probably of kilohertz [Hz]."""
 
 
 @judging()
@@ -103,7 +105,30 @@ def warnings_of(config: Config, callers: Sequence[Caller] = ()) -> tuple[str, ..
                 f"receiver.sample_rate: {rate:g} Hz is less than twice {tone}: real samples would "
                 f"hold it as {abs(frequency - rate * round(frequency / rate)):g} Hz; expected more"
             )
-    return (*warnings, *_of_the_other_medium(config))
+    return (*_kilohertz(config), *warnings, *_of_the_other_medium(config))
+
+
+def _kilohertz(section: Section, place: str = "") -> list[str]:
+    """Ask whether frequencies below 1 kHz are in kilohertz, of all settings in hertz.
+
+    >>> from pipistrelle.config import EmitterConfig
+    >>> _kilohertz(Config(emitter=EmitterConfig(frequency=40.0)))
+    ['emitter.frequency: 40 Hz is below 1 kHz; is it in kHz? 40 kHz are 40000 Hz']
+    """
+    warnings = []
+    for name, field in type(section).model_fields.items():
+        key, value = f"{place}{name}", getattr(section, name)
+        values = value if isinstance(value, tuple) else (value,)
+        for number, one in enumerate(values, start=1):
+            if isinstance(one, Section):
+                inner = f"{key}.{number}." if isinstance(value, tuple) else f"{key}."
+                warnings += _kilohertz(one, inner)
+            elif "[Hz]" in (field.description or "") and one is not None and one < KILOHERTZ:
+                warnings.append(
+                    f"{key}: {one:g} Hz is below 1 kHz; is it in kHz? {one:g} kHz are "
+                    f"{KILOHERTZ * one:g} Hz"
+                )
+    return warnings
 
 
 def _of_the_other_medium(config: Config) -> list[str]:
