@@ -1,12 +1,15 @@
 import math
 import tomllib
+from functools import reduce
+from operator import getitem
 from pathlib import Path
 
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from pydantic import ValidationError
 
-from pipistrelle.config import AirConfig, Config, InputError, RayConfig, ScenarioConfig
+from pipistrelle.config import AirConfig, Config, InputError, RayConfig, ScenarioConfig, Section
 from pipistrelle.experiments.studies.plan import cases_of
 from pipistrelle.experiments.studies.plan_file import plan_text, read_plan
 from pipistrelle.settings import (
@@ -340,3 +343,29 @@ def test_the_speed_of_sound_that_was_not_given_follows_a_grid_of_temperatures(tm
     for each in (plan, read_plan(tmp_path / "plan.toml")):
         speeds = [case.config.air.sound_speed for case in cases_of(each)]
         assert speeds == [pytest.approx(334.1, abs=0.05), 343.0]
+
+
+def numbers_of(section, path=()):
+    """Every setting that may be a float, by the names that lead to it."""
+    for name, field in type(section).model_fields.items():
+        value = getattr(section, name)
+        if isinstance(value, Section):
+            yield from numbers_of(value, (*path, name))
+        elif "float" in str(field.annotation):
+            yield (*path, name)
+
+
+@pytest.mark.parametrize("path", numbers_of(Config()), ids=".".join)
+@pytest.mark.parametrize("whole", [1, [1, 2], [2, 1], [1, 2, 3]], ids=str)
+@pytest.mark.filterwarnings("error")
+def test_a_whole_number_for_a_setting_that_is_a_float_becomes_the_float(path, whole):
+    table = whole
+    for name in reversed(path):
+        table = {name: table}
+    try:
+        config = Config.model_validate(table)
+    except ValidationError:
+        pytest.skip("no value of this setting")
+    value = reduce(getattr, path, config)
+    assert {type(one) for one in (value if isinstance(whole, list) else [value])} == {float}
+    assert reduce(getitem, path, config.model_dump(mode="json")) == whole

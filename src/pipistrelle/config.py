@@ -60,9 +60,11 @@ Probability = Annotated[float, Field(gt=0, le=1)]
 
 
 def _gate(value: Any) -> Any:
-    """Refuse what is neither a share nor "auto"."""
-    if value == "auto" or (type(value) in (int, float) and 0.0 < value <= 1.0):
+    """Refuse what is neither a share nor "auto"; a whole number is a share, too."""
+    if value == "auto":
         return value
+    if isinstance(value, (int, float)) and value is not True and 0.0 < value <= 1.0:
+        return float(value)
     raise ValueError('above 0 and up to 1, or "auto"')
 
 

@@ -113,3 +113,14 @@ def test_rows_that_a_limit_leaves_out_are_told_with_what_takes_them(left_out, pa
         assert part in line
     ((_, stds),) = left_out.items()
     assert ("takes" in line) == (min(stds) < 0.45)
+
+
+def test_the_share_of_measurements_that_do_not_fit_is_of_bearings_and_excess_paths():
+    rows = {"excess_path": np.full(5, 2.0), "excess_path_std": 0.1, "caller": 1}
+    heard = scan_with(np.arange(5), np.zeros(5), **rows)
+    said = [
+        fit_warnings(log_of(distance=np.ones(10)), [trial_of(heard, gated)], Path("log"), Config())
+        for gated in (2, 8)
+    ]
+    assert "the gate rejects 20.0% of the measurements" in said[0][0]
+    assert "8 of 10 measurements do not fit" in said[1][0]

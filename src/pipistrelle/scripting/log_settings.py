@@ -265,9 +265,9 @@ def _units(recorded: "Log") -> str:
 
 def _rejected(trial: "TrialResult", recorded: "Log", config: Config) -> list[Question]:
     """Question measurements that a trial's gate rejects, or else that surprise its estimator."""
-    from pipistrelle.experiments.results.scores import is_placed
+    from pipistrelle.experiments.results.scores import is_placed, judged
 
-    heard = sum(len(scan.landmark) for scan in trial.scans)
+    heard = judged(trial.scans)
     if not heard or not is_placed(trial):
         return []
     gated, who = trial.scores.gated, f"{trial.strategy} {short_name(trial.filter)}"

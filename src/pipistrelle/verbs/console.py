@@ -162,9 +162,11 @@ def _without_truth(trial: "TrialResult", driven: float | None) -> Iterator[tuple
     """Return cells of what an estimate states of itself, if there is no truth to score it."""
     from math import sqrt
 
-    pose, rows = trial.track.pose, sum(len(scan.landmark) for scan in trial.scans)
+    from pipistrelle.experiments.results.scores import judged
+
+    pose, measurements = trial.track.pose, judged(trial.scans)
     scored = trial.scores.position_rmse_m is not None
-    share = None if scored or not rows else 100.0 * trial.scores.gated / rows
+    share = None if scored or not measurements else 100.0 * trial.scores.gated / measurements
     spread = float(pose.covariance[-1, 0, 0] + pose.covariance[-1, 1, 1])
     yield NIS_TITLE, _number(None if scored else trial.scores.nis_mean, 2)
     yield "rejected by the gate [%]", _number(share, 2)

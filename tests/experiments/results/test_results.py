@@ -47,6 +47,7 @@ KEYS = [
     "measurements_per_frame",
     "gated",
     "nis_mean",
+    "gated_of",
     "ignored_rows",
     "wall_s",
 ]

@@ -319,15 +319,15 @@ class FastSlam:
         return _resampled(after, stratified(weight, uniform), restart)
 
     def _inside(self, belief: FastSlamBelief, scan: Scan, params: UpdateParams) -> tuple[Scan, int]:
-        """Drop the measurements and excess paths that no particle expected; return how many."""
+        """Drop rows and excess paths that no particle expected; return how many of each, summed."""
         if self.gate >= 1.0:
             return scan, 0
-        dropped, late, gated = gated_by_all(
+        dropped, late, _ = gated_by_all(
             *_arrays(belief), columns_of(scan), _timings(belief, scan), params
         )
         if late.any():
             scan = with_columns(scan, excess_path=np.where(late, np.nan, scan.excess_path))
-        return rows_of(scan, ~dropped), gated
+        return rows_of(scan, ~dropped), int(np.count_nonzero(dropped) + np.count_nonzero(late))
 
 
 def _arrays(belief: FastSlamBelief) -> tuple[Arrays, Parents]:

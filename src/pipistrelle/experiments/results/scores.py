@@ -79,7 +79,7 @@ class Scores:
     measurements_per_frame : float or None
         Mean over the scans.
     gated : int
-        Measurements that the gate rejected.
+        Measurements that the gate rejected, of `judged`.
     associated_right : float or None
         Share of the rows that an association gave a label which are of the landmark that the label
         stands for (`evaluation.association`); None of known labels, as are those that follow.
@@ -148,6 +148,20 @@ class TrialResult:
 def is_placed(trial: TrialResult) -> bool:
     """Return whether the path of a trial is finite everywhere."""
     return bool(np.isfinite(trial.track.pose.mean).all())
+
+
+def judged(scans: Sequence[Scan]) -> int:
+    """Return how many measurements a gate judges: a bearing with its range, or an excess path.
+
+    A row holds one of them, or both, and `Scores.gated` counts each.
+
+    >>> from pipistrelle.detection.scans import make_scan
+    >>> ahead = make_scan(0.0, np.array([3, 8]), np.zeros(2), excess_path=np.array([2.0, np.nan]))
+    >>> judged([ahead])
+    3
+    """
+    numbers = ([scan.bearing, scan.excess_path] for scan in scans)
+    return sum(int(np.count_nonzero(~np.isnan(both))) for both in numbers)
 
 
 @np.errstate(over="ignore", invalid="ignore")

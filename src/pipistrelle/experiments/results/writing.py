@@ -19,7 +19,7 @@ from pydantic import BaseModel
 from pipistrelle.estimation.beliefs import Track
 from pipistrelle.estimation.catalogue import short_name
 from pipistrelle.experiments.drives import Truth
-from pipistrelle.experiments.results.scores import OF_ASSOCIATION, Scores, TrialResult
+from pipistrelle.experiments.results.scores import OF_ASSOCIATION, Scores, TrialResult, judged
 from pipistrelle.experiments.results.tables import (
     landmark_table,
     map_text,
@@ -63,8 +63,9 @@ another's call the excess path, where it is known |
 RMSE and NEES leave out the start; after an exact one the NEES begins where the covariance is
 positive definite. "aligned": path and map, each after the rigid motion without
 scale that fits it best to the truth. Map errors are those of the fully initialised landmarks
-whose true positions are known. measurements_per_frame counts before the gate, gated what the
-gate rejected, ignored_rows what was dropped from a recorded log.
+whose true positions are known. measurements_per_frame counts the bearings before the gate, gated
+the measurements that the gate rejected, gated_of those that it judged: bearings with their ranges,
+and excess paths. ignored_rows are what was dropped from a recorded log.
 
     evo_ape tum truth.tum track_S_F.tum --align
 """
@@ -213,6 +214,7 @@ def run_entry(trial: TrialResult, ignored_rows: Mapping[str, int]) -> dict[str, 
         "strategy": trial.strategy,
         "filter": trial.filter,
         **_finite(_told(trial.scores)),
+        "gated_of": judged(trial.scans),
         **({"calibration": calibrated} if (calibrated := calibration_of(trial.track)) else {}),
         "ignored_rows": {
             **ignored_rows,
