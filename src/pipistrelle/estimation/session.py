@@ -15,7 +15,7 @@ from jaxtyping import Float, Int
 from pipistrelle.config import InputError
 from pipistrelle.detection.merging import labelled
 from pipistrelle.detection.noise import ConstantNoise
-from pipistrelle.detection.scans import UNLABELLED, Scan
+from pipistrelle.detection.scans import NO_CALLERS, UNLABELLED, Scan
 from pipistrelle.estimation.association import (
     Assignment,
     Association,
@@ -90,6 +90,9 @@ class Session(Generic[B]):
         Of what the estimator draws.
     known : Landmarks, optional
         What is on the map beforehand, for an estimator that accepts it (`AcceptsMap`).
+    callers : (c), optional
+        The label of each caller as a landmark, by its number: those on the map beforehand are known
+        to an association that has ``knowing``, too.
     association : Association, optional
         Labels the rows of scans; without one they bear labels already.
     noise : ConstantNoise, optional
@@ -128,6 +131,7 @@ class Session(Generic[B]):
         rng: np.random.Generator,
         *,
         known: Landmarks | None = None,
+        callers: Int[np.ndarray, " c"] = NO_CALLERS,
         association: Association | None = None,
         noise: ConstantNoise | None = None,
         live: bool = False,
@@ -144,6 +148,8 @@ class Session(Generic[B]):
         self.belief = estimator.init(start)
         if known is not None and known.landmark.size and isinstance(estimator, AcceptsMap):
             self.belief = estimator.knowing(self.belief, known)
+            if hasattr(association, "knowing"):
+                self._memory = association.knowing(self._memory, known, callers)
 
     def move(self, controls: Float[np.ndarray, "k c"], dt: Float[np.ndarray, " k"]) -> Gaussian:
         """Predict through control steps and return the pose after each, (k, 3) and (k, 3, 3).

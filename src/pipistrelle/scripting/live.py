@@ -159,6 +159,7 @@ class Slam:
             sensor.start,
             np.random.default_rng(stream_key(config.seed, 0, name)),
             known=drive.known,
+            callers=drive.callers,
             association=association_of(config),
             noise=noise_of(config.filter),
             live=True,

@@ -20,7 +20,8 @@ from pipistrelle.detection.logs.readers import Reader
 from pipistrelle.detection.logs.recording import Log, LogCaller
 from pipistrelle.detection.scans import COLUMNS, make_scan, with_columns
 from pipistrelle.estimation.measurement import excess_path_of
-from pipistrelle.experiments.drives import NO_TRUTH
+from pipistrelle.estimation.motion import Motion, motion_step
+from pipistrelle.experiments.drives import NO_TRUTH, Truth
 from pipistrelle.experiments.runs.replay import as_heard_by, load, motion_of, replay, start_of
 from pipistrelle.experiments.runs.truth_files import read_truth, write_truth
 from pipistrelle.geometry import range_and_bearing
@@ -562,3 +563,48 @@ def a_log():
         range_bounds=(0.5, 20.0),
         ignored_rows={},
     )
+
+
+def test_a_caller_whose_place_is_stated_stands_on_the_map_once_without_labels():
+    place = np.array([4.0, 5.0])
+    log = heard_without_labels(place)
+    config = Config(
+        association=AssociationConfig(method="marginal"), listening=ListeningConfig(timing=True)
+    )
+    mission = replay(log, Truth(time=log.time), ["fused"], ["iekf"], None, config)
+    (trial,) = mission.trials
+    (used,) = {scan.callers[1] for scan in trial.scans}
+    landmarks = trial.track.landmarks
+    near = np.hypot(*(landmarks.mean - place).T) < 1.0
+    assert used == 900
+    assert landmarks.landmark[near].tolist() == [900]
+    assert np.unique(landmarks.landmark).size == 1 + 8
+
+
+def heard_without_labels(place):
+    """A log of eight landmarks and a caller that stands at a place which the log states."""
+    rng, motion = np.random.default_rng(4), Motion(model="unicycle", control_std=(0.02, 0.02))
+    angles = 0.25 * np.pi * np.arange(8)
+    landmarks = np.column_stack((7.0 * np.cos(angles), 3.0 + 7.0 * np.sin(angles)))
+    pose, scans, direct = np.zeros(3), [], np.array([-1, 16])
+    for k in range(1, 101):
+        pose = motion_step(motion, pose, np.array([0.6, 0.2]) + 0.02 * rng.normal(size=2), 0.2)
+        r, b = range_and_bearing(pose, landmarks)
+        (far,), (to,) = range_and_bearing(pose, place[np.newaxis])
+        over = r + np.hypot(*(landmarks - place).T) - far
+        bearing = np.concatenate([b, b, [to]]) + 0.01 * rng.normal(size=17)
+        nothing = np.full(8, np.nan)
+        scan = make_scan(
+            0.2 * k, np.full(17, -1), bearing, caller=np.repeat([0, 1], [8, 9]),
+            range=np.concatenate([r + 0.02 * rng.normal(size=8), nothing, [np.nan]]),
+            excess_path=np.concatenate([nothing, over + 0.02 * rng.normal(size=8), [np.nan]]),
+        )  # fmt: skip
+        scans.append(replace(scan, direct=direct))
+    caller = LogCaller(name="mate", landmark=900, place=tuple(place))
+    return Log(
+        name="log", time=0.2 * np.arange(101), controls=np.tile([0.6, 0.2], (100, 1)),
+        dt=np.full(100, 0.2), scans=tuple(scans), motion="unicycle", control_std=(0.02, 0.02),
+        initial_pose=(0.0, 0.0, 0.0), initial_pose_std=(1e-3, 1e-3, 1e-3), range_std=0.02,
+        bearing_std=0.01, excess_path_std=0.02, range_bounds=(0.3, 20.0), callers=(caller,),
+        ignored_rows={},
+    )  # fmt: skip

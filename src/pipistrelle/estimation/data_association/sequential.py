@@ -29,7 +29,7 @@ from pipistrelle.detection.scans import (
     with_callers,
 )
 from pipistrelle.estimation.association import Assignment, is_among
-from pipistrelle.estimation.beliefs import Belief, Gaussian, JointGaussian
+from pipistrelle.estimation.beliefs import Belief, Gaussian, JointGaussian, Landmarks
 from pipistrelle.estimation.data_association.caller_search import searched
 from pipistrelle.estimation.data_association.doubles import asked_of, doubles
 from pipistrelle.estimation.data_association.early_scans import (
@@ -145,6 +145,22 @@ class Sequential:
             memory = replace(memory, labels=max(memory.labels, label))
             known[number] = Caller(label=label, place=place)
         return replace(memory, callers=known)
+
+    def knowing(self, memory: Memory, known: Landmarks, callers: Int[np.ndarray, " c"]) -> Memory:
+        """Return a memory of callers that stand on the map from the beginning, by their numbers.
+
+        They are not searched for, and cannot turn out to be elsewhere.
+        """
+        numbers = {label: number for number, label in enumerate(callers.tolist())}
+        rows = zip(known.landmark.tolist(), known.mean.tolist(), strict=True)
+        stated = {
+            numbers[label]: Caller(
+                label=label, place=CallerPlace(x, y, agreed=True), told=True, since=-PROBATION - 1
+            )
+            for label, (x, y) in rows
+            if label in numbers
+        }
+        return replace(memory, callers={**memory.callers, **stated})
 
     def tentative(self, memory: Memory) -> list[int]:
         """Return the labels of what may be no landmark."""
@@ -348,8 +364,11 @@ class _Work:
         return tuple((label[a], label[b]) for a, b in doubles(self.joint, at[old], apart, asked))
 
     def _another(self) -> int:
-        """Return a new label."""
+        """Return a new label, which no caller has."""
+        taken = {caller.label for caller in self.callers.values()}
         self.labels += 1
+        while self.labels in taken:
+            self.labels += 1
         return self.labels
 
     def _where(self, label: int) -> int:

@@ -75,8 +75,9 @@ def run_filter(
     steps = _steps_of(scans, time)
     _check_known(drive, scans)
     session = Session(
-        estimator, drive.start, rng, known=drive.known, association=association, noise=noise
-    )
+        estimator, drive.start, rng, known=drive.known, callers=drive.callers,
+        association=association, noise=noise,
+    )  # fmt: skip
     path = Gaussian(mean=np.empty((time.size, 3)), covariance=np.empty((time.size, 3, 3)))
     path.mean[0], path.covariance[0] = drive.start.mean, drive.start.covariance
     callers: dict[int, Gaussian] = {}
