@@ -444,3 +444,10 @@ def test_absurd_steps_and_scans_are_refused_or_leave_a_covariance_that_is_one(se
                 slam.hear(bearing=bearing, range=far, **labels)
         least, *_, largest = np.linalg.eigvalsh(slam.pose.covariance)
         assert least >= -1e-12 * largest
+
+
+def test_controls_that_cannot_be_are_refused_by_the_name_of_the_method_that_was_called():
+    slam = Slam(ROBOT)
+    for controls, dt in (([1.0, 2.0, 3.0], 1.0), ([1e9, 0.0], 1.0), ([1.0, 0.0], -1.0)):
+        with pytest.raises(InputError, match=r"^move: found "):
+            slam.move(controls, dt=dt)

@@ -84,7 +84,7 @@ def test_a_plan_may_be_a_table_and_is_refused_in_its_own_words():
     ):
         with pytest.raises(InputError, match=why):
             pipistrelle.study(levels | changes)
-    with pytest.raises(InputError, match="plan: iterations: missing"):
+    with pytest.raises(InputError, match="plan: no key 'iterations'; add iterations = 20"):
         pipistrelle.study({})
 
 

@@ -231,7 +231,10 @@ class Slam:
         """
         ends, lengths = times_of(dt, time, self._time)
         steps = np.atleast_2d(numbers(controls, "controls"))
-        steps, lengths = usable_controls(self._drive.motion, steps, lengths)
+        try:
+            steps, lengths = usable_controls(self._drive.motion, steps, lengths)
+        except InputError as error:  # it names the estimator's method
+            raise InputError(str(error).replace("predict:", "move:", 1)) from None
         if not lengths.size:
             return
         check_clock(ends, self._time)

@@ -13,6 +13,7 @@ from hypothesis import strategies as st
 from pipistrelle.config import InputError
 from pipistrelle.detection.logs.folder import read_log, write_log
 from pipistrelle.detection.logs.recording import Log
+from pipistrelle.detection.logs.vehicle import vehicle_of
 from pipistrelle.detection.scans import Scan, with_columns
 from reference.missions import scan_with
 
@@ -305,7 +306,7 @@ def test_an_empty_file_is_named(folder, name, header_only):
 
 def test_an_empty_settings_file_lacks_its_format(folder):
     (folder / "log.toml").write_text("")
-    refused(folder, "log.toml", "no key 'format'")
+    refused(folder, "log.toml", "no keys 'format', 'motion', ")
 
 
 def test_a_file_that_is_no_text_is_named(folder):
@@ -943,3 +944,14 @@ def test_any_log_survives_being_written(tmp_path_factory, log):
     folder = tmp_path_factory.mktemp("logs") / log.name
     write_log(folder, log)
     assert same(replace(read_log(folder), doubts=()), log)  # a drawn drive may be silent for long
+
+
+def test_all_keys_that_log_toml_lacks_are_named_at_once():
+    some = {"format": 1, "initial_pose": [0, 0, 0], "initial_pose_std": [0, 0, 0]}
+    unicycle = {"motion": "unicycle", "range_std": 0.1, "bearing_std": 0.1, "angular_rate_std": 0.1}
+    with pytest.raises(InputError, match="no keys 'range_bounds', 'velocity_std'") as refused:
+        vehicle_of(some | unicycle, "log")
+    assert str(refused.value).endswith("add 'range_bounds', 'velocity_std'")
+    with pytest.raises(InputError, match="no keys 'motion', 'range_std'") as refused:
+        vehicle_of(some, "log")
+    assert "velocity_std" not in str(refused.value), "which keys a motion has is not known"

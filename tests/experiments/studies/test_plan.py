@@ -184,8 +184,8 @@ def test_settings_laid_over_a_plan_go_before_its_own(tmp_path):
 @pytest.mark.parametrize(
     ("text", "said"),
     [
-        ("format = 1\n", "PLAN: iterations: missing"),
-        ("iterations = 3\n", "PLAN: format: missing"),
+        ("format = 1\n", "PLAN: no key 'iterations'; add iterations = 20"),
+        ("iterations = 3\n", "PLAN: no key 'format'; add format = 1"),
         ("iterations = = 3\n", "PLAN: found Invalid value (at line 1, column 14), expected TOML"),
         ("format = 2\niterations = 3\n", "PLAN: format: found 2, expected 1"),
         ("format = 1\niterations = 0\n", "PLAN: iterations: found 0, expected greater than"),

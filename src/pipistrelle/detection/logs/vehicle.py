@@ -187,7 +187,7 @@ def read_vehicle(path: Path) -> tuple[Vehicle, tuple[str, ...]]:
 def vehicle_of(table: Mapping[str, Any], where: object) -> Vehicle:
     """Check what a table says of a vehicle; `where` names it in refusals.
 
-    Of several errors the first is named, unknown keys before missing ones.
+    Of several errors the first is named, unknown keys before missing ones, and those all at once.
     """
     model = KINDS.get(str(table.get("motion")), _Unicycle)
     try:
@@ -197,7 +197,17 @@ def vehicle_of(table: Mapping[str, Any], where: object) -> Vehicle:
     rank = {"format": 0, "motion": 1}
     other = {"extra_forbidden": 2}
     fault = min(faults, key=lambda f: rank.get(str(f["loc"][0]), other.get(f["type"], 3)))
+    if fault["type"] == "missing" and len(fault["loc"]) == 1:
+        raise _missing(where, [f["loc"][0] for f in faults if f["type"] == "missing"], model)
     raise _key_refusal(where, fault, model)
+
+
+def _missing(where: object, names: list[Any], model: type[Vehicle]) -> InputError:
+    """Refuse a table without some keys; without a motion, keys of no motion model are named."""
+    known = Vehicle.model_fields if "motion" in names else model.model_fields
+    named = [repr(name) for name in names if name in known]
+    expected, plural = f"the keys {', '.join(known)}", "s" * (len(named) > 1)
+    return refusal(where, f"no key{plural} {', '.join(named)}", expected, f"add {', '.join(named)}")
 
 
 def _key_refusal(path: object, fault: Any, model: type[Vehicle]) -> InputError:
@@ -214,8 +224,6 @@ def _key_refusal(path: object, fault: Any, model: type[Vehicle]) -> InputError:
         known = _Association.model_fields
     parts = (f"[{p}]" if isinstance(p, int) else f".{p}" for p in fault["loc"])
     key = "".join(parts).removeprefix(".")
-    if fault["type"] == "missing":
-        return refusal(path, f"no key {key!r}", f"the keys {', '.join(known)}", f"add {key!r}")
     if fault["type"] == "extra_forbidden":
         near = meant(str(fault["loc"][-1]), known)
         fix = f"did you mean {near!r}?" if near else "remove it"

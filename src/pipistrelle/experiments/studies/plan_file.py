@@ -398,7 +398,8 @@ def _problem(path: Path, error: Any) -> str:
     """Say which key of a plan was refused, what was found and what was expected."""
     name = ".".join(map(str, error["loc"]))
     if error["type"] == "missing":
-        return f"{path}: {name}: missing; see paper.toml in pipistrelle/experiments/studies"
+        example = {"format": FORMAT, "iterations": 20}.get(name)
+        return f"{path}: no key {name!r}; add {name}" + f" = {example}" * (example is not None)
     expected = expectation(error)
     if error["type"] == "string_pattern_mismatch":
         expected = "letters, digits, _ . and -, for it names a folder"
