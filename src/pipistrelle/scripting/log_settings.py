@@ -230,7 +230,7 @@ def fit_warnings(
     Without such a mistake the warnings ask about units and labels.
     """
     beyond, odd_ranges = _beyond_a_turn(recorded), _out_of_bounds(recorded, "ranges")
-    questions, unmapped = beyond + odd_ranges, []
+    questions, unmapped, wide = beyond + odd_ranges, [], []
     notes = [
         f"{log}: {_nothing_used(trial)}, so it maps nothing"
         for trial in trials
@@ -239,6 +239,10 @@ def fit_warnings(
     for trial in trials if not beyond else ():
         questions += _rejected(trial, recorded, config)
         unmapped += _unmapped(trial, recorded)
+        if trial.track.labels:
+            from pipistrelle.scripting.misreadings import wide_sight
+
+            wide += wide_sight(trial, recorded, own_config(config, trial.filter))
     if questions or unmapped:
         from pipistrelle.scripting.misreadings import misreading
 
@@ -246,7 +250,7 @@ def fit_warnings(
         questions += [] if fits else unmapped
         if mistake:
             questions = [(questions[0][0], mistake)]
-    questions += _out_of_bounds(recorded, "excess paths")
+    questions += wide + _out_of_bounds(recorded, "excess paths")
     notes += [f"{log}: {found}; {question}" for found, question in questions]
     return notes + _unsure(trials, log, config)
 

@@ -1,4 +1,4 @@
-r"""Mistakes in the columns of a log that explain why its rows do not fit.
+r"""Mistakes in a log that explain why its rows do not fit: in its columns, and in its sight.
 
 Each mistake in `MISTAKES` is undone on the rows of some scans. Every row is then compared with rows
 of earlier scans, from which the odometry leads to it. Undone rightly, rows of one landmark
@@ -16,15 +16,21 @@ import math
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 
-from pipistrelle.detection.scans import UNLABELLED
+from pipistrelle.config import Config
+from pipistrelle.detection.scans import BEARING, NUMBERS, OWN, RANGE, UNLABELLED
+from pipistrelle.estimation.beliefs import placed
+from pipistrelle.estimation.data_association.existence import BEFORE, WITHIN
 from pipistrelle.estimation.motion import relative_motions
+from pipistrelle.estimation.session import REMEMBERED
+from pipistrelle.experiments.drives import carried
 from pipistrelle.experiments.runs.replay import motion_of
-from pipistrelle.geometry import wrap
+from pipistrelle.geometry import range_and_bearing, wrap
 
 if TYPE_CHECKING:
     from pipistrelle.detection.logs.recording import Log
+    from pipistrelle.experiments.results.scores import TrialResult
 
 DEGREE = math.pi / 180.0
 SCANS = 32
@@ -33,6 +39,9 @@ LAGS = 2 ** np.arange(10)
 """How many scans earlier those are."""
 CHANCE = 0.01
 """Probability that chance names a mistake."""
+REACH, QUESTIONED = 0.99, 1e-3
+"""Share of the rows within which a sensor surely sees, and probability of questioning a sound one
+by chance."""
 ROWS = 32
 """Rows of a scan that are compared with earlier scans, at most."""
 
@@ -328,3 +337,71 @@ def _log_ratio(
     mean = np.where(partner, density, 0.0).sum(axis=1) / np.maximum(partners, 1)
     known = (partners > 0) & ~np.isnan(bearing)
     return np.where(known, np.log(0.5 + 0.5 * mean / max(turns, 1.0)), 0.0)
+
+
+def wide_sight(trial: "TrialResult", recorded: "Log", config: Config) -> list[tuple[str, str]]:
+    """Return questions, what was found and what is asked, of a sensor's stated sight.
+
+    They are of a field of view or a range of the sensor that is stated wider than its rows.
+
+    Landmarks of the map that are expected beyond nearly all rows (`REACH`), but within what is
+    stated, must be heard with the probability ``association.detection``. It is questioned if by
+    chance so few would be heard with a probability of `QUESTIONED` at most. Scans count that are as
+    far apart as an association remembers, for in neighbours the same thing may hide a landmark.
+    """
+    stated = config.association
+    if stated.max_range is None:
+        return []
+    far, bearing, heard = _expected_rows(trial, recorded)
+    own = [scan.numbers[:, (scan.caller == OWN) & np.isnan(scan.level_db)] for scan in trial.heard]
+    rows = np.concatenate([np.empty((NUMBERS, 0)), *own], axis=1)
+    rows = rows[:, ~np.isnan(rows[RANGE])]
+    if not rows.size:
+        return []
+    half, farthest = 0.5 * stated.field_of_view - BEFORE, WITHIN * stated.max_range
+    wide, long = np.quantile(np.abs(rows[BEARING]), REACH), np.quantile(rows[RANGE], REACH)
+    off = np.abs(bearing)
+    asked = (
+        (
+            "field_of_view",
+            "bearings",
+            (far <= long) & (wide < off) & (off <= half),
+            2.0 * wide,
+            "rad",
+        ),
+        ("max_range", "ranges", (off <= wide) & (long < far) & (far <= farthest), long, "m"),
+    )
+    return [
+        (
+            f"association.{name} is {getattr(stated, name):.3g} {unit}, but {REACH:.0%} of the "
+            f"{what} are within {value:.3g} {unit}, and of {beyond.sum()} times that landmarks "
+            f"were expected beyond, they were heard {(beyond & heard).sum()} times",
+            f"the map loses landmarks by that; does {value:.3g} fit?",
+        )
+        for name, what, beyond, value, unit in asked
+        if _at_most(int((beyond & heard).sum()), int(beyond.sum()), stated.detection) <= QUESTIONED
+    ]
+
+
+def _at_most(heard: int, times: int, probability: float) -> float:
+    """Return the probability that at most so many of some independent times succeed."""
+    powers = ((1.0 - probability) ** (times - k) * probability**k for k in range(heard + 1))
+    return sum(math.comb(times, k) * power for k, power in enumerate(powers))
+
+
+def _expected_rows(
+    trial: "TrialResult", recorded: "Log"
+) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"], Bool[np.ndarray, " n"]]:
+    """Return range and bearing of all placed landmarks in some scans, and which were heard."""
+    track, landmarks = trial.track, trial.track.landmarks
+    there = placed(landmarks)
+    points, label = landmarks.mean[there], landmarks.landmark[there]
+    poses = carried(track.pose, recorded.sensor_pose).mean
+    found: list[np.ndarray] = [np.empty((3, 0))]
+    for n in range(0, len(track.labels), REMEMBERED):
+        scan, labels = trial.heard[n], track.labels[n]
+        step = np.searchsorted(track.time, scan.time)
+        far, bearing = range_and_bearing(poses[step], points)
+        found.append(np.vstack((far, bearing, np.isin(label, labels))))
+    far, bearing, heard = np.concatenate(found, axis=1)
+    return far, bearing, heard > 0.0
