@@ -9,10 +9,11 @@ import pytest
 from pipistrelle.config import AssociationConfig, Config
 from pipistrelle.detection.logs.folder import read_log, write_log
 from pipistrelle.detection.scans import make_scan
-from pipistrelle.estimation.beliefs import Gaussian, Landmarks
+from pipistrelle.estimation.beliefs import Gaussian
 from pipistrelle.estimation.motion import Motion, motion_step
 from pipistrelle.geometry import range_and_bearing, wrap
 from pipistrelle.scripting.misreadings import misreading, wide_sight
+from reference.missions import map_with
 from reference.spoilt_logs import DEGREES, SPOILED, noisy_log
 
 
@@ -99,9 +100,7 @@ def sight_of(field_of_view, max_range):
         heard = np.flatnonzero((np.abs(b) < 0.5 * np.pi) & (r < 8.0) & (rng.random(40) < 0.85))
         scans.append(make_scan(k * 0.1, np.full(heard.size, -1), b[heard], range=r[heard]))
         labels.append(heard)
-    landmarks = Landmarks(
-        landmark=np.arange(40), mean=places, covariance=np.zeros((40, 2, 2)), weight=np.ones(40)
-    )
+    landmarks = map_with(np.arange(40), places)
     track = SimpleNamespace(
         pose=Gaussian(mean=np.array(poses), covariance=np.zeros((1201, 3, 3))),
         time=log.time,
