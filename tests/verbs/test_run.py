@@ -72,6 +72,30 @@ def test_an_estimate_far_from_its_bound_is_told_of_once(obey, undrawn, monkeypat
         assert f"is {times:.1f} times the bound" in line
 
 
+@pytest.mark.parametrize(("rounding", "said"), [(missions.ROUNDING, 0), (0.0, 1)])
+def test_run_keeps_results_and_names_no_ratio_if_the_bound_is_zero(
+    obey, undrawn, monkeypatch, rounding, said
+):
+    monkeypatch.setattr(missions, "ROUNDING", rounding)
+    still = ("--scenario.speed", "0", "--motion.speed-std", "0", "--filter.range-std", "1e-6")
+    words = ("--duration", "1", "--seed", "728518", "--filter", "iekf", "--quiet", "-o", "one")
+    status, _, warned = obey("run", *still, *words)
+    assert status == 0
+    assert {run["position_bound_m"] for run in summary("one")["runs"]} == {0.0}
+    assert warned.count("is above the bound, 0 m") == warned.count("warning") == said
+
+
+def test_failing_warning_loses_no_results(obey, undrawn, monkeypatch):
+    def failing(trials):
+        raise ZeroDivisionError
+
+    monkeypatch.setattr(missions, "_far_off", failing)
+    with pytest.raises(ZeroDivisionError):
+        obey("run", *SHORT, "--strategy", "fused", "--quiet", "-o", "one", "--save-log", "log")
+    assert summary("one")["runs"]
+    assert Path("log/log.toml").exists()
+
+
 def test_nothing_is_told_of_kernels_that_are_loaded(obey, undrawn):
     obey("run", *SHORT)
     assert COMPILING not in obey("run", *SHORT)[2]
@@ -154,9 +178,7 @@ def test_earlier_results_and_logs_outlive_a_mission_that_comes_to_nothing(
     obey(*words, "--save-log", "log")
     results, log = contents("one"), contents("log")
     monkeypatch.setattr(f"pipistrelle.{place}", interrupted)
-    again = (*words, "--seed", "9", "--overwrite")
-    if place.startswith("experiments"):
-        again += ("--save-log", "log")
+    again = (*words, "--seed", "9", "--overwrite", "--save-log", "log")
     assert obey(*again)[0] == (130 if trouble is KeyboardInterrupt else 2)
     assert contents("one") == results
     assert contents("log") == log
@@ -260,7 +282,7 @@ def test_a_log_for_which_there_is_no_room_leaves_nothing(refused, undrawn, monke
     write, left = own_files.write_down, [room]
 
     def full(path, data):
-        left[0] -= 1
+        left[0] -= path.parent.name == "log"
         if left[0] < 0:
             write(path, data[:7])
             raise OSError(28, "No space left on device", str(path))
@@ -270,6 +292,7 @@ def test_a_log_for_which_there_is_no_room_leaves_nothing(refused, undrawn, monke
     said = refused("run", *SHORT, "--save-log", "log", "-o", "one", "--quiet")
     assert "could not be written (No space left on device)" in said
     assert not Path("log").exists()
+    assert summary("one")["runs"], "the results were written before"
 
 
 @pytest.mark.parametrize("estimator", ["ekf", pytest.param("fastslam", marks=pytest.mark.slow)])

@@ -1,7 +1,8 @@
 """Missions as they were asked for: simulated or solved from a log, then drawn, filmed, kept."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
+from functools import partial
 from math import inf, radians
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -42,6 +43,8 @@ if TYPE_CHECKING:
 
 MAX_TIMES_BOUND = 4.0
 """Ratio of position error to bound above which a warning is given."""
+ROUNDING = 1e-9
+"""Position error that comes of arithmetic and gives no warning where the bound is 0 [m]."""
 Conduct = Callable[..., Mission]
 """Does a mission, given `progress` and `watch`; the same settings give the same bits."""
 
@@ -68,14 +71,14 @@ def simulated(
         watch=watch,
     )
     assert mission.scenario is not None
-    return replace(
-        mission,
-        notes=(
-            *warnings_of(config, mission.scenario.callers),
-            *_far_off(mission.trials),
-            *filter(None, map(nis_warning, mission.trials)),
-        ),
-    )
+    callers = mission.scenario.callers
+
+    def notes() -> Iterator[str]:
+        yield from warnings_of(config, callers)
+        yield from _far_off(mission.trials)
+        yield from filter(None, map(nis_warning, mission.trials))
+
+    return replace(mission, notes=notes)
 
 
 def _far_off(trials: Sequence[TrialResult]) -> list[str]:
@@ -85,10 +88,12 @@ def _far_off(trials: Sequence[TrialResult]) -> list[str]:
     ]
     return [
         f"{trial.strategy} {short_name(trial.filter)}: its position error, {error:.3g} m, is "
-        f"{error / bound:.1f} times the bound, {bound:.3g} m; what serves each estimator is in "
-        "docs/estimators.md"
+        + (f"{error / bound:.1f} times" if bound > 0.0 else "above")
+        + f" the bound, {bound:.3g} m; what serves each estimator is in docs/estimators.md"
         for trial, error, bound in pairs
-        if error is not None and bound is not None and MAX_TIMES_BOUND * bound < error < inf
+        if error is not None
+        and bound is not None
+        and MAX_TIMES_BOUND * bound + ROUNDING < error < inf
     ]
 
 
@@ -127,8 +132,8 @@ def prepare_slam(
     def conduct(*, progress: Progress | None = None, watch: Watch | None = None) -> Mission:
         asked = (strategies, filters, beam, config)
         mission = replay(recorded, truth, *asked, progress=progress, watch=watch)
-        notes = fit_warnings(recorded, mission.trials, place, config)
-        return replace(mission, source=log_entry(place, robot, beam), notes=tuple(notes))
+        notes = partial(fit_warnings, recorded, mission.trials, place, config)
+        return replace(mission, source=log_entry(place, robot, beam), notes=notes)
 
     warnings = [*overruled, *log_warnings(recorded, truth, place)]
     return conduct, [f"{place}: {note}" for note in recorded.notes], warnings

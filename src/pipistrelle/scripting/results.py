@@ -386,8 +386,8 @@ def _finished(
     flags = ("output=DIR", ALLOW)
     own = None if place is None else claim(place, RESULTS, overwrite=overwrite, flags=flags)
     mission = conduct(progress=progress)
-    for line in (*mission.notes, *failures(mission)):
-        warnings.warn(line, stacklevel=3)
     if own is not None:
         keep(mission, own, command)
+    for line in (*mission.notes(), *failures(mission)):
+        warnings.warn(line, stacklevel=3)
     return Results(lambda watch: conduct(progress=progress, watch=watch), mission, place, command)

@@ -63,16 +63,14 @@ def conduct(
 ) -> int:
     """Do a mission, watched as the options say, and deliver it; return the exit status.
 
-    `save` writes what else was asked for, before the results; `compiling` lasts for the mission.
+    `save` writes what else was asked for, after the results; `compiling` lasts for the mission.
     """
     with result_folder(options, name) as own:
         get_ready(options)
         watch = recorder(options)
         with compiling or contextlib.nullcontext(), progress(options.quiet) as show:
             mission = mission_of(progress=show, watch=watch)
-        warn(*mission.notes)
-        save(mission)
-        return deliver(own, mission, options, watch)
+        return deliver(own, mission, options, watch, save)
 
 
 def deliver(
@@ -80,8 +78,11 @@ def deliver(
     mission: Mission,
     options: OutputOptions,
     watch: "MissionRecorder | None" = None,
+    save: Callable[[Mission], None] = lambda _: None,
 ) -> int:
     """Write results, pictures and bag in place of earlier ones; print the table, the folder last.
+
+    `save` writes more, and the warnings come after it, so neither can lose the results.
 
     Returns the exit status: 1 if an estimate is not finite or a filter failed, else 0.
     """
@@ -98,6 +99,8 @@ def deliver(
             write_bag(room / BAG, [*told_of(mission.trials)])
 
     keep(mission, own, command_line(), more)
+    save(mission)
+    warn(*mission.notes())
     if not options.quiet:
         landmarks, log = mission.drive.truth.landmarks, mission.log
         there = None if landmarks is None else len(landmarks[0])

@@ -174,7 +174,7 @@ def _recorded(
     config, _, _, own_world = asked
     sound.begin(checked_scenario(config, world=own_world or ALL_DRAWN))
     mission = simulated(*asked, keep=sound.keep, **watched)
-    return replace(mission, notes=(*mission.notes, *sound.notes()))
+    return replace(mission, notes=lambda: (*mission.notes(), *sound.notes()))
 
 
 def _sound_files(mission: "Mission", sound: "SoundRecorder") -> dict[str, Any]:

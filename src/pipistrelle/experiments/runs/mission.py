@@ -1,6 +1,6 @@
 """The record of a mission, simulated or solved from a recorded log."""
 
-from collections.abc import Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 
 from pipistrelle.acoustics.callers import Caller
@@ -36,7 +36,7 @@ class Mission:
     """The recorded log; None for a simulated mission."""
     source: Mapping[str, object] | None = None
     """Which log it was, for ``summary.json`` (`log_entry`)."""
-    notes: tuple[str, ...] = ()
-    """Warnings for the user."""
+    notes: Callable[[], Iterable[str]] = tuple
+    """Returns the warnings for the user; it is called after the results are written."""
     difference: str = ""
     """Of a mission that was rerun: how its tracks differ from those of its folder, in a line."""
