@@ -1,6 +1,7 @@
 """One file: what is no file is never read, and what we write is whole or not there."""
 
 import os
+from pathlib import Path
 
 import pytest
 
@@ -10,6 +11,7 @@ from pipistrelle.files import (
     put_in_place,
     read_file,
     read_text,
+    spelt,
     whole_name,
     write_down,
     write_whole,
@@ -115,3 +117,9 @@ def test_only_our_own_partial_names_are_taken_for_what_a_kill_left(tmp_path):
     assert whole_name(partial_of(path).name) == "one.txt"
     for name in ("one.txt", "one.txt.partial", "debian.iso.partial", ".0a1b2c3d.partial"):
         assert whole_name(name) is None
+
+
+def test_names_are_spelt_whatever_they_are_made_of():
+    assert spelt(Path("a b [1] µ")) == "a b [1] µ"
+    assert spelt(Path("a\nb")) == "a\\nb"
+    assert spelt(Path("a\udcff")) == "a\\xff"

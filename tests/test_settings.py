@@ -1,4 +1,5 @@
 import math
+import os
 import tomllib
 from functools import reduce
 from operator import getitem
@@ -208,6 +209,15 @@ def test_a_file_that_is_not_toml_is_refused_with_its_line(tmp_path):
     path.write_bytes(b"seed = 3 # \xff")
     with pytest.raises(InputError, match="byte 11, which is no UTF-8"):
         from_file(path)
+
+
+def test_a_setting_that_is_no_text_is_refused_by_its_name():
+    layer = from_flags({"scenario": {"world": os.fsdecode(b"w\xff")}, "seed": 3})
+    with pytest.raises(InputError, match=r"--scenario.world: found .*, expected UTF-8 text; "):
+        resolve(layer)
+    callers = [{"name": "boat", "route": os.fsdecode(b"boat\xff.csv")}]
+    with pytest.raises(InputError, match=r"--callers: found .*, expected UTF-8 text; "):
+        resolve(from_flags({"callers": callers}))
 
 
 @pytest.mark.parametrize(

@@ -68,6 +68,24 @@ def printable(path: Path) -> str:
     return text if text.isprintable() and len(text) < 4096 else shown(text)
 
 
+def text_of(name: str | Path) -> str:
+    r"""Return a path, or text with paths in it, as UTF-8 can hold it: other bytes are escaped.
+
+    >>> text_of("log" + chr(0xDCFF))
+    'log\\xff'
+    """
+    return str(name).encode(errors="surrogateescape").decode(errors="backslashreplace")
+
+
+def spelt(name: str | Path) -> str:
+    r"""Return a path, or text with paths in it, in one line; unprintable characters are escaped.
+
+    >>> spelt("one [2]"), spelt("a" + chr(10)), spelt("b" + chr(0x202E))
+    ('one [2]', 'a\\n', 'b\\u202e')
+    """
+    return "".join(c if c.isprintable() else repr(c)[1:-1] for c in text_of(name))
+
+
 def partial_of(path: Path) -> Path:
     """Return a new name beside a file, under which it is written before it is whole."""
     return path.with_name(f"{path.name}.{uuid4().hex[:8]}.partial")

@@ -445,6 +445,10 @@ def from_text(text: str) -> Any:
 
 def _problem(error: Any, layer: Layer) -> str:
     """Describe a refused value: where it stands, what was found and what was expected."""
+    if error["type"] == "json_invalid":
+        value, where = next(given for given in layer.values() if not _is_text(given.value))
+        fix = "rename the file or folder, or name a link to it"
+        return f"{where}: found {shown(value)}, expected UTF-8 text; {fix}"
     if error["loc"][:1] == CALLERS and CALLERS in layer:
         return _caller_problem(error, layer[CALLERS])
     key = tuple(part for part in error["loc"] if isinstance(part, str))
@@ -459,6 +463,15 @@ def _problem(error: Any, layer: Layer) -> str:
     elif key != error["loc"]:
         expected += f" as value {error['loc'][-1] + 1}"
     return f"{where}: found {shown(value)}, expected {expected}"
+
+
+def _is_text(value: Any) -> bool:
+    """Return whether all text in a value is text that UTF-8 can hold."""
+    try:
+        json.dumps(value, default=_plain, ensure_ascii=False).encode()
+    except UnicodeEncodeError:
+        return False
+    return True
 
 
 def _caller_problem(error: Any, given: Given) -> str:

@@ -9,8 +9,9 @@ from pipistrelle.estimation.catalogue import title_of
 from pipistrelle.evaluation.scores import heading, shown_in
 from pipistrelle.experiments.comparing.missions import ComparedEstimate, ComparedMissions
 from pipistrelle.experiments.comparing.studies import ComparedCase, ComparedStudies
-from pipistrelle.experiments.comparing.writing import lettered, spelt
+from pipistrelle.experiments.comparing.writing import lettered
 from pipistrelle.figures.style import INK, STYLE, TRUTH
+from pipistrelle.files import spelt
 
 if TYPE_CHECKING:
     from matplotlib.artist import Artist

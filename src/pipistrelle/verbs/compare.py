@@ -93,7 +93,8 @@ def _joined(notes: Sequence[str]) -> list[str]:
 def _names(compared: "Compared") -> str:
     """Say which folder is which."""
     from pipistrelle.experiments.comparing.studies import ComparedStudies
-    from pipistrelle.experiments.comparing.writing import lettered, spelt
+    from pipistrelle.experiments.comparing.writing import lettered
+    from pipistrelle.files import spelt
 
     lines = [f"{letter}  {spelt(folder)}" for letter, folder in lettered(compared.folders)]
     if isinstance(compared, ComparedStudies):

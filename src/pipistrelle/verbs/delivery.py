@@ -1,7 +1,6 @@
 """Doing a mission on the command line: its folder, figure, film and table."""
 
 import contextlib
-import os
 import shlex
 import sys
 from collections.abc import Callable, Iterator
@@ -12,6 +11,7 @@ from typing import TYPE_CHECKING
 from pipistrelle.detection.logs.bag import need_rosbags
 from pipistrelle.experiments.results import folder
 from pipistrelle.experiments.runs.mission import Mission
+from pipistrelle.files import spelt
 from pipistrelle.own_files import OwnFiles
 from pipistrelle.scripting.log_settings import distance_driven
 from pipistrelle.scripting.missions import Conduct, failures, filmed, keep
@@ -112,6 +112,5 @@ def deliver(
 
 
 def command_line() -> str:
-    """Return the command line as text, with names that are not valid text as their bytes."""
-    words = shlex.join(["pipistrelle", *sys.argv[1:]])
-    return os.fsencode(words).decode(errors="backslashreplace")
+    """Return the command line as text in one line, with bytes that are no text escaped."""
+    return spelt(shlex.join(["pipistrelle", *sys.argv[1:]]))

@@ -1,7 +1,6 @@
 """A comparison as files."""
 
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import polars as pl
@@ -14,10 +13,10 @@ from pipistrelle.experiments.comparing.writing import (
     comparison_table,
     settings_rows,
     settings_table,
-    spelt,
     write_comparison,
 )
 from pipistrelle.experiments.studies.plan import Plan
+from pipistrelle.files import spelt
 from pipistrelle.own_files import COMPARISON, SUMS, OwnFiles
 from reference.results import loop, mission_folder, study_folder, turned
 
@@ -125,9 +124,3 @@ def test_what_a_user_changed_in_an_earlier_comparison_is_not_replaced(missions, 
         write_comparison(OwnFiles(folder, COMPARISON), missions, **given)
     assert (folder / "comparison.csv").read_text() == "mine"
     assert (folder / "README.md").exists()
-
-
-def test_names_are_spelt_whatever_they_are_made_of():
-    assert spelt(Path("a b [1] µ")) == "a b [1] µ"
-    assert spelt(Path("a\nb")) == "a\\nb"
-    assert spelt(Path("a\udcff")) == "a\\xff"

@@ -1,6 +1,7 @@
 """A mission done again from its folder is the same, bit for bit, or a line says that it is not."""
 
 import json
+import os
 import re
 import shutil
 import sys
@@ -66,6 +67,23 @@ def test_the_tracks_are_those_of_the_folder_bit_for_bit(made, name):
         assert trial.scores.position_rmse_m == run["position_rmse_m"]
         assert trial.scores.landmarks_full == run["landmarks_full"]
         assert trial.scores.gated == run["gated"]
+
+
+@pytest.mark.skipif(os.name == "nt", reason="all names are Unicode there")
+@pytest.mark.parametrize("name", [b"log\xff", b"log\n<title>", "log\u202egol".encode()])
+def test_results_of_a_log_with_an_odd_name_are_viewed_and_compared(folders, name, capsys):
+    log = os.fsdecode(name)
+    Path("log").rename(log)
+    assert main(["slam", log, "--filter", "ekf", "--quiet", "-o", "one"]) == 0
+    kept = json.loads(Path("one/summary.json").read_bytes())["log"]
+    kept["path"].encode()
+    assert rerun(Path("one")).source == kept
+    assert main(["view", "one", "--quiet"]) == 0
+    page = Path("one/view.html").read_text(encoding="utf-8")
+    assert "\u202e" not in page
+    assert page.count("<title>") == 1
+    assert main(["compare", "one", "robot", "-o", "both", "--quiet"]) == 0
+    assert capsys.readouterr().err == ""
 
 
 def test_a_simulated_mission_comes_with_its_world(made):

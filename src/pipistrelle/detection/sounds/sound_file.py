@@ -1,5 +1,6 @@
 """Sound files, read in pieces by the package soundfile: a long recording is never in memory."""
 
+import os
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
@@ -124,7 +125,8 @@ def _opened(path: Path) -> "SoundFile":
         if not path.stat().st_size:
             raise refusal(path, "an empty file", "a sound file", "copy it again")
         header = header_of(path)
-        file = soundfile.SoundFile(path)
+        name: Any = os.fsencode(path)  # it takes bytes, and refuses text that is not UTF-8
+        file = soundfile.SoundFile(name)
     try:
         check_header(path, file, header)
     except BaseException:

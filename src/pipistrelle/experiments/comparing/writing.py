@@ -3,7 +3,6 @@
 import io
 import json
 import math
-import os
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -13,6 +12,7 @@ from pipistrelle.estimation.catalogue import short_name
 from pipistrelle.experiments.comparing.folders import LETTERS
 from pipistrelle.experiments.comparing.missions import ComparedMissions
 from pipistrelle.experiments.comparing.studies import ComparedStudies
+from pipistrelle.files import spelt
 from pipistrelle.own_files import OwnFiles, drawn_files
 
 if TYPE_CHECKING:
@@ -100,18 +100,6 @@ def lettered(folders: Sequence[Path]) -> list[tuple[str, Path]]:
     ['A', 'B']
     """
     return list(zip(LETTERS, folders, strict=False))
-
-
-def spelt(folder: Path) -> str:
-    r"""Write a folder's name with unprintable characters escaped.
-
-    Examples
-    --------
-    >>> spelt(Path("one [2]")), spelt(Path("a" + chr(10)))
-    ('one [2]', 'a\\n')
-    """
-    text = os.fsencode(folder).decode(errors="backslashreplace")
-    return "".join(c if c.isprintable() else repr(c)[1:-1] for c in text)
 
 
 def scores_of(run: Mapping[str, Any]) -> dict[str, float | None]:

@@ -1,9 +1,10 @@
 """The summary of a result folder, read and checked; any other folder is refused."""
 
+import os
 from pathlib import Path
 from typing import Literal
 
-from pydantic import BaseModel, ValidationError
+from pydantic import BaseModel, Field, ValidationError
 
 from pipistrelle.config import InputError, Strategy
 from pipistrelle.detection.logs.readers import READERS, Robot
@@ -26,13 +27,22 @@ class LogEntry(BaseModel):
     """The recorded log that was solved."""
 
     path: str
-    """The folder."""
+    """The folder; bytes that are no text are escaped."""
+    path_bytes: str | None = Field(None, pattern=r"^([0-9a-f]{2})+$")
+    """The bytes of the folder's name in hexadecimal digits, where they are no text."""
     robot: Robot | None
     """The robot, where the log is of several."""
     beamwidth_rad: float | None
     """Ranges outside a beam of this width were hidden [rad]."""
     files: dict[str, str]
     """The SHA-256 of each file that was read, or might have been."""
+
+    @property
+    def place(self) -> Path:
+        """The folder's path."""
+        if self.path_bytes is None:
+            return Path(self.path)
+        return Path(os.fsdecode(bytes.fromhex(self.path_bytes)))
 
 
 class Summary(BaseModel):

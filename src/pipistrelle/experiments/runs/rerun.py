@@ -9,6 +9,7 @@ import math
 from collections.abc import Collection, Sequence
 from dataclasses import replace
 from hashlib import file_digest
+from os import fsencode
 from pathlib import Path
 
 import numpy as np
@@ -29,7 +30,7 @@ from pipistrelle.experiments.runs import truth_files
 from pipistrelle.experiments.runs.mission import Mission
 from pipistrelle.experiments.runs.replay import load, replay
 from pipistrelle.experiments.runs.trial import Watch, run_mission
-from pipistrelle.files import read_file
+from pipistrelle.files import read_file, text_of
 from pipistrelle.refusals import refusal
 from pipistrelle.settings import from_file, read_toml, resolve
 from pipistrelle.version import find_version
@@ -83,7 +84,7 @@ def rerun(
         recorded, truth = load(_log_of(folder, summary, log), summary.log.robot, bag=config.bag)
         beam, asked = summary.log.beamwidth_rad, (strategies, filters)
         mission = replay(recorded, truth, *asked, beam, config, progress=progress, watch=watch)
-        mission = replace(mission, source=summary.log.model_dump())
+        mission = replace(mission, source=summary.log.model_dump(exclude_defaults=True))
     return replace(mission, difference=_difference(folder, summary, mission.trials))
 
 
@@ -105,15 +106,17 @@ def log_entry(log: Path, robot: Robot | None, beamwidth: float | None) -> dict[s
     >>> entry["beamwidth_rad"], list(entry["files"])
     (0.5, ['log.toml'])
     """
-    heard = {"robot": robot, "beamwidth_rad": beamwidth}
-    return {"path": str(log.resolve()), **heard, "files": _sums(log)}
+    path = str(log.resolve())
+    entry: dict[str, object] = {"path": text_of(path), "robot": robot, "beamwidth_rad": beamwidth}
+    entry |= {"files": _sums(log)}
+    return entry if entry["path"] == path else entry | {"path_bytes": fsencode(path).hex()}
 
 
 def _sums(log: Path) -> dict[str, str]:
     """Return the SHA-256 of each file of a log and of its truth, by name."""
     patterns = (*reader_of(log).files, *truth_files.FILES)
-    found = {path.name: path for pattern in patterns for path in log.glob(pattern)}
-    found |= {log.name: log} if log.is_file() else {}
+    found = {text_of(path.name): path for pattern in patterns for path in log.glob(pattern)}
+    found |= {text_of(log.name): log} if log.is_file() else {}
     sums = {}
     for name, path in sorted(found.items()):
         if path.is_file():
@@ -143,7 +146,7 @@ def _check_simulated(folder: Path, log: Path | None) -> None:
 def _log_of(folder: Path, summary: Summary, log: Path | None) -> Path:
     """Return where the log is that was solved; refuse one that is gone or was changed."""
     assert summary.log
-    path = Path(summary.log.path) if log is None else log
+    path = summary.log.place if log is None else log
     where = f"{folder / SUMMARY}: log.path" if log is None else f"{folder}, option --log"
     if not path.exists():
         raise refusal(

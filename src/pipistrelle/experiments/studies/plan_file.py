@@ -38,7 +38,7 @@ from pipistrelle.experiments.studies.plan import (
     Plan,
     combinations,
 )
-from pipistrelle.files import check_ordinary
+from pipistrelle.files import check_ordinary, text_of
 from pipistrelle.refusals import expectation, meant, shown
 from pipistrelle.settings import (
     ARRAY_KEY,
@@ -376,7 +376,9 @@ def _head(path: Path, table: Mapping[str, Any], iterations: int | None) -> _Head
     for name in table:
         if name not in keys:
             raise InputError(f"{path}: {name}: no such key of a plan; {_meant(name, keys)}")
-    given = {"name": path.stem} | {k: v for k, v in table.items() if k in _Head.model_fields}
+    given = {"name": text_of(path.stem)} | {
+        k: v for k, v in table.items() if k in _Head.model_fields
+    }
     if iterations is not None:
         if isinstance(given.get("iterations"), int):
             given.setdefault("planned", given["iterations"])

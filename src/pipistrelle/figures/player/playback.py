@@ -27,6 +27,7 @@ from pipistrelle.figures.excess_paths import (
 from pipistrelle.figures.maps import view
 from pipistrelle.figures.mission import outcome
 from pipistrelle.figures.recorder import Snapshot, heard_from
+from pipistrelle.files import spelt
 
 MAX_FRAMES = 3000
 """Of a longer recording so many are shown, evenly spaced."""
@@ -171,9 +172,8 @@ def _told(done: Mission, frames: int, shown: int) -> tuple[str, tuple[str, ...]]
         facts.append(f"{len(done.drive.truth.landmarks[0])} landmarks")
     if done.drive.truth.path is None:
         facts.append("no truth known")
-    return f"Log {done.log.name}" if done.log else f"Mission of seed {done.config.seed}", tuple(
-        facts
-    )
+    title = f"Log {spelt(done.log.name)}" if done.log else f"Mission of seed {done.config.seed}"
+    return title, tuple(facts)
 
 
 def _origin(trials: Sequence[TrialResult]) -> Float[np.ndarray, "2"]:
