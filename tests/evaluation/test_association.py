@@ -6,11 +6,16 @@ import numpy as np
 import pytest
 
 from pipistrelle.detection.scans import UNLABELLED, make_scan, rows_of
+from pipistrelle.evaluation.accuracy import alignment, moved
 from pipistrelle.evaluation.association import (
+    STAY,
     associated,
     causes_of,
     gospa,
     map_counts,
+    matched,
+    nearest_motion,
+    out_of_place,
     renamed,
 )
 from reference.missions import map_with
@@ -98,3 +103,36 @@ def test_nothing_associated_is_no_score():
     found = associated([np.empty(0, np.int64)], [np.empty(0, np.int64)])
     assert found.right is None
     assert found.names == {}
+
+
+TRUE = np.array([7, 8, 9]), np.array([[0.0, 0.0], [10.0, 0.0], [0.0, 10.0]])
+
+
+def test_landmark_near_no_true_one_is_false_whatever_caused_its_rows():
+    places = np.array([[0.1, 0.0], [6.0, 0.0], [50.0, 50.0]])
+    landmarks = map_with([1, 2, 3], places, np.tile(np.eye(2), (3, 1, 1)))
+    rows = [np.array([1, 2, 3])] * 3
+    found = associated(rows, [np.array([7, 8, 44])] * 3)
+    away = out_of_place(landmarks, found, *TRUE)
+    assert away == {2}, "where 44 truly is nobody knows"
+    counts = map_counts(landmarks, found, away)
+    assert (counts.missed, counts.false, counts.twice) == (1, 1, 0)
+
+
+def test_matching_by_position_gives_a_doubled_landmark_to_the_nearer_of_two():
+    places = np.array([[1.5, 0.0], [0.1, 0.0], [10.0, 1.0], [np.nan, 0.0], [5.0, 5.0]])
+    landmarks = map_with([3, 1, 2, 4, 5], places, np.tile(np.eye(2), (5, 1, 1)))
+    found = matched(landmarks, *TRUE)
+    assert found.names == {3: 7, 1: 7, 2: 8, 4: UNLABELLED, 5: UNLABELLED}
+    assert renamed(landmarks, found).landmark.tolist() == [-5, 7, 8, -6, -7]
+    counts = map_counts(landmarks, found)
+    assert (counts.missed, counts.false, counts.twice) == (1, 2, 1)
+
+
+def test_map_that_is_turned_as_a_whole_has_no_false_landmark():
+    turn = np.array([3.0, -4.0, 0.5])
+    back = alignment(moved(TRUE[1], turn), TRUE[1])
+    landmarks = map_with([1, 2, 3], moved(TRUE[1], turn), np.tile(np.eye(2), (3, 1, 1)))
+    assert matched(landmarks, *TRUE).names != {1: 7, 2: 8, 3: 9}
+    motion = nearest_motion(landmarks.mean, TRUE[1], [STAY, back])
+    assert matched(landmarks, *TRUE, motion).names == {1: 7, 2: 8, 3: 9}

@@ -598,3 +598,24 @@ def test_unsure_rows_are_counted_by_the_limits_of_their_own_filter(obey, undrawn
     ekf, smoother = json.loads(Path("out/summary.json").read_text())["runs"]
     assert ekf["ignored_rows"]["unsure_bearing"] > 10
     assert "unsure_bearing" not in smoother["ignored_rows"]
+
+
+def test_log_without_labels_is_scored_by_the_positions_of_its_landmarks(obey, undrawn):
+    words = ("--duration", "8", "--landmarks", "12", "--seed", "3", "--quiet")
+    obey("run", *words, "--strategy", "active", "--save-log", "log", "-o", "one")
+    rows = pl.read_csv("log/measurements.csv")
+    rows.with_columns(landmark=pl.lit(None, pl.Int64)).write_csv("log/measurements.csv")
+    told = ("--association.method", "marginal", "--strategy", "active")
+    _, printed, _ = obey("slam", "log", *told, "-o", "two")
+    (run,) = summary("two")["runs"]
+    there = table(printed)
+    assert float(there["map RMSE [m]"][0]) == pytest.approx(run["map_rmse_m"], abs=1e-3)
+    assert {"GOSPA of the map [m]", "landmarks missed", "landmarks false"} <= there.keys()
+    found = pl.read_parquet("two/landmarks.parquet").filter(status="full")
+    error = found["error_m"].drop_nulls()
+    assert len(error) > 3
+    assert error.max() < 2.0
+    assert np.sqrt((error**2).mean()) == pytest.approx(run["map_rmse_m"])
+    shown = pipistrelle.slam("log", association__method="marginal", strategies="active").summary
+    assert shown["map_rmse_m"].to_list() == [run["map_rmse_m"]]
+    assert shown["gospa_m"].to_list() == [run["gospa_m"]]

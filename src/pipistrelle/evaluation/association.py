@@ -1,11 +1,12 @@
 r"""How well rows were associated, by what truly caused them, and how well the map agrees.
 
 An association's labels are its own. The landmark that a label stands for is the one that caused
-most of its rows; none, where most were clutter.
+most of its rows; none, where most were clutter. If the causes of rows are not known, landmarks are
+matched by their positions.
 """
 
 from collections import Counter, defaultdict
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -13,6 +14,7 @@ from jaxtyping import Float, Int
 
 from pipistrelle.detection.scans import UNLABELLED, Scan
 from pipistrelle.estimation.beliefs import Landmarks, placed
+from pipistrelle.evaluation.accuracy import moved
 
 Causes = Sequence[Int[np.ndarray, " m"]]
 """Of each scan what caused its rows: labels of landmarks, or UNLABELLED."""
@@ -20,6 +22,8 @@ OFTEN = 3
 """In how many scans a landmark must be heard to be missed."""
 CUTOFF = 2.0
 """Distance from which on a landmark counts as missed and another as false [m]."""
+STAY = np.zeros(3)
+"""The motion that moves nothing."""
 
 
 def causes_of(scan: Scan, rows: Scan, cause: Int[np.ndarray, " n"]) -> Int[np.ndarray, " m"]:
@@ -38,16 +42,16 @@ def causes_of(scan: Scan, rows: Scan, cause: Int[np.ndarray, " n"]) -> Int[np.nd
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Associated:
-    """What became of the rows of a drive."""
+    """The landmark of each label, from the causes of rows or from positions."""
 
     names: Mapping[int, int]
     """The landmark that each label stands for, or UNLABELLED."""
     rows: Mapping[int, int]
-    """How many rows have each label."""
+    """How many rows have each label; from positions, 1 if the label is the nearest, else 0."""
     right: float | None
     """Share of the rows with a label that are of the landmark it stands for."""
     heard: frozenset[int]
-    """Landmarks that were heard in `OFTEN` scans or more."""
+    """Landmarks that were heard in `OFTEN` scans or more; from positions, all."""
 
 
 def associated(
@@ -84,6 +88,101 @@ def associated(
     )
 
 
+def pairs_of(
+    points: Float[np.ndarray, "n 2"], true: Float[np.ndarray, "k 2"], cutoff: float = CUTOFF
+) -> tuple[Int[np.ndarray, " m"], Int[np.ndarray, " m"], Float[np.ndarray, " m"]]:
+    """Pair points with true ones nearer than a cutoff, so that `gospa` is least.
+
+    Returns the rows of the points, the rows of the true ones, and the squared distances [m^2].
+
+    >>> pairs_of(np.array([[9.0, 9.0], [0.0, 1.0]]), np.zeros((1, 2)))
+    (array([1]), array([0]), array([1.]))
+    """
+    from scipy.optimize import linear_sum_assignment  # a quarter of a second, if not needed
+
+    off = points[:, np.newaxis] - true
+    squared = np.einsum("nke,nke->nk", off, off)
+    squared = np.where(squared < cutoff**2, squared, cutoff**2)  # NaN is far
+    rows, columns = linear_sum_assignment(squared)
+    near = squared[rows, columns] < cutoff**2
+    rows, columns = rows[near], columns[near]
+    return rows, columns, squared[rows, columns]
+
+
+def nearest_motion(
+    points: Float[np.ndarray, "n 2"],
+    true: Float[np.ndarray, "k 2"],
+    motions: Sequence[Float[np.ndarray, "3"]],
+) -> Float[np.ndarray, "3"]:
+    """Return the rigid motion after which points are nearest to true ones, by `gospa`.
+
+    >>> nearest_motion(np.ones((1, 2)), np.full((1, 2), 5.0), [STAY, np.array([4.0, 4.0, 0.0])])
+    array([4., 4., 0.])
+    """
+    return min(motions, key=lambda motion: gospa(moved(points, motion), true).distance)
+
+
+def matched(
+    landmarks: Landmarks,
+    true_landmark: Int[np.ndarray, " k"],
+    true_position: Float[np.ndarray, "k 2"],
+    motion: Float[np.ndarray, "3"] = STAY,
+) -> Associated:
+    """Match the placed landmarks of a map with true ones by their positions.
+
+    `motion` is applied to the map before. A landmark that has no partner in `pairs_of`, but is
+    nearer than the cutoff to a true landmark, stands for it as well: it is on the map twice.
+
+    >>> from pipistrelle.estimation.beliefs import Landmarks
+    >>> places = np.array([[1.0, 0.0], [9.0, 0.0], [1.0, 1.0]])
+    >>> found = Landmarks(
+    ...     landmark=np.arange(3), mean=places, covariance=np.tile(np.eye(2), (3, 1, 1)),
+    ...     weight=np.ones(3),
+    ... )
+    >>> matched(found, np.array([7]), np.ones((1, 2))).names
+    {0: 7, 1: -1, 2: 7}
+    """
+    full = placed(landmarks)
+    labels, points = landmarks.landmark[full].tolist(), moved(landmarks.mean[full], motion)
+    rows, columns, _ = pairs_of(points, true_position)
+    partner = dict(zip(rows.tolist(), columns.tolist(), strict=True))
+    near = [partner.get(row, _nearest(point, true_position)) for row, point in enumerate(points)]
+    names = [UNLABELLED if k is None else int(true_landmark[k]) for k in near]
+    return Associated(
+        names=dict(zip(labels, names, strict=True)),
+        rows={label: int(row in partner) for row, label in enumerate(labels)},
+        right=None,
+        heard=frozenset(true_landmark.tolist()),
+    )
+
+
+def _nearest(point: Float[np.ndarray, "2"], true: Float[np.ndarray, "k 2"]) -> int | None:
+    """Return the number of the true point nearest to a point, within the cutoff; else None."""
+    away = np.hypot(*(true - point).T)
+    near = np.flatnonzero(away < CUTOFF)
+    return int(near[np.argmin(away[near])]) if near.size else None
+
+
+def out_of_place(
+    landmarks: Landmarks,
+    found: Associated,
+    true_landmark: Int[np.ndarray, " k"],
+    true_position: Float[np.ndarray, "k 2"],
+    motion: Float[np.ndarray, "3"] = STAY,
+) -> frozenset[int]:
+    """Return the labels of placed landmarks that, after a motion, are near no true landmark.
+
+    Labels that stand for a landmark whose true position is not known are left out.
+    """
+    full, known = placed(landmarks), {*true_landmark.tolist()}
+    labels, points = landmarks.landmark[full].tolist(), moved(landmarks.mean[full], motion)
+    return frozenset(
+        label
+        for label, point in zip(labels, points, strict=True)
+        if found.names.get(label) in known and _nearest(point, true_position) is None
+    )
+
+
 def renamed(landmarks: Landmarks, found: Associated) -> Landmarks:
     """Return a map under the names of what its labels stand for.
 
@@ -109,15 +208,20 @@ class MapCounts:
     missed: int
     """Heard often, and not on the map."""
     false: int
-    """On the map, and none."""
+    """On the map, and none: caused by clutter, or near no true landmark."""
     twice: int
     """On the map under another label, too."""
 
 
-def map_counts(landmarks: Landmarks, found: Associated) -> MapCounts:
-    """Count missed, false and doubled landmarks among the placed ones of a map."""
+def map_counts(
+    landmarks: Landmarks, found: Associated, away: Collection[int] = frozenset()
+) -> MapCounts:
+    """Count missed, false and doubled landmarks among the placed ones of a map.
+
+    `away`: labels of landmarks that are near no true one, which stand for none (`out_of_place`).
+    """
     labels = landmarks.landmark[placed(landmarks)].tolist()
-    named = [found.names.get(label, UNLABELLED) for label in labels]
+    named = [UNLABELLED if n in away else found.names.get(n, UNLABELLED) for n in labels]
     true = [name for name in named if name != UNLABELLED]
     return MapCounts(
         missed=len(found.heard - {*true}),
@@ -155,13 +259,7 @@ def gospa(
     >>> round(found.distance**2, 9), found.error, found.missed, found.false
     (3.0, 1.0, 0, 1)
     """
-    from scipy.optimize import linear_sum_assignment  # a quarter of a second, if not needed
-
-    off = points[:, np.newaxis] - true
-    squared = np.minimum(np.einsum("nke,nke->nk", off, off), cutoff**2)
-    rows, columns = linear_sum_assignment(squared)
-    pairs = squared[rows, columns]
-    pairs = pairs[pairs < cutoff**2]
+    _, _, pairs = pairs_of(points, true, cutoff)
     missed, false = len(true) - pairs.size, len(points) - pairs.size
     total = float(pairs.sum())
     distance = np.sqrt(total + 0.5 * cutoff**2 * (missed + false))

@@ -440,4 +440,4 @@ def _log_of(vehicle: Vehicle, time: float) -> tuple[Log, Path]:
 
 def _map_table(landmarks: Landmarks) -> "pl.DataFrame":
     """Lay out a map without its truth."""
-    return landmark_table(landmarks, None).drop("true_x_m", "true_y_m", "error_m")
+    return landmark_table(landmarks, None).drop("true_x_m", "true_y_m", "error_m", "true_landmark")

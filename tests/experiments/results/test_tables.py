@@ -1,5 +1,7 @@
 """The files' contents: numbers survive them, and what is missing is null."""
 
+from dataclasses import replace
+
 import numpy as np
 import polars as pl
 import pytest
@@ -118,6 +120,18 @@ def test_the_landmark_table_holds_every_hypothesis_and_every_true_landmark(landm
     assert table["error_m"][0] == pytest.approx(np.hypot(*(landmarks.mean[0] - [5.0, 6.0])))
     assert table["error_m"].is_null().to_list() == [False, False, False, False, True, True]
     assert table["true_x_m"].to_list() == [5.0, 1.0, 1.0, 1.0, None, 3.0]
+
+
+def test_landmark_table_joins_the_truth_by_the_names_that_a_map_has_there(landmarks):
+    labels, positions = np.array([4, 8, 51]), np.array([[1.0, 2.0], [3.0, 4.0], [5.0, 6.0]])
+    mapped = replace(landmarks, landmark=np.array([8, -6, -6, -6, 4]))
+    table = landmark_table(landmarks, (labels, positions), mapped)
+    assert table["landmark"].to_list() == [51, 4, 4, 4, 17, None]
+    assert table["true_landmark"].to_list() == [8, None, None, None, 4, 51]
+    assert table["status"].to_list() == ["full", *["partial"] * 3, "full", "unseen"]
+    assert table["true_x_m"].to_list() == [3.0, None, None, None, 1.0, 5.0]
+    error = np.hypot(*(landmarks.mean[[0, 4]] - positions[[1, 0]]).T)
+    assert table["error_m"].drop_nulls().to_list() == pytest.approx(error.tolist())
 
 
 def test_the_landmark_table_tells_each_hypothesis_its_covariance_term_by_term(landmarks):

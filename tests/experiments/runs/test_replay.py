@@ -22,6 +22,7 @@ from pipistrelle.detection.scans import COLUMNS, make_scan, with_columns
 from pipistrelle.estimation.measurement import excess_path_of
 from pipistrelle.estimation.motion import Motion, motion_step
 from pipistrelle.experiments.drives import NO_TRUTH, Truth
+from pipistrelle.experiments.results.writing import run_entry, tables_of
 from pipistrelle.experiments.runs.replay import as_heard_by, load, motion_of, replay, start_of
 from pipistrelle.experiments.runs.truth_files import read_truth, write_truth
 from pipistrelle.geometry import range_and_bearing
@@ -505,6 +506,28 @@ def test_a_log_without_labels_is_refused_with_the_option_that_solves_it():
     (trial,) = replay(bare, NO_TRUTH, ["fused"], ["ekf"], None, config).trials
     assert sum((label > 0).sum() for label in trial.track.labels) > 0
     assert trial.scores.associated_right is None, "nobody knows"
+    assert trial.mapped is None
+
+
+@pytest.mark.parametrize("shift", [0.0, 5.0])
+def test_log_without_labels_is_scored_by_the_positions_of_its_landmarks(shift):
+    log, truth = load(DATA / "unicycle_log")
+    bare = replace(log, scans=tuple(with_columns(scan, landmark=-1) for scan in log.scans))
+    config = Config(association=AssociationConfig(method="nearest"))
+    labels, places = truth.landmarks
+    truth = replace(truth, path=truth.path + np.array([shift, 0.0, 0.0]))
+    truth = replace(truth, landmarks=(labels + 100, places + np.array([shift, 0.0])))
+    mission = replay(bare, truth, ["fused"], ["ekf"], None, config)
+    (trial,) = mission.trials
+    full = tables_of(mission.trials, truth)["landmarks"].filter(status="full")
+    scores, near = trial.scores, full["error_m"].drop_nulls()
+    assert len(near), "by their positions, whatever their numbers are"
+    assert abs(near - shift).max() < 2.0, "the whole map may be shifted"
+    assert np.sqrt((near**2).mean()) == pytest.approx(scores.map_rmse_m)
+    assert scores.landmarks_missed == len(labels) - len(near)
+    assert scores.landmarks_false + scores.landmarks_twice == len(full) - len(near)
+    assert scores.gospa_missed >= scores.landmarks_missed
+    assert run_entry(trial, {})["landmarks_missed"] == scores.landmarks_missed
 
 
 def test_rows_of_two_scans_at_one_time_are_each_scored_by_their_own_labels():

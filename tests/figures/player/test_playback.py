@@ -6,11 +6,18 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from pipistrelle.config import InputError
+from pipistrelle.config import (
+    AssociationConfig,
+    Config,
+    EmitterConfig,
+    InputError,
+    ScenarioConfig,
+)
 from pipistrelle.detection.logs.recording import LogCaller
 from pipistrelle.detection.scans import rows_of as rows_of_scan
 from pipistrelle.estimation.beliefs import Gaussian
 from pipistrelle.experiments.drives import NO_TRUTH
+from pipistrelle.experiments.runs.trial import run_mission
 from pipistrelle.figures.animation import pruned
 from pipistrelle.figures.excess_paths import callers_at, resolved
 from pipistrelle.figures.player.playback import MAX_PARTICLES, playback
@@ -310,3 +317,22 @@ def test_a_logs_callers_have_names_and_no_true_place(watched):
     ).callers
     assert (label, name) == (21, "mate")
     assert np.isnan(place).all()
+
+
+def test_playback_names_landmarks_of_an_association_as_the_true_ones_they_stand_for():
+    config = Config(seed=7, scenario=ScenarioConfig(steps=160, landmarks=20))
+    config = config.model_copy(
+        update={
+            "association": AssociationConfig(method="marginal"),
+            "emitter": EmitterConfig(radius=0.002),
+        }
+    )
+    watch = MissionRecorder()
+    done = run_mission(config, ["active"], ["ekf"], watch=watch)
+    (estimate,) = playback(done, watch.snapshots).estimates
+    true = dict(zip(*(part.tolist() for part in done.drive.truth.landmarks), strict=True))
+    labels, rows = rows_of(estimate.mapped, -1 % len(estimate.pose))
+    off = [np.hypot(*(row[:2] - true[n])) for n, row in zip(labels, rows, strict=True) if n in true]
+    assert len(off) == 3
+    assert max(off) < 2.0
+    assert {*estimate.heard.landmark.tolist()} & {*labels.tolist()}

@@ -19,7 +19,14 @@ from pipistrelle.evaluation.accuracy import (
     rmse,
     scored_landmarks,
 )
-from pipistrelle.evaluation.association import Associated, gospa, map_counts
+from pipistrelle.evaluation.association import (
+    STAY,
+    Associated,
+    gospa,
+    map_counts,
+    nearest_motion,
+    out_of_place,
+)
 from pipistrelle.evaluation.bound import NO_ROUTES, path_bound, pose_bound, true_controls
 from pipistrelle.evaluation.consistency import diverged, track_nees
 from pipistrelle.experiments.drives import Drive, Truth, split_at
@@ -82,11 +89,14 @@ class Scores:
         Measurements that the gate rejected, of `judged`.
     associated_right : float or None
         Share of the rows that an association gave a label which are of the landmark that the label
-        stands for (`evaluation.association`); None of known labels, as are those that follow.
+        stands for (`evaluation.association`); None if no row of a log has a label. None of known
+        labels, as are those that follow.
     landmarks_missed, landmarks_false, landmarks_twice : int or None
-        Heard in three scans or more and not on the map; on the map and none; there twice.
+        Heard in three scans or more and not on the map; on the map and none, or near none
+        (`map_motion`); there twice. If no row of a log has a label, all true landmarks count as
+        heard, and landmarks are matched by their positions.
     gospa_m, gospa_error_m, gospa_missed, gospa_false
-        Metric of the map against the landmarks that were heard in three scans or more, and parts.
+        Metric of the map against the landmarks that were heard, and its parts.
     nis_mean : float or None
         Normalised innovation squared per degree of freedom of what was used of placed landmarks:
         about 1 where the filter believes rightly. None where it does not say (`Innovations`).
@@ -136,7 +146,8 @@ class TrialResult:
     wall_s: float
     """Time that the estimate took."""
     mapped: Landmarks | None = None
-    """The map under the names of the true landmarks, where an association has labels of its own."""
+    """The map under the names of the true landmarks, where an association has labels of its own;
+    numbers below 0 name landmarks that stand for none."""
     online: PathScores | None = None
     """Scores of the path as it was believed at its time, where the filter revises it."""
     left_out: Mapping[str, Float[np.ndarray, " n"]] = field(default_factory=dict)
@@ -227,10 +238,18 @@ def _followed(
 
 
 def with_association(
-    scores: Scores, landmarks: Landmarks, found: Associated, truth: Truth
+    scores: Scores,
+    landmarks: Landmarks,
+    found: Associated,
+    truth: Truth,
+    motion: Float[np.ndarray, "3"] = STAY,
 ) -> Scores:
-    """Return scores with those of an association filled in; ``landmarks``: under its own labels."""
-    counts = map_counts(landmarks, found)
+    """Return scores with those of an association filled in; ``landmarks``: under its own labels.
+
+    Whether a landmark is near a true one is decided after `motion`.
+    """
+    away = out_of_place(landmarks, found, *truth.landmarks, motion) if truth.landmarks else ()
+    counts = map_counts(landmarks, found, away)
     scores = replace(
         scores,
         associated_right=found.right,
@@ -249,6 +268,25 @@ def with_association(
         gospa_error_m=metric.error,
         gospa_missed=metric.missed,
         gospa_false=metric.false,
+    )
+
+
+@np.errstate(over="ignore", invalid="ignore")
+def map_motion(track: Track, truth: Truth) -> Float[np.ndarray, "3"]:
+    """Return the rigid motion after which a map is compared with the true landmarks by position.
+
+    It is the alignment of the path, or none: that after which the map is nearer. No measurement
+    determines where the whole map lies, so a common shift and turn makes no landmark false.
+    """
+    if truth.landmarks is None or truth.path is None:
+        return STAY
+    points, true = track.pose.mean[:, :2], truth.path[:, :2]
+    known = np.isfinite(points).all(axis=1) & np.isfinite(true).all(axis=1)
+    if not known.any():
+        return STAY
+    motions = (STAY, alignment(points[known], true[known]))
+    return nearest_motion(
+        track.landmarks.mean[placed(track.landmarks)], truth.landmarks[1], motions
     )
 
 

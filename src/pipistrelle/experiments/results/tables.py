@@ -123,9 +123,15 @@ def _pose_columns(name: str, poses: Float[np.ndarray, "k 3"]) -> dict[str, np.nd
     return {f"{name.format(part)}_{unit}": poses[:, i] for i, (part, unit) in enumerate(units)}
 
 
-def landmark_table(landmarks: Landmarks, true_landmarks: LabelledPoints | None) -> "pl.DataFrame":
+def landmark_table(
+    landmarks: Landmarks,
+    true_landmarks: LabelledPoints | None,
+    mapped: Landmarks | None = None,
+) -> "pl.DataFrame":
     """Lay out a map, one row per hypothesis, with the true positions beside it.
 
+    ``landmark`` is the map's label and ``true_landmark`` that of the true landmark for which it
+    stands: the same number, or by `mapped`, the same rows under the names of the true landmarks.
     ``status`` is full, partial or, for a true landmark that is not in the map, unseen.
 
     Notes
@@ -155,22 +161,29 @@ def landmark_table(landmarks: Landmarks, true_landmarks: LabelledPoints | None) 
             "xx_m2": P[:, 0, 0],
             "xy_m2": P[:, 0, 1],
             "yy_m2": P[:, 1, 1],
+            "true_landmark": (mapped or landmarks).landmark.astype(np.int64),
         },
         schema_overrides={"status": pl.String},
     )
     labels, positions = true_landmarks or (np.empty(0, np.int64), np.empty((0, 2)))
     truth = pl.DataFrame(
         {
-            "landmark": labels.astype(np.int64),
+            "true_landmark": labels.astype(np.int64),
             "true_x_m": positions[:, 0],
             "true_y_m": positions[:, 1],
         }
     )
-    table = found.join(truth, on="landmark", how="full", coalesce=True, maintain_order="left_right")
-    across, along = pl.col("x_m") - pl.col("true_x_m"), pl.col("y_m") - pl.col("true_y_m")
-    return table.with_columns(
-        pl.col("status").fill_null("unseen"), error_m=(across**2 + along**2).sqrt()
+    table = found.join(
+        truth, on="true_landmark", how="full", coalesce=True, maintain_order="left_right"
     )
+    across, along = pl.col("x_m") - pl.col("true_x_m"), pl.col("y_m") - pl.col("true_y_m")
+    if mapped is None:
+        table = table.with_columns(pl.col("landmark").fill_null(pl.col("true_landmark")))
+    return table.with_columns(
+        pl.col("status").fill_null("unseen"),
+        error_m=(across**2 + along**2).sqrt(),
+        true_landmark=pl.when(pl.col("true_x_m").is_not_null()).then("true_landmark"),
+    ).select(pl.exclude("true_landmark"), "true_landmark")
 
 
 def measurement_table(scans: Sequence[Scan], callers: Sequence[str] = ()) -> "pl.DataFrame":

@@ -52,7 +52,8 @@ bearings counter-clockwise from the heading. S is the sensing strategy, F the fi
 {online}{callers}| truth.tum | true path at the same times, where it is known |
 | map_S_F.csv | final map with covariances; a partial landmark by its heaviest hypothesis |
 | steps.parquet | estimated and true poses, standard deviations, errors, NEES |
-| landmarks.parquet | every hypothesis of every landmark, beside the true positions |
+| landmarks.parquet | every hypothesis of every landmark, beside the true position of the landmark \
+that it stands for, true_landmark |
 | measurements.parquet | what each strategy measured; no range where it was passive; of echoes of \
 another's call the excess path, where it is known |
 | mission.* | pictures; mission.mcap, where asked for: tracks and maps as a ROS bag |
@@ -177,7 +178,8 @@ def tables_of(
     tables = {
         "steps": [named(step_table(t.track, truth.path), **names) for t, names in both],
         "landmarks": [
-            named(landmark_table(t.track.landmarks, truth.landmarks), **names) for t, names in both
+            named(landmark_table(t.track.landmarks, truth.landmarks, t.mapped), **names)
+            for t, names in both
         ],
         "measurements": [
             named(measurement_table(scans, callers), strategy=name) for name, scans in heard.items()
@@ -245,7 +247,7 @@ def calibration_of(track: Track) -> dict[str, float]:
 def _told(scores: Scores) -> dict[str, object]:
     """Return scores by name, without those of an association where there is none."""
     told = asdict(scores)
-    known = told["associated_right"] is None
+    known = all(told[name] is None for name in OF_ASSOCIATION)
     return {name: v for name, v in told.items() if not (known and name in OF_ASSOCIATION)}
 
 

@@ -22,7 +22,7 @@ from pipistrelle.estimation.association import KNOWN, Association
 from pipistrelle.estimation.beliefs import Belief, Landmarks, Track, at_steps
 from pipistrelle.estimation.catalogue import CATALOGUE, entry, short_name
 from pipistrelle.estimation.data_association.methods import association_of
-from pipistrelle.evaluation.association import Causes, associated, renamed
+from pipistrelle.evaluation.association import Causes, associated, matched, renamed
 from pipistrelle.experiments.cases import Case
 from pipistrelle.experiments.drives import Drive, at_sensor, at_vehicle, split_at
 from pipistrelle.experiments.hearing.listening import Keep, Progress, listen
@@ -33,6 +33,7 @@ from pipistrelle.experiments.named_settings import each_its_own
 from pipistrelle.experiments.results.scores import (
     Scores,
     TrialResult,
+    map_motion,
     position_floor,
     score,
     score_path,
@@ -174,8 +175,8 @@ def run_trial(
         Labels the rows of scans; that of the settings by default, where they have one. The noise of
         rows that it merges is the settings'. Its labels are not the truth's.
     causes : sequence of (m), optional
-        What caused the rows of each scan, to score an association by; without them the map is not
-        scored.
+        What caused the rows of each scan, to score an association by; without them the map is
+        matched with the true landmarks by position.
     progress, watch : callable, optional
 
     Returns
@@ -244,12 +245,16 @@ def _scored(
     truth = drive.truth
     if association is None:
         return score(track, truth, used, limit), None
-    if causes is None:
-        return score(track, replace(truth, landmarks=None), used, limit), None
-    found = associated(track.labels, causes, [*drive.moving])
+    motion = map_motion(track, truth)
+    if causes is not None:
+        found = associated(track.labels, causes, [*drive.moving])
+    elif truth.landmarks is not None:
+        found = matched(track.landmarks, *truth.landmarks, motion)
+    else:
+        return score(track, truth, used, limit), None
     mapped = renamed(track.landmarks, found)
     scores = score(replace(track, landmarks=mapped), truth, used, limit)
-    return with_association(scores, track.landmarks, found, truth), mapped
+    return with_association(scores, track.landmarks, found, truth, motion), mapped
 
 
 def with_moving(

@@ -81,7 +81,9 @@ if (mission.landmarks) {
   });
 }
 
+// Labels of an association that stand for no true landmark are below -1.
 const nameOf = (label) => {
+  if (label < -1) return `unmatched landmark ${-2 - label}`;
   const caller = mission.callers.find((one) => one.label === label && !one.moves);
   return caller ? `${caller.name} (landmark ${label})` : `landmark ${label}`;
 };

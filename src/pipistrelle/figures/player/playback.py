@@ -12,6 +12,7 @@ from jaxtyping import Float, Int
 
 from pipistrelle.acoustics.callers import moves
 from pipistrelle.config import InputError
+from pipistrelle.detection.scans import UNLABELLED
 from pipistrelle.estimation.beliefs import Landmarks, some_of
 from pipistrelle.experiments.drives import LabelledPoints
 from pipistrelle.experiments.results.scores import TrialResult
@@ -247,6 +248,10 @@ def _estimate(
     gone = [_gone(old, frame.landmarks) for old, frame in zip(before, shown, strict=True)]
     first = trial.track.online or trial.track.pose
     revised_at, revised = _revised(trial, frames, at, steps, origin)
+
+    def named(rows: Rows) -> Rows:
+        return replace(rows, landmark=_named(rows.landmark, trial))
+
     return Estimate(
         strategy=trial.strategy,
         filter=trial.filter,
@@ -254,16 +259,27 @@ def _estimate(
         start=_moved(first.mean[0], origin),
         pose=_moved(np.array([frame.pose for frame in shown]), origin),
         spread=covariance[:, (0, 0, 1, 2), (0, 1, 1, 2)],
-        heard=_heard(shown),
-        mapped=_mapped([frame.landmarks for frame in shown], origin),
-        pruned=_mapped(gone, origin),
+        heard=named(_heard(shown)),
+        mapped=named(_mapped([frame.landmarks for frame in shown], origin)),
+        pruned=named(_mapped(gone, origin)),
         cloud=_cloud(shown, origin),
         revised_at=revised_at,
         revised=revised,
         callers=_callers_believed(shown, origin) if callers_marked(trial.scans) else None,
-        excess_paths=_excess_paths(shown),
-        resolved=np.array(resolved(frames), dtype=int)[at],
+        excess_paths=named(_excess_paths(shown)),
+        resolved=_named(np.array(resolved(frames), dtype=int)[at], trial),
     )
+
+
+def _named(labels: Int[np.ndarray, " n"], trial: TrialResult) -> Int[np.ndarray, " n"]:
+    """Return labels as the true landmarks for which they stand; below -1 if they stand for none."""
+    if trial.mapped is None:
+        return labels
+    pairs = zip(
+        trial.track.landmarks.landmark.tolist(), trial.mapped.landmark.tolist(), strict=True
+    )
+    names = {UNLABELLED: UNLABELLED, **dict(pairs)}
+    return np.array([names.get(label, -2 - label) for label in labels.tolist()], dtype=int)
 
 
 def _rows(landmarks: Sequence[np.ndarray], numbers: Sequence[np.ndarray], columns: int) -> Rows:
