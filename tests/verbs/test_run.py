@@ -240,6 +240,44 @@ def test_what_was_heard_hangs_on_no_filter(obey, undrawn):
     assert other.measurements.equals(one)
 
 
+@pytest.mark.parametrize("method", ["known", "marginal"])
+def test_order_of_filters_changes_no_table_and_no_log(obey, undrawn, method):
+    words = ("--duration", "3", "--landmarks", "12", "--beamwidth", "90", "--quiet")
+    words += ("--association.method", method)
+    for name, filters in (("one", "ekf,iekf"), ("two", "iekf,ekf")):
+        obey("run", *words, "--filter", filters, "--save-log", f"log_{name}", "-o", name)
+    logs = [contents(f"log_{name}") for name in ("one", "two")]
+    assert logs[0] == logs[1]
+    by = ("strategy", "filter")
+    for kind in ("steps", "landmarks", "measurements"):
+        one, two = (pl.read_parquet(f"{name}/{kind}.parquet") for name in ("one", "two"))
+        assert one.sort(by, maintain_order=True).equals(two.sort(by, maintain_order=True))
+    assert one["true_landmark"].null_count() < one.height
+    for name in ("bearing", "range"):
+        unit = "rad" if name == "bearing" else "m"
+        there = one[f"{name}_{unit}"].is_not_null()
+        noise = one[f"{name}_std_{unit}"]
+        assert (noise.is_not_null() == there).all()
+        assert (noise.drop_nulls() > 0).all()
+    if method == "known":
+        assert {*one["filter"]} - {None} == {"ekf", "iekf"}
+        assert one["assigned"].null_count() == one.height
+        assert one["true_landmark"].equals(one["landmark"])
+    else:
+        assert (one["assigned"].drop_nulls() > 0).all()
+        assert one["landmark"].unique().to_list() == [-1]
+
+
+def test_measurements_of_a_log_have_the_label_assigned_beside_the_recorded(obey, undrawn):
+    obey("run", *SHORT, "--strategy", "fused", "--beamwidth", "90", "--save-log", "log", "-o", "1")
+    obey("slam", "log", "--association.method", "nearest", "--filter", "ekf", "-o", "2")
+    rows = pl.read_parquet("2/measurements.parquet")
+    assert rows["filter"].null_count() == rows.height
+    found = rows.drop_nulls("assigned").group_by("assigned").agg(pl.col("true_landmark").mode())
+    assert found.height > 0
+    assert {*rows["true_landmark"]} <= {*range(1, 12)}
+
+
 def test_a_saved_log_is_the_six_files_that_the_readme_promises(obey, undrawn):
     obey("run", *SHORT, "--save-log", "log", "-o", "one")
     tables = ("landmarks.csv", "measurements.csv", "odometry.csv", "truth.csv")

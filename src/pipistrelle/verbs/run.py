@@ -25,6 +25,7 @@ if TYPE_CHECKING:
     from pipistrelle.detection.logs.recording import Log, LogCaller
     from pipistrelle.detection.scans import Scan
     from pipistrelle.experiments.hearing.sound_recorder import SoundRecorder
+    from pipistrelle.experiments.results.scores import TrialResult
     from pipistrelle.experiments.runs.mission import Mission
 
 
@@ -97,8 +98,7 @@ def run(
             assert mission.scenario is not None
             world.replace(world_files(mission.scenario, config))
         if log is not None:
-            scans = {trial.strategy: trial.heard for trial in mission.trials}
-            log.replace(_log_files(mission, scans.get("fused", mission.trials[-1].heard)))
+            log.replace(_log_files(mission, _logged(mission)))
         if sound is not None:
             sound.own.replace(_sound_files(mission, sound))
 
@@ -184,7 +184,7 @@ def _sound_files(mission: "Mission", sound: "SoundRecorder") -> dict[str, Any]:
     from pipistrelle.detection.logs.folder import log_files
     from pipistrelle.experiments.runs.truth_files import truth_files
 
-    log = log_files(_log(mission, ()))
+    log = log_files(_log(mission, mission.trials[-1], ()))
     about = tomllib.loads(log["log.toml"])
     kept = {name: value for name, value in about.items() if name not in ("format", "callers")}
     assert mission.scenario is not None
@@ -193,23 +193,43 @@ def _sound_files(mission: "Mission", sound: "SoundRecorder") -> dict[str, Any]:
     return truth_files(mission.drive.truth) | {"odometry.csv": log["odometry.csv"]} | files | last
 
 
-def _log_files(mission: "Mission", scans: "Sequence[Scan]") -> dict[str, str]:
-    """Return what was heard as a log, and the truth beside it."""
+def _logged(mission: "Mission") -> "TrialResult":
+    """Return the trial whose measurements are logged, whatever the order of the filters.
+
+    It is fused, if that was sensed, and of filters whose settings differ one that takes known
+    labels, excess paths and the standard deviations of each row, as far as any does: a log without
+    these can be had of it, by settings of `slam`. Among equals the first name counts.
+    """
+    from pipistrelle.estimation.association import KNOWN
+
+    def rank(trial: "TrialResult") -> tuple[bool, bool, bool, str]:
+        own = own_config(mission.config, trial.filter)
+        bare = own.association.method != KNOWN
+        return bare, not own.listening.timing, own.filter.noise == "constant", trial.filter
+
+    strategies = [trial.strategy for trial in mission.trials]
+    chosen = "fused" if "fused" in strategies else strategies[-1]
+    return min((t for t in mission.trials if t.strategy == chosen), key=rank)
+
+
+def _log_files(mission: "Mission", trial: "TrialResult") -> dict[str, str]:
+    """Return the measurements of a trial as a log, and the truth beside it."""
     from pipistrelle.detection.logs.folder import log_files
     from pipistrelle.experiments.runs.truth_files import truth_files
 
-    return truth_files(mission.drive.truth) | log_files(_log(mission, scans))
+    log = _log(mission, trial, trial.heard)
+    return truth_files(mission.drive.truth) | log_files(log)
 
 
-def _log(mission: "Mission", scans: "Sequence[Scan]") -> "Log":
-    """Return a mission as its recorder would have seen it."""
+def _log(mission: "Mission", trial: "TrialResult", scans: "Sequence[Scan]") -> "Log":
+    """Return a mission as its recorder would have seen it, by the settings of a trial's filter."""
     import numpy as np
 
     from pipistrelle.detection.logs.recording import Log
     from pipistrelle.detection.noise import unstated
     from pipistrelle.experiments.drives import split_at
 
-    config = own_config(mission.config, mission.trials[-1].filter)  # of the scans that are kept
+    config = own_config(mission.config, trial.filter)
     drive, _ = split_at(mission.drive, [scan.time for scan in scans])
     timing = config.listening.timing
     if config.filter.noise == "constant":  # log.toml says it

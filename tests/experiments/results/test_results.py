@@ -314,8 +314,13 @@ def test_two_filters_of_one_strategy_share_their_measurements(tmp_path):
         "excess_path_m",
         "excess_path_std_m",
         "caller",
+        "bearing_std_rad",
+        "range_std_m",
+        "assigned",
+        "true_landmark",
     ]
-    assert measurements.columns == ["strategy", "time_s", *measured]
+    assert measurements.columns == ["strategy", "filter", "time_s", *measured]
+    assert measurements["filter"].null_count() == 6
     assert measurements["strategy"].to_list() == ["fused"] * 3 + ["active"] * 3
     assert measurements["range_m"].to_list() == [4.0, None, 2.0] * 2
 

@@ -22,6 +22,7 @@ from pipistrelle.evaluation.accuracy import (
 from pipistrelle.evaluation.association import (
     STAY,
     Associated,
+    Causes,
     gospa,
     map_counts,
     nearest_motion,
@@ -139,7 +140,8 @@ class TrialResult:
     """The estimator's name."""
     track: Track
     heard: tuple[Scan, ...]
-    """Scans of the strategy, one per frame, empty ones included; the same for every filter."""
+    """Scans of the strategy, one per frame, empty ones included; the same for every filter of the
+    same settings."""
     scans: tuple[Scan, ...]
     """The scans as the filter had them, perhaps without callers that move."""
     scores: Scores
@@ -152,6 +154,9 @@ class TrialResult:
     """Scores of the path as it was believed at its time, where the filter revises it."""
     left_out: Mapping[str, Float[np.ndarray, " n"]] = field(default_factory=dict)
     """Deviations of a log's rows that the association left out as too unsure, by its setting."""
+    causes: Causes | None = None
+    """The landmark that caused each row of `heard`, where an association labels the rows and the
+    truth is known."""
     error: str | None = None
     """The error with which the filter failed; its path is then NaN."""
 

@@ -9,11 +9,12 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
-from pipistrelle.detection.scans import OWN, Scan
+from pipistrelle.detection.scans import OWN, UNLABELLED, Scan
 from pipistrelle.estimation.beliefs import Gaussian, Landmarks, Track, placed
 from pipistrelle.evaluation.accuracy import heaviest, pose_error, position_error
+from pipistrelle.evaluation.association import Causes
 from pipistrelle.evaluation.consistency import track_nees
 from pipistrelle.experiments.drives import LabelledPoints
 
@@ -186,39 +187,58 @@ def landmark_table(
     ).select(pl.exclude("true_landmark"), "true_landmark")
 
 
-def measurement_table(scans: Sequence[Scan], callers: Sequence[str] = ()) -> "pl.DataFrame":
+def measurement_table(
+    scans: Sequence[Scan],
+    callers: Sequence[str] = (),
+    labels: Sequence[Int[np.ndarray, " m"]] = (),
+    causes: Causes | None = None,
+) -> "pl.DataFrame":
     """Lay out scans, one row per measurement; null is what was not measured.
 
     ``caller`` is the name of the caller whose echo it is, number 1 being the first name; it is null
-    for an echo of the vehicle's own call.
+    for an echo of the vehicle's own call. ``assigned`` is the label that an association gave the
+    row, one array of `labels` for each scan. ``true_landmark`` is the landmark that caused the row:
+    by `causes`, or else its recorded label.
 
     >>> from pipistrelle.detection.scans import make_scan
     >>> scan = make_scan(1.0, np.array([7]), np.array([0.5]))
     >>> measurement_table([scan]).rows()
-    [(1.0, 7, 0.5, None, None, None, None)]
+    [(1.0, 7, 0.5, None, None, None, None, None, None, None, 7)]
     """
     import polars as pl
 
-    def joined(parts: list[np.ndarray], dtype: type) -> np.ndarray:
+    def joined(parts: Sequence[np.ndarray], dtype: type) -> np.ndarray:
         return np.concatenate([np.empty(0, dtype), *parts]).astype(dtype)
 
+    recorded = joined([s.landmark for s in scans], np.int64)
+    true = recorded if causes is None else joined(causes, np.int64)
+    decided = joined(labels, np.int64) if labels else np.full(recorded.size, UNLABELLED)
     return pl.DataFrame(
         {
             "time_s": joined([np.full(len(s.landmark), s.time) for s in scans], np.float64),
-            "landmark": joined([s.landmark for s in scans], np.int64),
+            "landmark": recorded,
             "bearing_rad": joined([s.bearing for s in scans], np.float64),
             "range_m": joined([s.range for s in scans], np.float64),
             "excess_path_m": joined([s.excess_path for s in scans], np.float64),
             "excess_path_std_m": joined([s.excess_path_std for s in scans], np.float64),
             "caller": [_name(j, callers) for s in scans for j in s.caller.tolist()],
+            "bearing_std_rad": joined([s.bearing_std for s in scans], np.float64),
+            "range_std_m": joined([s.range_std for s in scans], np.float64),
+            "assigned": decided,
+            "true_landmark": true,
         },
         schema_overrides={"caller": pl.String},
     ).with_columns(
         pl.col("bearing_rad", "range_m", "excess_path_m").fill_nan(None),
-        # Noise is stated of every row, whether it has an excess path or not.
-        excess_path_std_m=pl.when(pl.col("excess_path_m").is_not_nan())
-        .then("excess_path_std_m")
-        .fill_nan(None),
+        pl.col("assigned", "true_landmark").replace(UNLABELLED, None),
+        # Noise is stated of every row, whether it has a bearing, a range or an excess path or not.
+        *(
+            pl.when(pl.col(f"{name}_{unit}").is_not_nan())
+            .then(f"{name}_std_{unit}")
+            .fill_nan(None)
+            .alias(f"{name}_std_{unit}")
+            for name, unit in (("bearing", "rad"), ("range", "m"), ("excess_path", "m"))
+        ),
     )
 
 

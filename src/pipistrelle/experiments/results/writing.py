@@ -7,7 +7,7 @@ import hashlib
 import io
 import json
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
 from types import MappingProxyType
@@ -55,7 +55,9 @@ bearings counter-clockwise from the heading. S is the sensing strategy, F the fi
 | landmarks.parquet | every hypothesis of every landmark, beside the true position of the landmark \
 that it stands for, true_landmark |
 | measurements.parquet | what each strategy measured; no range where it was passive; of echoes of \
-another's call the excess path, where it is known |
+another's call the excess path, where it is known. Where filters take different measurements, \
+filter names whose they are; assigned is the label that an association gave, true_landmark the \
+true one |
 | mission.* | pictures; mission.mcap, where asked for: tracks and maps as a ROS bag |
 | worlds/ | the world that was heard, where it was one of your own |
 | view.html | the mission frame by frame, once `pipistrelle view` on this folder has made it |
@@ -166,24 +168,33 @@ def tables_of(
 ) -> "dict[str, pl.DataFrame]":
     """Lay out ``steps``, ``landmarks`` and ``measurements`` of a mission, as their files hold them.
 
-    Trials of one strategy share their measurements.
+    Trials of one strategy share their measurements, with a null for the filter, unless settings or
+    associations of the filters make them differ: then each filter has its rows.
     """
     import polars as pl
 
-    def named(table: pl.DataFrame, **names: str) -> pl.DataFrame:
-        return table.select(*(pl.lit(name).alias(key) for key, name in names.items()), pl.all())
+    def named(table: pl.DataFrame, **names: str | None) -> pl.DataFrame:
+        words = (pl.lit(name, pl.String).alias(key) for key, name in names.items())
+        return table.select(*words, pl.all())
+
+    def measured(strategy: str) -> Iterator[pl.DataFrame]:
+        alike = [trial for trial in trials if trial.strategy == strategy]
+        parts = [measurement_table(t.heard, callers, t.track.labels, t.causes) for t in alike]
+        if all(part.equals(parts[0]) for part in parts):
+            yield named(parts[0], strategy=strategy, filter=None)
+        else:
+            for trial, part in zip(alike, parts, strict=True):
+                yield named(part, strategy=strategy, filter=trial.filter)
 
     both = [(trial, {"strategy": trial.strategy, "filter": trial.filter}) for trial in trials]
-    heard = {trial.strategy: trial.heard for trial in trials}
+    strategies = dict.fromkeys(trial.strategy for trial in trials)
     tables = {
         "steps": [named(step_table(t.track, truth.path), **names) for t, names in both],
         "landmarks": [
             named(landmark_table(t.track.landmarks, truth.landmarks, t.mapped), **names)
             for t, names in both
         ],
-        "measurements": [
-            named(measurement_table(scans, callers), strategy=name) for name, scans in heard.items()
-        ],
+        "measurements": [table for strategy in strategies for table in measured(strategy)],
     }
     return {name: pl.concat(parts) for name, parts in tables.items() if parts}
 

@@ -219,6 +219,7 @@ def run_trial(
         scans=tuple(used),
         scores=replace(scores, position_floor_m=position_floor(drive, used)),
         mapped=mapped,
+        causes=causes,
         wall_s=wall_s,
         online=None if track.online is None else score_path(track.online, drive.truth.path),
     )
