@@ -11,7 +11,9 @@ from contextlib import contextmanager, suppress
 
 from numba.core.event import Event, Listener, register
 
-COMPILING = "Compiling kernels (once; a minute or two) ..."
+COMPILING = (
+    "Compiling the kernels of this kind of task, kept for the next time (a minute or two) ..."
+)
 _COMPILE, _LOCK = "numba:compile", "numba:compiler_lock"
 """Numba tells when it compiles, and when it compiles or loads."""
 

@@ -1,11 +1,15 @@
 """The figure of a comparison: what of it is drawn, where, and that nothing breaks it."""
 
+import re
+from dataclasses import replace
+from itertools import combinations
+
 import numpy as np
 import pytest
 from matplotlib import pyplot
 
 from pipistrelle.config import Config
-from pipistrelle.evaluation.scores import SCORES, heading
+from pipistrelle.evaluation.scores import SCORES, heading, shown_in
 from pipistrelle.experiments.comparing.missions import compare_missions
 from pipistrelle.experiments.comparing.studies import compare_studies
 from pipistrelle.experiments.drives import NO_TRUTH, Truth
@@ -118,7 +122,8 @@ def test_a_path_that_is_lost_or_far_away_leaves_the_others_to_be_seen(tmp_path):
 def test_studies_have_a_panel_for_each_score_and_a_line_for_each_case(tmp_path):
     compared = studies_of(tmp_path, 1.0, 2.0)
     figure = draw_comparison(compared)
-    assert [axes.get_title("left") for axes in figure.axes] == [
+    titles = [re.sub(r"\s", " ", axes.get_title("left")) for axes in figure.axes]
+    assert titles == [
         heading(SCORES[name])
         for name in (
             "position_rmse_m",
@@ -135,6 +140,22 @@ def test_studies_have_a_panel_for_each_score_and_a_line_for_each_case(tmp_path):
     assert [line.get_ydata().item() for line in points] == [0.0, 1.0, 2.0]
     assert all(line.get_mfc() == RUNS[1] for line in points), "all are significant"
     assert legend(figure)[0].startswith("A  ")
+
+
+def test_titles_of_panels_do_not_overlap_however_many_scores_there_are(tmp_path):
+    compared = studies_of(tmp_path, 1.0, 2.0)
+    cases = [
+        replace(case, score=name)
+        for name in shown_in("studies")
+        for case in compared.cases
+        if case.score == "position_rmse_m"
+    ]
+    figure = draw_comparison(replace(compared, cases=tuple(cases)))
+    figure.draw_without_rendering()
+    boxes = [axes._left_title.get_window_extent() for axes in figure.axes]
+    assert len(boxes) == len(shown_in("studies"))
+    assert not any(one.overlaps(other) for one, other in combinations(boxes, 2))
+    assert all(figure.bbox.x0 <= box.x0 and box.x1 <= figure.bbox.x1 for box in boxes)
 
 
 def test_a_difference_that_is_not_sure_is_hollow_and_one_without_an_interval_has_none(tmp_path):

@@ -2,8 +2,13 @@
 
 import re
 import sys
+from itertools import product
 
 import numpy as np
+
+from pipistrelle.config import Config
+from pipistrelle.estimation.data_association.methods import METHODS
+from pipistrelle.experiments.runs import compiling
 
 
 def test_the_doctor_names_versions_and_folders_and_what_to_mend(obey, monkeypatch):
@@ -36,3 +41,16 @@ def test_the_doctor_names_the_extra_that_brings_a_library(obey, monkeypatch):
     assert f"numpy             {np.__version__} (extra one)\n" in printed
     missing = "not found (extra two-b); python -m pip install 'pipistrelle[two-b]'"
     assert f"nosuchthing       {missing}\n" in printed
+
+
+def test_doctor_compiles_the_kernels_of_all_estimators_if_asked(obey, monkeypatch):
+    asked = []
+    monkeypatch.setattr(compiling, "run_mission", lambda config, *_: asked.append(config))
+    monkeypatch.setattr(compiling, "run_trials", lambda names, *_: asked.append(names))
+    assert "kernels" not in obey("doctor")[1].replace("kernel cache", "")
+    assert asked == []
+    status, printed, said = obey("doctor", "--compile")
+    assert (status, said) == (0, "")
+    assert "compiled or loaded" in printed.splitlines()[-1]
+    methods = {(c.association.method, c.listening.timing) for c in asked if isinstance(c, Config)}
+    assert methods == {*product(("known", *METHODS), (False, True))}

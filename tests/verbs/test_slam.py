@@ -619,3 +619,12 @@ def test_log_without_labels_is_scored_by_the_positions_of_its_landmarks(obey, un
     shown = pipistrelle.slam("log", association__method="marginal", strategies="active").summary
     assert shown["map_rmse_m"].to_list() == [run["map_rmse_m"]]
     assert shown["gospa_m"].to_list() == [run["gospa_m"]]
+
+
+def test_log_that_is_solved_whole_is_headed_all_rows(obey, undrawn):
+    log = Path(__file__).parents[1] / "data" / "unicycle_log"
+    _, printed, _ = obey("slam", str(log), "--filter", "ekf", "-o", "one")
+    assert printed.splitlines()[0].strip() == "all rows"
+    assert Path("one/track_fused_ekf.tum").exists(), "files keep the strategy's name"
+    _, printed, _ = obey("slam", str(log), "--filter", "ekf", "--strategy", "all", "-o", "two")
+    assert printed.splitlines()[0].split() == ["active", "fused", "passive"]

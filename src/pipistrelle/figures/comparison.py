@@ -1,6 +1,7 @@
 """Results side by side: paths of several runs in one map, differences of studies by case."""
 
 from collections.abc import Sequence
+from textwrap import fill
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -23,6 +24,8 @@ RUNS = ("#0b6e69", "#c8501e", "#6a3fa0", "#7d8a12", "#b03a7a", "#2f6db3")
 DASHES: tuple[Any, ...] = ("-", (0, (5, 2)), (0, (1.2, 1.4)), (0, (6, 2, 1.2, 2)))
 WIDTH, ROW, REST = 12.0, 3.7, 0.75
 """Of a figure of paths [inch]: its width, the height of an estimate, and what is left for words."""
+ACROSS, TITLE = 4, 22
+"""Of a figure of studies: most panels side by side, and most letters in a line of their titles."""
 SIGNIFICANCE = 0.05
 """A point is full where p is below, as one of all cases."""
 
@@ -172,25 +175,30 @@ def _draw_studies(compared: ComparedStudies) -> "Figure":
     first = compared.cases[0]
     labels = [c.label for c in compared.cases if (c.score, c.other) == (first.score, first.other)]
     others = len(compared.folders) - 1
-    height = max(2.0, (0.1 + 0.12 * others) * len(labels)) + 1.4
-    figure = Figure(figsize=(WIDTH, height), layout="constrained")
     there = {case.score for case in compared.cases}
     shown = {name: score for name, score in shown_in("studies").items() if name in there}
-    panels = figure.subplots(1, len(shown), sharey=True, squeeze=False)[0]
+    rows = -(-len(shown) // ACROSS)
+    height = max(2.0, (0.1 + 0.12 * others) * len(labels)) + 0.9
+    figure = Figure(figsize=(WIDTH, rows * height + 0.5), layout="constrained")
+    grid = figure.subplots(rows, min(ACROSS, len(shown)), sharey=True, squeeze=False)
+    panels, empty = grid.flat[: len(shown)], grid.flat[len(shown) :]
+    for axes in empty:
+        axes.remove()
     for axes, (name, score) in zip(panels, shown.items(), strict=True):
         of_score = [case for case in compared.cases if case.score == name]
         axes.axvline(0.0, color=INK, lw=0.8, zorder=1)
         for k, case in enumerate(of_score):
             place = k // others + (case.other - 1 - 0.5 * (others - 1)) * 0.6 / others
             _draw_case(axes, case, place)
-        axes.set_title(heading(score), loc="left", weight="bold")
+        title = heading(score).replace(" [", "\u00a0[")  # no line begins with the unit
+        axes.set_title(fill(title, TITLE), loc="left", weight="bold")
         axes.set_xlabel("other less A" if others > 1 else "B less A")
         axes.xaxis.set_major_locator(MaxNLocator(4))
         axes.grid(True, axis="x")
         axes.set_axisbelow(True)
     panels[0].set_yticks(range(len(labels)), labels)
     panels[0].set_ylim(len(labels) - 0.5, -0.5)
-    for text in panels[0].get_yticklabels():
+    for text in (text for axes in grid[:, 0] for text in axes.get_yticklabels()):
         text.set_parse_math(False)
     _name_studies(figure, compared)
     return figure

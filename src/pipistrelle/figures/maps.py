@@ -171,10 +171,11 @@ def cells(cases: Sequence[tuple[str, str]]) -> list[tuple[int, int]]:
     return [divmod(i, MAX_COLUMNS) for i in range(len(cases))]
 
 
-def head(axes: "Axes", strategy: str, estimator: str) -> "Annotation":
+def head(axes: "Axes", strategy: str, estimator: str, name: str = "") -> "Annotation":
     """Write a panel's name above it, and leave a line below the name for what is to be said.
 
-    `estimator`: the filter. Returns: the line below, still empty.
+    `estimator`: the filter; `name`: that of the strategy, where it has another. Returns: the
+    line below, still empty.
 
     Examples
     --------
@@ -185,8 +186,8 @@ def head(axes: "Axes", strategy: str, estimator: str) -> "Annotation":
     above: dict[str, Any] = {"xy": (0, 1), "xycoords": "axes fraction"}
     above["textcoords"] = "offset points"
     style = {"color": strategy_colour(strategy), "fontsize": 13, "weight": "bold"}
-    name = axes.annotate(strategy, xytext=(0, 21), **style, **above)
-    beside = above | {"xy": (1, 0), "xycoords": name, "va": "bottom"}
+    first = axes.annotate(name or strategy, xytext=(0, 21), **style, **above)
+    beside = above | {"xy": (1, 0), "xycoords": first, "va": "bottom"}
     axes.annotate(title_of(estimator), xytext=(6, 0), fontsize=13, **beside)
     return axes.annotate("", xytext=(0, 7), fontsize=9.5, **above)
 

@@ -1,6 +1,7 @@
 """One mission at a glance: what each strategy made of the same world, and how far it was off."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from types import MappingProxyType
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -50,6 +51,7 @@ def draw_mission(
     truth: Truth = NO_TRUTH,
     callers: Sequence[Caller] = (),
     beamwidth: float | None = None,
+    names: Mapping[str, str] = MappingProxyType({}),
 ) -> "Figure":
     """Draw the final maps of one world side by side, and below each its errors over time.
 
@@ -67,7 +69,8 @@ def draw_mission(
     a path there are no errors to show. Callers may be among the landmarks. `callers`: without the
     vehicle: a star where one stands, by its name where it is not the one beacon, a line where one
     moves. `beamwidth` [rad]: of the vehicle's call, for the strategies that use it; without it no
-    beam is drawn. Returns: not known to pyplot: it is freed when it is let go. Raises ValueError:
+    beam is drawn. `names`: headings for strategies that have others than their names.
+    Returns: not known to pyplot: it is freed when it is let go. Raises ValueError:
     without trials.
 
     Bradley & Abaid, Eqs. (23) and (26), over the time of one run.
@@ -86,9 +89,9 @@ def draw_mission(
     maps = [trial.track.landmarks for trial in trials]
     limits = view(truth, callers, paths, maps)
     places = cells([(trial.strategy, trial.filter) for trial in trials])
-    names = _symbols(trials, truth, callers, beamwidth)
+    symbols = _symbols(trials, truth, callers, beamwidth)
     with matplotlib.rc_context(STYLE):
-        figure, panels = _panels(places, limits, len(names), errors=truth.path is not None)
+        figure, panels = _panels(places, limits, len(symbols), errors=truth.path is not None)
         for trial, (axes, *rows) in zip(trials, panels, strict=True):
             draw_truth(axes, truth.landmarks, callers)
             if truth.path is not None:
@@ -96,11 +99,12 @@ def draw_mission(
                 _draw_errors(rows, trial, truth.path)
             _draw_estimate(axes, trial, truth.landmarks)
             _draw_vehicle(axes, trial, beamwidth)
-            _title(axes, trial, truth)
+            name = names.get(trial.strategy, trial.strategy)
+            head(axes, trial.strategy, trial.filter, name).set_text(outcome(trial, truth))
         _draw_clouds([axes for axes, *_ in panels], trials, truth)
         if truth.path is not None:
             _scale_errors([rows for _, *rows in panels])
-        legend(figure, names, 4 if figure.get_figwidth() > 8.0 else 2, LEFT, RIGHT)
+        legend(figure, symbols, 4 if figure.get_figwidth() > 8.0 else 2, LEFT, RIGHT)
     return figure
 
 
@@ -316,11 +320,6 @@ def _draw_clouds(maps: Sequence["Axes"], trials: Sequence[TrialResult], truth: T
     for closeup, cloud, path in zip(closeups, clouds, paths, strict=True):
         if closeup:
             closeup.show(cloud[0], path, truth.path)
-
-
-def _title(axes: "Axes", trial: TrialResult, truth: Truth) -> None:
-    """Write the panel's title and its scores."""
-    head(axes, trial.strategy, trial.filter).set_text(outcome(trial, truth))
 
 
 def outcome(trial: TrialResult, truth: Truth) -> str:

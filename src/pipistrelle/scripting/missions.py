@@ -148,6 +148,12 @@ def failures(mission: Mission) -> list[str]:
     ]
 
 
+def strategy_names(mission: Mission) -> dict[str, str]:
+    """Return headings for strategies: a log that is solved by fused sensing only gives all rows."""
+    alone = mission.log is not None and {trial.strategy for trial in mission.trials} == {"fused"}
+    return {"fused": "all rows"} if alone else {}
+
+
 def drawn(mission: Mission) -> "Figure":
     """Draw the maps and errors of a mission."""
     from pipistrelle.figures.mission import draw_mission
@@ -157,6 +163,7 @@ def drawn(mission: Mission) -> "Figure":
         truth=mission.drive.truth,
         callers=mission.callers,
         beamwidth=mission.beamwidth,
+        names=strategy_names(mission),
     )
 
 

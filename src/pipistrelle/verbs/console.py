@@ -1,7 +1,7 @@
 """Progress and tables for the terminal; results go to standard output."""
 
 import sys
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from threading import Timer
 from typing import TYPE_CHECKING
@@ -115,19 +115,23 @@ def _rate(frames: int, elapsed: float) -> str:
 
 
 def closing_table(
-    trials: "Sequence[TrialResult]", there: int | None = None, driven: float | None = None
+    trials: "Sequence[TrialResult]",
+    there: int | None = None,
+    driven: float | None = None,
+    names: "Mapping[str, str] | None" = None,
 ) -> str:
     """Lay out the scores of a mission, a column per estimate; rows without any number are left out.
 
     Six columns fit into 100 characters. Of particles, landmarks are those of the heaviest particle.
     Under the table stands what a bound says, and the NIS, where there is one. `driven` is the way
-    by the odometry [m].
+    by the odometry [m]. `names` has headings for strategies that have others than their names.
     """
     from pipistrelle.evaluation.bound import IN_ONE_WORLD
 
     columns = [dict(_cells(trial, there, driven)) for trial in trials]
     filters = [short_name(trial.filter) for trial in trials]
-    lines = [("", *(trial.strategy for trial in trials)), ("", *filters)]
+    heads = [(names or {}).get(trial.strategy, trial.strategy) for trial in trials]
+    lines = [("", *heads), ("", *filters)]
     width = max(11, 1 + max(map(len, filters)))
     for title in dict.fromkeys(title for column in columns for title in column):
         cells = [column.get(title, "") for column in columns]

@@ -14,7 +14,7 @@ from pipistrelle.experiments.runs.mission import Mission
 from pipistrelle.files import spelt
 from pipistrelle.own_files import OwnFiles
 from pipistrelle.scripting.log_settings import distance_driven
-from pipistrelle.scripting.missions import Conduct, failures, filmed, keep
+from pipistrelle.scripting.missions import Conduct, failures, filmed, keep, strategy_names
 from pipistrelle.verbs.console import announced, closing_table, progress
 from pipistrelle.verbs.options import OutputOptions
 from pipistrelle.verbs.streams import put, say, warn
@@ -104,7 +104,8 @@ def deliver(
     if not options.quiet:
         landmarks, log = mission.drive.truth.landmarks, mission.log
         there = None if landmarks is None else len(landmarks[0])
-        put(closing_table(mission.trials, there, None if log is None else distance_driven(log)))
+        driven = None if log is None else distance_driven(log)
+        put(closing_table(mission.trials, there, driven, strategy_names(mission)))
     failed = failures(mission)
     warn(*failed)
     put(own.folder)

@@ -4,18 +4,42 @@ import os
 import re
 import shutil
 import sys
+import time
 from collections.abc import Iterator
 from importlib.metadata import PackageNotFoundError, requires, version
 from pathlib import Path
+from typing import Annotated
+
+from cyclopts import Parameter
 
 import pipistrelle
 from pipistrelle.verbs.streams import put
 
 
-def doctor() -> None:
+def doctor(
+    *,
+    compile_kernels: Annotated[
+        bool,
+        Parameter(
+            name="--compile",
+            negative=(),
+            help="Compile the kernels of all estimators, with and without labels, so that no later "
+            "run, slam or study waits for them; some minutes.",
+        ),
+    ] = False,
+) -> None:
     """Print versions, folders and tools, one line each, with the fix of each problem."""
     for name, state in _findings():
         put(f"{name:<18}{state}")
+    if compile_kernels:
+        from pipistrelle.experiments.runs.compiling import compile_all
+        from pipistrelle.kernel_clock import announce, cpu_s
+
+        announce(None)
+        began, worked = time.thread_time(), cpu_s()
+        compile_all()
+        took = time.thread_time() - began - (cpu_s() - worked)
+        put(f"{'kernels':<18}compiled or loaded, in {took:.0f} s of processor time")
 
 
 def _findings() -> Iterator[tuple[str, str]]:

@@ -153,7 +153,7 @@ class OutputOptions:
     )
     animate: Annotated[
         Literal["gif", "mp4"] | None,
-        Parameter(help="Film the mission; gif unless said otherwise. [default: no]"),
+        Parameter(help="Film the mission; --animate without a value makes a gif. [default: no]"),
     ] = None
     save_bag: Annotated[
         bool, Parameter(negative=(), help="Write tracks and maps as a ROS bag, too: mission.mcap.")
@@ -187,7 +187,10 @@ class MissionOptions:
     ] = None
     engine: Annotated[
         Literal["auto", "block", "dense"] | None,
-        Parameter(help="Receiver: fast or literal; sets receiver.engine. [default: auto]"),
+        Parameter(
+            help="How samples are computed: block (exact sums over blocks, fast), dense (every "
+            "sample, slow) or auto (block where it applies); sets receiver.engine. [default: auto]"
+        ),
     ] = None
     particles: Particles = None
     world: Annotated[

@@ -5,12 +5,21 @@ import sys
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
+from itertools import product
 
 import numpy as np
 
-from pipistrelle.config import STRATEGIES, Config, ListeningConfig, ScenarioConfig
+from pipistrelle.config import (
+    STRATEGIES,
+    AssociationConfig,
+    Config,
+    ListeningConfig,
+    ScenarioConfig,
+)
 from pipistrelle.detection.scans import OWN, UNLABELLED, Scan, make_scan
+from pipistrelle.estimation.association import KNOWN
 from pipistrelle.estimation.catalogue import CATALOGUE
+from pipistrelle.estimation.data_association.methods import METHODS
 from pipistrelle.experiments.drives import Drive
 from pipistrelle.experiments.machine import cores
 from pipistrelle.experiments.named_settings import each_its_own
@@ -32,19 +41,29 @@ smoother's border, whose kernels are then compiled, too."""
 
 
 def compile_kernels(
-    filters: Iterable[str] = CATALOGUE, timings: Iterable[bool] = (False, True)
+    filters: Iterable[str] = CATALOGUE,
+    timings: Iterable[bool] = (False, True),
+    associations: Iterable[str] = (KNOWN,),
 ) -> None:
     """Compile kernels, or load them from the cache, by missions of two frames.
 
-    The timings are the values of ``listening.timing``. Filters that are not of the catalogue
-    are left out: their kernels are compiled when they are needed.
+    The timings are the values of ``listening.timing``, the associations of ``association.method``.
+    Filters that are not of the catalogue are left out: their kernels are compiled when they are
+    needed.
     """
     there = [name for name in filters if name in CATALOGUE]
     tiny = ScenarioConfig(steps=8, landmarks=4, radius=10.0)
-    for timing in timings:
-        run_mission(
-            Config(scenario=tiny, listening=ListeningConfig(timing=timing)), STRATEGIES, there
-        )
+    for timing, method in product(timings, associations):
+        listening, association = ListeningConfig(timing=timing), AssociationConfig(method=method)
+        config = Config(scenario=tiny, listening=listening, association=association)
+        run_mission(config, STRATEGIES, there)
+
+
+def compile_all() -> None:
+    """Compile the kernels of all estimators, with and without labels, or load them."""
+    compile_kernels(associations=(KNOWN, *METHODS))
+    for timing in (False, True):
+        compile_filters(Config(listening=ListeningConfig(timing=timing)), CATALOGUE)
 
 
 @contextmanager
