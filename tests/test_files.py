@@ -12,6 +12,7 @@ from pipistrelle.files import (
     read_file,
     read_text,
     spelt,
+    upright,
     whole_name,
     write_down,
     write_whole,
@@ -123,3 +124,10 @@ def test_names_are_spelt_whatever_they_are_made_of():
     assert spelt(Path("a b [1] µ")) == "a b [1] µ"
     assert spelt(Path("a\nb")) == "a\\nb"
     assert spelt(Path("a\udcff")) == "a\\xff"
+
+
+def test_characters_that_turn_the_direction_of_writing_are_escaped_and_no_others():
+    turning = [*"\u202a\u202b\u202c\u202d\u202e", *"\u2066\u2067\u2068\u2069"]
+    assert "".join(map(upright, turning)).isascii()
+    plain = "µ · 95 %\n\tשלום سلام \u200d\u00a0<b>"
+    assert upright(plain) == plain

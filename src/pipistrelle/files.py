@@ -9,11 +9,14 @@ import os
 import re
 from hashlib import file_digest, sha256
 from pathlib import Path
+from unicodedata import bidirectional
 from uuid import uuid4
 
 from pipistrelle.config import InputError
 from pipistrelle.refusals import refusal, shown
 
+_TURNS = {"LRE", "RLE", "LRO", "RLO", "PDF", "LRI", "RLI", "FSI", "PDI"}
+"""Classes of characters that embed, override or isolate a direction of writing."""
 _PARTIAL = re.compile(r"(.+)\.[0-9a-f]{8}\.partial")
 
 
@@ -84,6 +87,17 @@ def spelt(name: str | Path) -> str:
     ('one [2]', 'a\\n', 'b\\u202e')
     """
     return "".join(c if c.isprintable() else repr(c)[1:-1] for c in text_of(name))
+
+
+def upright(text: str) -> str:
+    r"""Return text in which characters that change the direction of writing are escaped.
+
+    A name that holds one would show the rest of its line in another order.
+
+    >>> upright("log" + chr(0x202E) + "gol")
+    'log\\u202egol'
+    """
+    return "".join(repr(c)[1:-1] if bidirectional(c) in _TURNS else c for c in text)
 
 
 def partial_of(path: Path) -> Path:

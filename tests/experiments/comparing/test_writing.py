@@ -1,6 +1,8 @@
 """A comparison as files."""
 
+import re
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import polars as pl
@@ -110,7 +112,7 @@ def test_a_comparison_is_written_with_its_sums_and_says_what_it_is(kind, request
     assert pl.read_parquet(folder / "comparison.parquet").equals(table)
     assert pl.read_csv(folder / "comparison.csv").height == table.height
     readme = (folder / "README.md").read_text()
-    for part in ("pipistrelle compare one", "- A note.", f"- A: {spelt(compared.folders[0])}"):
+    for part in ("pipistrelle compare one", "- A note.", f"- A: `{spelt(compared.folders[0])}`"):
         assert part in readme
 
 
@@ -124,3 +126,14 @@ def test_what_a_user_changed_in_an_earlier_comparison_is_not_replaced(missions, 
         write_comparison(OwnFiles(folder, COMPARISON), missions, **given)
     assert (folder / "comparison.csv").read_text() == "mine"
     assert (folder / "README.md").exists()
+
+
+@pytest.mark.parametrize("name", ["<script>", "a`b``c", "`"])
+def test_readme_shows_a_folder_name_as_code_in_which_nothing_is_markup(missions, tmp_path, name):
+    compared = replace(missions, folders=(Path(name), *missions.folders[1:]))
+    folder = tmp_path / "out"
+    write_comparison(OwnFiles(folder, COMPARISON), compared, command="", notes=())
+    (line,) = [one for one in (folder / "README.md").read_text().split("\n") if "- A: " in one]
+    ticks, text = re.fullmatch(r"- A: (`+) ?(.+?) ?\1", line).groups()
+    assert text == name
+    assert ticks not in name

@@ -3,6 +3,7 @@
 import io
 import json
 import math
+import re
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -75,7 +76,7 @@ def write_comparison(
         command=command,
         version=__version__,
         first=LETTERS[0],
-        folders="\n".join(f"- {x}: {spelt(f)}" for x, f in lettered(compared.folders)),
+        folders="\n".join(f"- {x}: {_quoted(spelt(f))}" for x, f in lettered(compared.folders)),
         notes="\n".join(f"- {note}" for note in notes),
         table=what,
         figure=figure,
@@ -89,6 +90,13 @@ def write_comparison(
             "README.md": text,
         }
     )
+
+
+def _quoted(text: str) -> str:
+    """Write text as code of Markdown, in which nothing is markup."""
+    ticks = "`" * (1 + max(map(len, re.findall("`+", text)), default=0))
+    pad = " " if "`" in text else ""
+    return f"{ticks}{pad}{text}{pad}{ticks}"
 
 
 def lettered(folders: Sequence[Path]) -> list[tuple[str, Path]]:

@@ -17,6 +17,7 @@ from pipistrelle.estimation.catalogue import title_of
 from pipistrelle.figures.outlines import PLACED, RAY
 from pipistrelle.figures.player.playback import POSE_STDS, Estimate, Playback, Rows
 from pipistrelle.figures.style import STRATEGY_COLOURS, page_colours
+from pipistrelle.files import upright
 
 SCRIPTS = ("numbers.js", "drawing.js", "map.js", "charts.js", "player.js")
 """In the order in which they are joined."""
@@ -35,7 +36,7 @@ def page(playback: Playback) -> str:
     )
     template = environment.from_string((here / "page.html").read_text(encoding="utf-8"))
     script = "".join((here / name).read_text(encoding="utf-8") for name in SCRIPTS)
-    return template.render(
+    text = template.render(
         title=playback.title,
         excess_paths=any(len(estimate.excess_paths.landmark) for estimate in playback.estimates),
         facts=playback.facts,
@@ -45,6 +46,7 @@ def page(playback: Playback) -> str:
         script=Markup(script),
         numbers=Markup(_json(_numbers(playback))),
     )
+    return upright(text)
 
 
 def _numbers(playback: Playback) -> dict[str, Any]:
@@ -60,7 +62,12 @@ def _numbers(playback: Playback) -> dict[str, Any]:
         if landmarks is None
         else {"label": _packed(landmarks[0]), "place": _packed(landmarks[1])},
         "callers": [
-            {"label": label, "name": name, "moves": place.ndim == 2, "place": _packed(place)}
+            {
+                "label": label,
+                "name": upright(name),
+                "moves": place.ndim == 2,
+                "place": _packed(place),
+            }
             for label, name, place in playback.callers
         ],
         "beamwidth": playback.beamwidth,
@@ -85,7 +92,7 @@ def _estimate(estimate: Estimate) -> dict[str, Any]:
         "name": _name(estimate),
         "role": estimate.strategy if known else "ink",
         "calls": estimate.strategy != "passive",
-        "outcome": estimate.outcome,
+        "outcome": upright(estimate.outcome),
         "start": _packed(estimate.start),
         "pose": _packed(estimate.pose),
         "spread": _packed(estimate.spread),

@@ -17,6 +17,7 @@ from pipistrelle.evaluation.comparison import INTERVALS, Finding
 from pipistrelle.evaluation.scores import shown_in
 from pipistrelle.figures.chart import Chart, Panel, columns_of, csv_rows, csv_text
 from pipistrelle.figures.style import page_colours
+from pipistrelle.files import upright
 from pipistrelle.own_files import REPORT, claim, drawn_files
 from pipistrelle.report.charts.results import Figure, answers, study_charts
 from pipistrelle.report.charts.setting import model_charts
@@ -96,7 +97,7 @@ def page(
     """
     here, study = files("pipistrelle.report.page"), result.study
     figures = [_figure(chart.name, found) for chart in _distinct(found)]
-    return _template().render(
+    text = _template().render(
         study=study,
         papers=result.papers,
         headline=result.rule,
@@ -129,6 +130,7 @@ def page(
         consistency=overview.by_strategy(numbers["consistency"]),
         config=to_toml(study.config),
     )
+    return upright(text)
 
 
 def _template() -> "Template":
