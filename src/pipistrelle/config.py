@@ -684,6 +684,9 @@ class FastSlamConfig(Section):
     """Bearings shared among a ray's members (the paper's) or an exact Gaussian mixture."""
     weights: Literal["marginal", "sampled"] = "marginal"
     """Weigh by the likelihood before the sample, or at it by prior x likelihood / proposal."""
+    estimate: Literal["mixture", "heaviest", "separate"] = "separate"
+    """Pose and map are the moments of all particles, those of the heaviest particle, or the pose of
+    all and the map of the heaviest."""
     resampled_rays: Literal["kept", "restart"] = "kept"
     """Whether rays keep their members' weights at a resampling, or restart with equal ones."""
 

@@ -56,9 +56,10 @@ class Assignment:
 class Association(Protocol[M]):
     """A stage that decides which landmark each row of a scan is of; a frozen record of settings.
 
-    Two methods are optional. ``informed(memory, news)`` returns an earlier memory with what has
-    become known (`Assignment.again`). ``tentative(memory)`` returns the labels of landmarks that
-    may be none, and are left out of the map.
+    Three methods are optional. ``informed(memory, news)`` returns an earlier memory with what has
+    become known (`Assignment.again`). ``knowing(memory, known, callers)`` returns a first memory
+    with the landmarks and callers that are on the map beforehand. ``tentative(memory)`` returns the
+    labels of landmarks that may be none, and are left out of the map.
     """
 
     def start(self) -> M:

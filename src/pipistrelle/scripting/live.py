@@ -179,7 +179,8 @@ class Slam:
         pose = self._at_vehicle(self._session.belief.pose())
         values, axes = np.linalg.eigh(pose.covariance)
         covariance = pose.covariance if values[0] >= 0.0 else (axes * values.clip(0.0)) @ axes.T
-        return Pose(self._time, *pose.mean.tolist(), covariance.copy())
+        x, y, heading = pose.mean.tolist()
+        return Pose(self._time, x, y, heading, covariance.copy())
 
     @property
     def map(self) -> "pl.DataFrame":

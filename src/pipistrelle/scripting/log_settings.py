@@ -24,6 +24,7 @@ OWN: dict[Key, str] = {
     GATE_KEY: "auto",
     ("rays", "spacing"): "auto",
     ("filter", "noise"): "measured",
+    ("fastslam", "estimate"): "mixture",
 }
 """Defaults of a recorded log that differ from those of a simulated mission."""
 TIMING: Key = ("listening", "timing")

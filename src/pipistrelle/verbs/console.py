@@ -122,7 +122,7 @@ def closing_table(
 ) -> str:
     """Lay out the scores of a mission, a column per estimate; rows without any number are left out.
 
-    Six columns fit into 100 characters. Of particles, landmarks are those of the heaviest particle.
+    Six columns fit into 100 characters.
     Under the table stands what a bound says, and the NIS, where there is one. `driven` is the way
     by the odometry [m]. `names` has headings for strategies that have others than their names.
     """

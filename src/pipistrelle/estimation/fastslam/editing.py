@@ -1,18 +1,84 @@
-"""Landmarks of all particles: as one Gaussian, taken out, and two that become one."""
+"""Landmarks of all particles: their moments, taken out, and two that become one."""
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from pipistrelle.config import InputError
-from pipistrelle.estimation.beliefs import JointGaussian
+from pipistrelle.estimation.beliefs import JointGaussian, Landmarks
 from pipistrelle.estimation.fastslam.block import LANES
 from pipistrelle.geometry import wrap
 
 if TYPE_CHECKING:
     from pipistrelle.estimation.fastslam.filter import FastSlamBelief
+
+
+class _Placed(NamedTuple):
+    """Landmarks that most particles have placed, by p particles and k landmarks."""
+
+    there: Int[np.ndarray, " k"]
+    """Their numbers."""
+    weight: Float[np.ndarray, " p"]
+    """Of each particle."""
+    placed: Bool[np.ndarray, "p k"]
+    """Whether a particle has placed it."""
+    members: Float[np.ndarray, "p k 6"]
+    """Its numbers in each particle."""
+    share: Float[np.ndarray, "p k"]
+    """Weight of each particle among those that have placed it."""
+    spots: Float[np.ndarray, "k 2"]
+    """Mean position [m]."""
+
+
+def _placed_by_most(belief: "FastSlamBelief") -> _Placed:
+    """Return the landmarks that most particles, by weight, have placed."""
+    particles = belief.log_weight.size
+    weight = np.exp(belief.log_weight - belief.log_weight.max())
+    weight /= weight.sum()
+    placed = _lanes(belief.count)[:particles] == 1
+    there = np.flatnonzero(np.einsum("p,pn->n", weight, placed) > 0.5)
+    members = _numbers(belief.member[:, belief.first[there]], 6)[:particles]
+    counting = weight[:, np.newaxis] * placed[:, there]
+    share = counting / counting.sum(axis=0)
+    spots = np.einsum("pn,pne->ne", share, members[..., :2])
+    return _Placed(there, weight, placed[:, there], members, share, spots)
+
+
+def mixture_map(belief: "FastSlamBelief") -> Landmarks:
+    r"""Return the map that all particles have: mean and covariance of each landmark over them.
+
+    .. math:: \bar l = \sum_i w_i l_i, \qquad
+              P = \sum_i w_i \left( (l_i - \bar l)(l_i - \bar l)^T + P_i \right)
+
+    A landmark is fully initialised if it is in most particles, by weight. Of any other the rows are
+    those of the heaviest particle in which it is a ray.
+    """
+    of = _placed_by_most(belief)
+    off = of.members[..., :2] - of.spots
+    spread = np.einsum("pn,pna,pnb->nab", of.share, off, off)
+    own = np.einsum("pn,pne->ne", of.share, of.members[..., 2:5])[:, [0, 1, 1, 2]]
+    labels, rows = [belief.landmark[of.there]], [of.spots]
+    spreads, weights = [spread + own.reshape(-1, 2, 2)], [np.ones(of.there.size)]
+    count = _lanes(belief.count)[: of.weight.size]
+    for n in np.setdiff1d(np.arange(belief.landmark.size), of.there).tolist():
+        best = int(np.argmax(np.where(count[:, n] > 1, of.weight, -1.0)))
+        first, size = belief.first[n], count[best, n]
+        lane = belief.member[best // LANES, first : first + size]
+        members = lane.reshape(size, 6, LANES)[..., best % LANES]
+        labels.append(np.full(size, belief.landmark[n]))
+        rows.append(members[:, :2])
+        spreads.append(members[:, [2, 3, 3, 4]].reshape(-1, 2, 2))
+        weights.append(np.exp(members[:, 5]))
+    label = np.concatenate(labels)
+    order = np.argsort([belief.landmark.tolist().index(one) for one in label], kind="stable")
+    return Landmarks(
+        landmark=label[order],
+        mean=np.concatenate(rows)[order],
+        covariance=np.concatenate(spreads)[order],
+        weight=np.concatenate(weights)[order],
+    )
 
 
 def joint_of(belief: "FastSlamBelief") -> JointGaussian:
@@ -25,23 +91,15 @@ def joint_of(belief: "FastSlamBelief") -> JointGaussian:
     those of one parent share that parent's error. A landmark counts that most particles have
     placed; where one has not, it is at the mean.
     """
-    particles = belief.log_weight.size
-    weight = np.exp(belief.log_weight - belief.log_weight.max())
-    weight /= weight.sum()
-    placed = _lanes(belief.count)[:particles] == 1
-    there = np.flatnonzero(np.einsum("p,pn->n", weight, placed) > 0.5)
-    rows = _numbers(belief.poses, 9)[:particles]
-    members = _numbers(belief.member[:, belief.first[there]], 6)[:particles]
-    counting = weight[:, np.newaxis] * placed[:, there]
-    share = counting / counting.sum(axis=0)
-    spots = np.einsum("pn,pne->ne", share, members[..., :2])
+    there, weight, placed, members, share, spots = _placed_by_most(belief)
+    rows = _numbers(belief.poses, 9)[: weight.size]
     rows[:, 2] = belief.estimate.mean[2] + wrap(rows[:, 2] - belief.estimate.mean[2])
     mean = np.append(np.einsum("p,pe->e", weight, rows[:, :3]), spots.ravel())
-    points = np.where(placed[:, there, np.newaxis], members[..., :2], spots)
-    off = np.hstack([rows[:, :3], points.reshape(particles, 2 * there.size)]) - mean
+    points = np.where(placed[..., np.newaxis], members[..., :2], spots)
+    off = np.hstack([rows[:, :3], points.reshape(weight.size, 2 * there.size)]) - mean
     covariance = np.einsum("p,pd,pe->de", weight, off, off, optimize=True)
     covariance[:3, :3] += _packed(np.einsum("p,pe->e", weight, rows[:, 3:9]))
-    covariance[3:, 3:] += _by_parents(belief, there, members, counting)
+    covariance[3:, 3:] += _by_parents(belief, there, members, weight[:, np.newaxis] * placed)
     own = np.einsum("pn,pne->ne", share, members[..., 2:5])
     for n, (xx, xy, yy) in enumerate(own.tolist()):
         covariance[3 + 2 * n : 5 + 2 * n, 3 + 2 * n : 5 + 2 * n] += [[xx, xy], [xy, yy]]

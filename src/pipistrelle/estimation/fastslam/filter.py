@@ -75,6 +75,7 @@ the frame.
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Self
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -99,7 +100,7 @@ from pipistrelle.estimation.checking import (
 from pipistrelle.estimation.fastslam.block import LANES, MEMBER
 from pipistrelle.estimation.fastslam.block_conditional import SLOPES
 from pipistrelle.estimation.fastslam.conditional_landmarks import Parents, resample_slopes
-from pipistrelle.estimation.fastslam.editing import edits, joint_of
+from pipistrelle.estimation.fastslam.editing import edits, joint_of, mixture_map
 from pipistrelle.estimation.fastslam.particles import (
     Arrays,
     correct_particles,
@@ -139,7 +140,7 @@ class FastSlamBelief:
     member: Float[np.ndarray, "b c numbers"]
     """(b, c, 6 L): x, y [m], xx, xy, yy [m^2] and log weight of each hypothesis."""
     estimate: Gaussian
-    """Mean of the poses and their covariance, before any resampling."""
+    """The pose by ``settings.estimate``, before any resampling."""
     best_count: Int[np.ndarray, " n"]  # the map of the heaviest particle, before any resampling
     best_member: Float[np.ndarray, "c 6"]
     full: float  # weighted mean number of fully initialised landmarks
@@ -149,13 +150,18 @@ class FastSlamBelief:
     """Each landmark's parent, or -1 (`conditional_landmarks`), when excess paths came last."""
     slope: Float[np.ndarray, "b n slopes"]
     """(b, n, 4 L), the slopes by the parent; no rows while no landmark has one."""
+    best: int = 0  # the heaviest particle, or after a resampling its first copy
+    mixed: bool = False  # whether the map is that of all particles
+    before: Self | None = None  # the belief before the resampling, as long as nothing has moved
 
     def pose(self) -> Gaussian:
-        """Return the vehicle's pose, (3) and (3, 3): of all particles."""
+        """Return the vehicle's pose, (3) and (3, 3)."""
         return self.estimate
 
     def landmarks(self) -> Landmarks:
-        """Return the heaviest particle's map, one row per member."""
+        """Return the map, one row per member: of all particles or of the heaviest."""
+        if self.mixed:
+            return mixture_map(self.before or self)
         return _rows(self.landmark, self.first, self.best_count, self.best_member)
 
     def labels(self) -> list[int]:
@@ -168,7 +174,7 @@ class FastSlamBelief:
 
     def edited(self, remove: Sequence[int], merge: Sequence[tuple[int, int]]) -> "FastSlamBelief":
         """Return the belief without some landmarks, and with others as one (`editing`)."""
-        return replace(self, **edits(self, remove, merge))
+        return replace(self, **edits(self, remove, merge), before=None)
 
     def cloud(self) -> Float[np.ndarray, "p 3"]:
         """Return the particles' poses, (p, 3) [m, m, rad]."""
@@ -226,6 +232,7 @@ class FastSlam:
             gated=0,
             parent=np.empty(0, dtype=np.int64),
             slope=np.empty((blocks, 0, SLOPES)),
+            mixed=self.settings.estimate == "mixture",
         )
 
     def knowing(self, belief: FastSlamBelief, known: Landmarks) -> FastSlamBelief:
@@ -261,13 +268,13 @@ class FastSlam:
         controls, dt = usable_controls(self.motion, controls, dt)
         carried, steps = belief.poses.copy(), len(dt)
         poses = Gaussian(mean=np.empty((steps, 3)), covariance=np.empty((steps, 3, 3)))
-        weight = normalised(belief.log_weight)
+        weight = self._estimating(normalised(belief.log_weight), belief.best)
         numbers = motion_numbers(self.motion)
         propagate(carried, weight, controls, dt, numbers, poses.mean, poses.covariance)
         if not steps:
             return belief, poses
         estimate = Gaussian(mean=poses.mean[-1], covariance=poses.covariance[-1])
-        return replace(belief, poses=carried, estimate=estimate), poses
+        return replace(belief, poses=carried, estimate=estimate, before=None), poses
 
     def update(
         self, belief: FastSlamBelief, scan: Scan, rng: np.random.Generator
@@ -283,20 +290,19 @@ class FastSlam:
             return belief
         if rng is None:
             raise InputError("update: found no generator, expected one: FastSLAM draws poses by it")
-        particles = self.settings.particles
+        particles, sampled = self.settings.particles, self.settings.weights == "sampled"
         normal, uniform = rng.standard_normal((particles, 3)), rng.random(particles)
         params = update_params(self.rays, self.gate, exact=self.settings.mixture == "exact")
-        sampled = self.settings.weights == "sampled"
         inside, gated = self._inside(belief, scan, params)
-        heaviest = int(np.argmax(belief.log_weight))
-        off = innovations_of(_arrays(belief)[0], columns_of(inside), heaviest)
-        corrected, (parent, slope), gained = correct_particles(
+        most = int(belief.log_weight.argmax())
+        off = innovations_of(_arrays(belief)[0], columns_of(inside), most)
+        (poses, landmark, first, count, member), (parent, slope), gained = correct_particles(
             *_arrays(belief), columns_of(inside), _timings(belief, inside), normal, params, sampled
         )
-        poses, landmark, first, count, member = corrected
         weight = normalised(belief.log_weight + gained)
-        best_count, best_member = particle_map(count, member, int(np.argmax(weight)))
-        mean, covariance = summarise(poses, weight)
+        best = int(np.argmax(weight))
+        mean, covariance = summarise(poses, self._estimating(weight, best))
+        best_count, best_member = particle_map(count, member, best)
         after = FastSlamBelief(
             poses=poses,
             log_weight=np.log(weight, where=weight > 0.0, out=np.full(particles, -np.inf)),
@@ -312,17 +318,42 @@ class FastSlam:
             innovations=belief.innovations.plus(*off),
             parent=parent,
             slope=slope,
+            best=best,
+            mixed=belief.mixed,
         )
         if effective_particles(weight) >= self.settings.resample_below * particles:
             return after
-        restart = self.settings.resampled_rays == "restart"
-        return _resampled(after, stratified(weight, uniform), restart)
+        return self._resampled(after, stratified(weight, uniform))
+
+    def _estimating(self, weight: Float[np.ndarray, " p"], best: int) -> Float[np.ndarray, " p"]:
+        """Return the weights by which particles make the pose."""
+        if self.settings.estimate != "heaviest":
+            return weight
+        return (np.arange(weight.size) == best).astype(float)
+
+    def _resampled(self, belief: FastSlamBelief, ancestor: Int[np.ndarray, " p"]) -> FastSlamBelief:
+        """Replace the particles by copies of the ancestors, with equal weights."""
+        arrays, (_, slope) = _arrays(belief)
+        poses, count, member = resample_into(arrays, ancestor)
+        if self.settings.resampled_rays == "restart":
+            restart_rays(belief.first, count, member)
+        log_weight = np.full(ancestor.size, -math.log(ancestor.size))
+        return replace(
+            belief,
+            poses=poses,
+            log_weight=log_weight,
+            count=count,
+            member=member,
+            slope=resample_slopes(slope, ancestor) if slope.size else slope,
+            best=int(np.argmax(ancestor == belief.best)),
+            before=belief if belief.mixed else None,
+        )
 
     def _inside(self, belief: FastSlamBelief, scan: Scan, params: UpdateParams) -> tuple[Scan, int]:
         """Drop rows and excess paths that no particle expected; return how many of each, summed."""
         if self.gate >= 1.0:
             return scan, 0
-        dropped, late, _ = gated_by_all(
+        dropped, late = gated_by_all(
             *_arrays(belief), columns_of(scan), _timings(belief, scan), params
         )
         if late.any():
@@ -339,21 +370,6 @@ def _arrays(belief: FastSlamBelief) -> tuple[Arrays, Parents]:
 def _timings(belief: FastSlamBelief, scan: Scan) -> Timings | None:
     """Return a scan's caller columns; None without excess paths where no landmark has a parent."""
     return timings_of(scan) if belief.slope.size == 0 else (scan.caller, scan.callers, scan.moving)
-
-
-def _resampled(
-    belief: FastSlamBelief, ancestor: Int[np.ndarray, " p"], restart: bool
-) -> FastSlamBelief:
-    """Replace the particles by copies of the ancestors, with equal weights."""
-    arrays, (_, slope) = _arrays(belief)
-    poses, count, member = resample_into(arrays, ancestor)
-    if restart:
-        restart_rays(belief.first, count, member)
-    log_weight = np.full(ancestor.size, -math.log(ancestor.size))
-    slope = resample_slopes(slope, ancestor) if slope.size else slope
-    return replace(
-        belief, poses=poses, log_weight=log_weight, count=count, member=member, slope=slope
-    )
 
 
 def _rows(

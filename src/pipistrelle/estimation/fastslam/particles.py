@@ -116,11 +116,8 @@ def gated_by_all(
     columns: Columns,
     timings: Timings | None,
     params: UpdateParams,
-) -> tuple[Bool[np.ndarray, " m"], Bool[np.ndarray, " m"], int]:
-    """Tell which rows, and which excess paths, are beyond the gate of every particle.
-
-    Returns both masks, over the particles that could use it, and how many rows have either.
-    """
+) -> tuple[Bool[np.ndarray, " m"], Bool[np.ndarray, " m"]]:
+    """Return masks of the bearings and of the excess paths beyond the gate of every particle."""
     particles, heard = Particles(*arrays), measurements(columns)
     slot = _slots(particles.landmark, heard.landmark)
     gated, blocks = np.zeros(columns[0].size, dtype=np.bool_), particles.pose.shape[0]
@@ -146,7 +143,7 @@ def gated_by_all(
             particles.pose, particles.first, particles.count, particles.member, particles.landmark,
             parents, timed, params.passive_bound,
         )  # fmt: skip
-    return gated, late, int(np.count_nonzero(gated | late))
+    return gated, late
 
 
 @kernel
