@@ -59,7 +59,7 @@ class Scan:
     not known, as for numbers beyond the array."""
     moving: Int[np.ndarray, " v"] = field(default_factory=lambda: NO_CALLERS)
     """Labels of the callers that move; in a scan without labels, their numbers."""
-    direct: Int[np.ndarray, " c"] = field(default_factory=lambda: NO_CALLERS)
+    direct: Int[np.ndarray, " d"] = field(default_factory=lambda: NO_CALLERS)
     """Row of each caller's direct call, by the caller's number, in a scan without labels; -1 where
     none was heard. The row's label becomes that of the caller (`merging.labelled`)."""
 

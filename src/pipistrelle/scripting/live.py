@@ -12,12 +12,15 @@ from pipistrelle.arithmetic.random_stream import stream_key
 from pipistrelle.config import Config, InputError
 from pipistrelle.detection.logs.recording import Log, scan_at
 from pipistrelle.detection.logs.vehicle import ODOMETRY, read_vehicle, vehicle_of
+from pipistrelle.detection.logs.vehicle import Vehicle as VehicleKeys
 from pipistrelle.detection.noise import noise_of
 from pipistrelle.estimation.association import KNOWN
 from pipistrelle.estimation.beliefs import Gaussian, Landmarks, answer, no_landmarks
 from pipistrelle.estimation.catalogue import entry
 from pipistrelle.estimation.checking import usable_controls
 from pipistrelle.estimation.data_association.methods import association_of
+from pipistrelle.estimation.fastslam.filter import FastSlamBelief
+from pipistrelle.estimation.outside import ASSOCIATION, ESTIMATOR, class_of, names_class
 from pipistrelle.estimation.session import Session
 from pipistrelle.experiments.drives import NO_TRUTH, at_sensor, carried, vehicle_in
 from pipistrelle.experiments.named_settings import check_own, laid, over_named, own_config
@@ -42,7 +45,8 @@ from pipistrelle.scripting.live_rows import (
     times_of,
 )
 from pipistrelle.scripting.log_settings import TIMING, check_open, with_log
-from pipistrelle.scripting.saved_state import not_saved, read_state, write_state
+from pipistrelle.scripting.saved_records import check_going_on
+from pipistrelle.scripting.saved_state import DriveState, Named, not_saved, read_state, write_state
 from pipistrelle.settings import Given, from_keywords
 
 if TYPE_CHECKING:
@@ -136,7 +140,7 @@ class Slam:
         start, flags = finite(time, "time"), from_keywords(settings, OWN_WORDS)
         check_clock(np.array([start]))
         check_open(flags)
-        log, where = _log_of(vehicle, start)
+        log, where, told = _log_of(vehicle, start)
         named, _ = over_named(base_layer(config), flags)
         layer = laid({TIMING: Given(True, "Slam")}, named)
         check_own(layer)
@@ -144,11 +148,12 @@ class Slam:
         names = named_filters(filter, "filter")
         if len(names) > 1:
             raise refusal("filter", ", ".join(names), "one estimator", "make a Slam of each")
-        self._begin(log, own_config(resolved, names[0]), names[0], kept)
+        self._begin(log, told, own_config(resolved, names[0]), names[0], kept)
 
-    def _begin(self, log: Log, config: Config, name: str, kept: int) -> None:
+    def _begin(self, log: Log, told: VehicleKeys, config: Config, name: str, kept: int) -> None:
         """Build the estimator, at the start."""
-        self._log, self._config, self._name, self._kept = log, config, name, kept
+        self._log, self._vehicle, self._config = log, told, config
+        self._name, self._kept = name, kept
         drive = drive_of(log, NO_TRUTH)
         check_filters([name], drive.motion, config, drive.moving.values())
         check_calibrated(log, config)
@@ -307,30 +312,41 @@ class Slam:
         A file in its place is replaced where `save` wrote it, and refused where it did not.
         """
         path = folder_named(file, "file")
-        settings = self._config.model_dump(mode="json")
-        header = {"filter": self._name, "kept": self._kept, "config": settings}
         times, online = self._online()
-        content = {
-            "session": self._session.state(),
-            "log": self._log,
-            "heard": self._heard,
-            "times": times,
-            "means": online.mean,
-            "covariances": online.covariance,
-        }
-        write_state(path, header, content)
+        state = DriveState(
+            name=self._log.name,
+            start=float(self._log.time[0]),
+            former=self._log.former_names,
+            vehicle=self._vehicle.model_dump(),
+            settings=self._config.model_dump(mode="json"),
+            kept=self._kept,
+            session=self._session.state(),
+            heard=frozenset(self._heard),
+            times=times,
+            means=online.mean,
+            covariances=online.covariance,
+        )
+        write_state(path, Named(self._name, self._config.association.method), state)
         return path
 
     @classmethod
-    def load(cls, file: Path | str, *, filter: str | type | None = None) -> Self:  # noqa: A002
+    def load(
+        cls,
+        file: Path | str,
+        *,
+        filter: str | type | None = None,  # noqa: A002 - as `Slam` has it
+        association__method: str | None = None,
+    ) -> Self:
         """Go on from what `save` wrote, to the bit.
 
         Parameters
         ----------
         file : Path
         filter : str or class, optional
-            The estimator that it was saved with, where that is one of your own: a file alone makes
-            nobody's module run.
+            The estimator that it was saved with, where that is one of your own: no module is
+            imported because a file names it.
+        association__method : str, optional
+            The association, ``module:Class``, where that is one of your own.
 
         Raises
         ------
@@ -338,32 +354,47 @@ class Slam:
             For a file that `save` of this version did not write, or that has changed since.
         """
         path = folder_named(file, "file")
-        own = None if filter is None else named_filters(filter, "filter")[0]
-        header, content = read_state(path, own)
+        named = None if filter is None else named_filters(filter, "filter")[0]
+        for role, name in ((ESTIMATOR, named), (ASSOCIATION, association__method)):
+            if name is not None and names_class(name):
+                class_of(role, name)
+        own = {"filter": named, "association__method": association__method}
         slam = cls.__new__(cls)
+        names, state = read_state(path, own)
         try:
-            slam._go_on_from(header, content)
+            slam._go_on_from(names, state)
         except InputError:
             raise
         except Exception as error:  # of a file that somebody made, and summed
             raise not_saved(path, error) from None
         return slam
 
-    def _go_on_from(self, header: Mapping[str, Any], content: Mapping[str, Any]) -> None:
-        """Know what a file of `save` says and holds."""
-        config = Config.model_validate(header["config"])
-        self._begin(content["log"], config, header["filter"], header["kept"])
-        self._session.go_on_from(content["session"])
-        parts = zip(
-            content["times"].tolist(), content["means"], content["covariances"], strict=True
-        )
+    def _go_on_from(self, named: Named, state: DriveState) -> None:
+        """Know what a file of `save` holds."""
+        config = Config.model_validate(state.settings)
+        belief, method = state.session.belief, config.association.method
+        particles = isinstance(belief, FastSlamBelief) and belief.log_weight.size
+        if method != named.association or particles not in (False, config.fastslam.particles):
+            raise ValueError("settings")
+        log, _, vehicle = _log_of(state.vehicle, finite(state.start, "start"))
+        log = replace(log, name=state.name, former_names=state.former)
+        self._begin(log, vehicle, config, named.filter, state.kept)
+        check_going_on(self._session.state(), state.session, own=names_class(named.filter))
+        self._session.go_on_from(state.session)
+        parts = zip(state.times.tolist(), state.means, state.covariances, strict=True)
         self._poses = [(t, Gaussian(mean=m, covariance=P)) for t, m, P in parts]
-        self._time, self._heard = self._poses[-1][0], content["heard"]
+        self._time, self._heard = self._poses[-1][0], {*state.heard}
+        check_clock(state.times)
+        now = self._session.belief.pose()
+        variances = np.diagonal(state.covariances, axis1=1, axis2=2)
+        for known in (now.mean, now.covariance, state.means, state.covariances, np.sqrt(variances)):
+            if not np.isfinite(known).all():
+                raise ValueError("a pose that is no number")
 
     def copy(self) -> Self:
         """Return another that goes on from here by itself, to the same bits."""
         other = type(self).__new__(type(self))
-        other._begin(self._log, self._config, self._name, self._kept)
+        other._begin(self._log, self._vehicle, self._config, self._name, self._kept)
         other._session.go_on_from(self._session.state())
         other._poses, other._time, other._heard = [*self._poses], self._time, {*self._heard}
         return other
@@ -422,8 +453,8 @@ def _fault(pose: Gaussian) -> tuple[str, str] | None:
     return None
 
 
-def _log_of(vehicle: Vehicle, time: float) -> tuple[Log, Path]:
-    """Return a log of a vehicle that has not moved, and where the vehicle was told."""
+def _log_of(vehicle: Vehicle, time: float) -> tuple[Log, Path, VehicleKeys]:
+    """Return a log of a vehicle that has not moved, where its keys are from, and the keys."""
     if isinstance(vehicle, Mapping):
         where, former = Path("vehicle"), ()
         told = vehicle_of(OF_ITSELF | dict(vehicle), where)
@@ -436,7 +467,7 @@ def _log_of(vehicle: Vehicle, time: float) -> tuple[Log, Path]:
     none = {"scans": (), "ignored_rows": {}, "dt": np.empty(0), "former_names": former}
     controls, start = np.empty((0, len(ODOMETRY[told.motion]))), np.array([time])
     log = Log(name=str(where), time=start, controls=controls, **none, **told.told())
-    return log, where
+    return log, where, told
 
 
 def _map_table(landmarks: Landmarks) -> "pl.DataFrame":

@@ -148,7 +148,7 @@ class FastSlamBelief:
     innovations: Innovations = NO_INNOVATIONS  # of the heaviest particle before each scan
     parent: Int[np.ndarray, " parents"]
     """Each landmark's parent, or -1 (`conditional_landmarks`), when excess paths came last."""
-    slope: Float[np.ndarray, "b n slopes"]
+    slope: Float[np.ndarray, "b parents_or_0 slopes"]
     """(b, n, 4 L), the slopes by the parent; no rows while no landmark has one."""
     best: int = 0  # the heaviest particle, or after a resampling its first copy
     mixed: bool = False  # whether the map is that of all particles
