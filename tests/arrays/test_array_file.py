@@ -78,6 +78,69 @@ def test_rows_are_ordered_by_channel_and_what_is_left_out_says_nothing(tmp_path)
     assert found.face == ("left", "")
 
 
+XML = (
+    '<?xml version="1.0" encoding="{}"?>\n<MicArray name="{}">\n'
+    '<pos Name="a" x="0.0" y="-0.02" z="0.1"/>\n<pos Name="b" x="0" y="0.02" z="0.1"/>\n</MicArray>'
+)
+
+
+@pytest.mark.parametrize(
+    ("encoding", "name"),
+    [
+        ("utf-8", "耳"), ("UTF-8", "é"), ("utf-8-sig", "é"), ("us-ascii", "pair"),
+        ("shift_jis", "耳のソ"), ("cp932", "髙①"), ("euc-jp", "耳"), ("iso-2022-jp", "耳"),
+        ("gbk", "麦克风"), ("GB2312", "麦"), ("gb18030", "麦"), ("big5", "麥"),
+        ("euc-kr", "마이크"), ("shift_jis", "髙①"), ("gb2312", "镕"),
+        ("iso-8859-1", "é"), ("windows-1252", "€"), ("koi8-r", "ж"),
+        ("utf-16", "耳"), ("UTF-16LE", "耳"), ("UTF-16BE", "耳"), ("utf-32", "耳"), ("utf-7", "耳"),
+    ],
+)  # fmt: skip
+def test_xml_is_read_in_the_encoding_that_it_declares(tmp_path, encoding, name):
+    xml, plain = tmp_path / "array.csv", tmp_path / "plain.xml"
+    on_windows = {"shift_jis": "cp932", "gb2312": "gb18030"}.get(encoding, encoding)
+    xml.write_bytes(XML.format(encoding, name).encode(on_windows))
+    plain.write_text(XML.format("utf-8", "pair"))
+    assert array_text(read_array(xml)) == array_text(read_array(plain))
+
+
+@pytest.mark.parametrize(
+    "encoding",
+    [
+        "foo", "hex", "rot13", "idna", "punycode", "undefined", "base64", "zlib", "mbcs", "",
+        "unicode_escape", "raw_unicode_escape", "../x", "utf-8\0", "x" * 100_000, "utf-16",
+        "UTF-32", "utf_8; y", "é", "os.system",
+    ],
+)  # fmt: skip
+def test_xml_in_an_encoding_that_is_none_is_refused(tmp_path, encoding):
+    xml = tmp_path / "array.xml"
+    xml.write_bytes(XML.format(encoding, "pair").encode())
+    with pytest.raises(InputError, match=r"array\.xml: found XML .*; save it as UTF-8"):
+        read_array(xml)
+
+
+@pytest.mark.parametrize(
+    ("encoding", "data"),
+    [
+        ("utf-8", XML.format("utf-8", "耳").encode("shift_jis")),
+        ("gbk", XML.format("gbk", "").encode() + b"\xff"),
+        ("us-ascii", XML.format("us-ascii", "é").encode()),
+        ("utf-7", XML.format("utf-7", "+2AA-").encode()),
+        ("utf-8", XML.format("utf-8", "").encode().replace(b"pair", b"\xed\xa0\x80") + b"\xff"),
+    ],
+)
+def test_xml_in_another_encoding_than_it_declares_is_refused(tmp_path, encoding, data):
+    (tmp_path / "array.xml").write_bytes(data)
+    with pytest.raises(InputError, match=f"found XML whose bytes are no {encoding}"):
+        read_array(tmp_path / "array.xml")
+
+
+@pytest.mark.parametrize("data", [b"\xff\xfe", b"\xff\xfec\0h\0", b"\0<\0?", b"<", b"<?xml", b""])
+def test_what_is_neither_xml_nor_a_table_is_refused(tmp_path, data):
+    (tmp_path / "array.xml").write_bytes(data)
+    with pytest.raises(InputError, match=r"array\.xml"):
+        read_array(tmp_path / "array.xml")
+
+
 def test_acoulars_xml_is_the_same_array_as_its_rows(tmp_path):
     xml, csv = tmp_path / "array.xml", tmp_path / "array.csv"
     xml.write_text(

@@ -10,10 +10,11 @@ left:
     2,0.03,0.02,0,front,0
 
 of which ``z``, ``face`` and ``gain_db`` may be left out; or the XML of Acoular,
-``<MicArray name="..."><pos Name="..." x="..." y="..." z="..."/></MicArray>``, whose microphones are
-numbered from 1 in the order of the file.
+``<MicArray name="..."><pos Name="..." x="..." y="..." z="..."/></MicArray>``, in the encoding that
+it declares, whose microphones are numbered from 1 in the order of the file.
 """
 
+import codecs
 import math
 import re
 from collections.abc import Iterator, Sequence
@@ -27,7 +28,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from pipistrelle.config import SQUARE, InputError, MicrophoneRow
-from pipistrelle.files import check_ordinary, read_text, write_whole
+from pipistrelle.files import check_ordinary, read_named, read_text, write_whole
 from pipistrelle.refusals import refusal, shown
 from pipistrelle.settings import ARRAY_KEY, Layer
 
@@ -43,6 +44,30 @@ MAX_GAIN_DB = 100.0
 """Gains of microphones lie between this and its negative [dB]."""
 REQUIRED = ("channel", "x", "y")
 OPTIONAL = ("z", "face", "gain_db")
+_MARKS = {
+    codecs.BOM_UTF8: "utf-8-sig",
+    codecs.BOM_UTF32_LE: "utf-32",
+    codecs.BOM_UTF32_BE: "utf-32",
+    codecs.BOM_UTF16_LE: "utf-16",
+    codecs.BOM_UTF16_BE: "utf-16",
+    b"<\0?\0": "utf-16-le",
+    b"\0<\0?": "utf-16-be",
+}
+"""How XML of some encodings begins (XML 1.0, appendix F)."""
+_DECLARED = re.compile(rb"""<\?xml\s[^>]*?\bencoding\s*=\s*(["'])(?P<name>[^"']*)\1""")
+_NAME = re.compile(r"[A-Za-z][A-Za-z0-9._-]{0,40}")
+"""Of an encoding, as XML has it."""
+_ON_WINDOWS = {
+    "shift_jis": "cp932",
+    "gb2312": "gb18030",
+    "gbk": "gb18030",
+    "big5": "cp950",
+    "euc_kr": "cp949",
+}
+"""Encodings that have more characters where Windows writes them under the same name."""
+_OF_PYTHON = ("idna", "punycode", "undefined", "unicode-escape", "unicode_escape",
+              "raw-unicode-escape", "raw_unicode_escape")  # fmt: skip
+"""Codecs that are no encodings of files."""
 _FACE = re.compile(r"[\w-]{0,40}")
 _LIMITS = {"x": 1e6, "y": 1e6, "z": 1e6, "gain_db": MAX_GAIN_DB}
 
@@ -108,8 +133,8 @@ def read_array(path: Path, *, some: bool = False) -> Microphones:
     if path.exists() and (size := path.stat().st_size) > MAX_BYTES:
         expected = f"an array of at most {MAX_MICROPHONES} microphones"
         raise refusal(path, f"{size / 1e6:.1f} MB", expected, "name the file of an array")
-    text = read_text(path)
-    rows = list((_rows_of_xml if text.lstrip()[:1] == "<" else _rows_of_csv)(path, text))
+    text = _text_of_xml(path, read_named(path, "a readable text file"))
+    rows = list(_rows_of_csv(path, read_text(path)) if text is None else _rows_of_xml(path, text))
     rows.sort(key=lambda row: row.channel)
     return _checked(str(path), rows, some=some)
 
@@ -208,12 +233,40 @@ def _rows_of_csv(path: Path, text: str) -> Iterator[_Row]:
         yield _row(path, line, dict(zip(names, fields, strict=True)))
 
 
+def _text_of_xml(path: Path, data: bytes) -> str | None:
+    """Return a file's text if it is XML, as bytes of the encoding that it declares; else None.
+
+    A byte order mark goes before a declaration, and UTF-8 is what declares none.
+    """
+    marked = next((name for mark, name in _MARKS.items() if data.startswith(mark)), None)
+    if marked is None and not data.lstrip().startswith(b"<"):
+        return None
+    declared = _DECLARED.match(data.lstrip()) if marked is None else None
+    name = declared["name"].decode("ascii", "replace") if declared else marked or "utf-8-sig"
+    found, text = f"XML in the encoding {shown(name)}", ""
+    try:
+        codec = codecs.lookup(name).name if _NAME.fullmatch(name) else _OF_PYTHON[0]
+        if codec not in _OF_PYTHON:
+            text = data.decode(_ON_WINDOWS.get(codec, codec)).lstrip("\ufeff").lstrip()
+            text.encode()  # for the parser, which takes no half of a pair
+    except LookupError:
+        pass
+    except ValueError:
+        found, text = f"XML whose bytes are no {name}", ""
+    if text.startswith("<"):
+        return text
+    if marked is not None:
+        return None
+    expected = "XML in the encoding that it declares, UTF-8 or another that is known"
+    raise refusal(path, found, expected, "save it as UTF-8, and declare that")
+
+
 def _rows_of_xml(path: Path, text: str) -> Iterator[_Row]:
     """Return the microphones of Acoular's XML; a document type, which may define entities, is not
     read.
     """
     rows: list[_Row] = []
-    parser = expat.ParserCreate()
+    parser = expat.ParserCreate("utf-8")  # in place of what is declared: that was decoded before
     expected = "Acoular's <MicArray><pos x=... y=... z=.../></MicArray>"
 
     def refuse_type(*_: object) -> None:
