@@ -44,9 +44,26 @@ def test_relative_cache_folder_of_the_desktop_is_not_taken(tmp_path):
     assert place(tmp_path, XDG_CACHE_HOME="here") == place(tmp_path)
 
 
-def test_folder_that_the_user_names_is_taken(tmp_path):
+def test_a_folder_of_ones_own_is_made_in_that_which_the_user_names(tmp_path):
     folder, said = place(tmp_path, NUMBA_CACHE_DIR=str(tmp_path / "mine"))
-    assert (folder, said) == (tmp_path / "mine", [])
+    own = tmp_path / "mine" / f"pipistrelle-{os.getuid()}"
+    assert (folder, said) == (own / sources_key(), [])
+
+
+@pytest.mark.parametrize("variable", ["HOME", "NUMBA_CACHE_DIR", "TMPDIR"])
+def test_a_process_that_is_started_by_another_takes_the_same_folder(tmp_path, variable):
+    again = "import subprocess, sys; print(subprocess.check_output([sys.executable, '-c', "
+    code = f"{SHOW}; {again}{SHOW!r}], text=True))"
+    places = {"TMPDIR": {"HOME": NOWHERE}, "HOME": {}}.get(
+        variable, {variable: str(tmp_path / "mine")}
+    )
+    if variable == "TMPDIR":  # of which a new one is made each time
+        (tmp_path / "tmp").mkdir()
+        (tmp_path / "tmp" / f"pipistrelle-{os.getuid()}").write_text("")
+    found, said = place(tmp_path, code, **places)
+    first, second = str(found).split("\n")
+    assert first == second
+    assert len(said) == (variable == "TMPDIR")
 
 
 def test_numba_imported_before_keeps_them_there_too(tmp_path):
@@ -173,10 +190,102 @@ def test_a_cache_that_others_can_write_is_not_trusted(tmp_path, mode):
     folder, said = place(tmp_path)
     assert folder.is_relative_to(tmp_path / "tmp")
     assert f"{mine} can be written by others" in said[0]
-    theirs = tmp_path / "theirs"
-    theirs.mkdir()
-    theirs.chmod(mode)
-    assert "can be written by others" in place(tmp_path, NUMBA_CACHE_DIR=str(theirs))[1][0]
+
+
+def of_group(folder: Path) -> Path:
+    """A folder of a group in which others may be, if this process may make one."""
+    try:
+        os.chown(folder, -1, 3000)
+    except PermissionError:
+        pytest.skip("only root gives a folder to a group of others")
+    return folder
+
+
+UNSAFE = {
+    "a link": lambda parent, own: own.symlink_to(parent.mkdir() or parent),
+    "a link to a folder of one's own": lambda parent, own: own.symlink_to(
+        (own.parent / "kept").mkdir(0o700) or own.parent / "kept"
+    ),
+    "writable by all": lambda parent, own: parent.chmod(0o777),
+    "writable by a group": lambda parent, own: of_group(parent).chmod(0o775),
+    "of another user": lambda parent, own: os.chown(parent, 2002, 3000),
+    "with another user's in it": lambda parent, own: os.chown(own.mkdir(0o700) or own, 2002, -1),
+    "with a folder that a group can write": lambda parent, own: (
+        (own / sources_key() / "arrays_1").mkdir(parents=True),
+        own.chmod(0o700),
+        of_group(own / sources_key() / "arrays_1").chmod(0o775),
+    ),
+    "with a link in it": lambda parent, own: (
+        (own / sources_key()).mkdir(parents=True),
+        own.chmod(0o700),
+        (own / sources_key() / "arrays_1").symlink_to(own.parent, target_is_directory=True),
+    ),
+}
+
+
+@pytest.mark.skipif(os.name != "posix", reason="permissions are of another kind there")
+@pytest.mark.parametrize("what", UNSAFE)
+@pytest.mark.parametrize("below", ["", "deeper"])
+def test_a_folder_in_which_another_could_put_kernels_is_not_taken(tmp_path, what, below):
+    parent = tmp_path / "shared"
+    chosen = parent / below
+    own = chosen / f"pipistrelle-{os.getuid()}"
+    if what == "a link":
+        parent, chosen = tmp_path / "elsewhere", tmp_path / "shared"
+        own = chosen / f"pipistrelle-{os.getuid()}"
+        chosen.mkdir()
+    chosen.mkdir(parents=True, exist_ok=True)
+    try:
+        UNSAFE[what](parent, own)
+    except PermissionError:
+        pytest.skip("only root makes a folder of another user")
+    folder, said = place(tmp_path, NUMBA_CACHE_DIR=str(chosen))
+    assert folder.is_relative_to(tmp_path / "tmp")
+    assert len(said) == 1
+    assert "set NUMBA_CACHE_DIR to a folder of your own" in said[0]
+
+
+@pytest.mark.skipif(os.name != "posix", reason="permissions are of another kind there")
+def test_a_shared_folder_in_which_nobody_can_replace_anothers_is_taken(tmp_path):
+    shared = tmp_path / "shared"
+    shared.mkdir()
+    shared.chmod(0o1777)
+    folder, said = place(tmp_path, NUMBA_CACHE_DIR=str(shared))
+    assert (folder.parent.parent, said) == (shared, [])
+    assert folder.parent.stat().st_mode & 0o077 == 0
+
+
+@pytest.mark.skipif(os.name != "posix", reason="permissions are of another kind there")
+def test_all_that_is_made_for_kernels_is_closed_to_others(tmp_path):
+    wide = "import os; os.umask(0o002); "
+    (tmp_path / ".cache" / "pipistrelle").mkdir(parents=True)
+    (tmp_path / ".cache" / "pipistrelle").chmod(0o775)
+    for places in ({}, {"NUMBA_CACHE_DIR": str(tmp_path / "new" / "mine")}):
+        folder, said = place(tmp_path, wide + COMPILE, **places)
+        assert said[1:] == []
+        made = [folder.parent, folder, *(one for one in folder.iterdir() if one.is_dir())]
+        assert len(made) > 2
+        assert [one.stat().st_mode & 0o077 for one in made] == [0] * len(made)
+        assert place(tmp_path, wide + COMPILE, **places) == (folder, [])
+
+
+@pytest.mark.skipif(os.name != "posix" or os.getuid() != 0, reason="needs a second user")
+def test_kernels_of_another_user_of_the_group_are_not_run(tmp_path):
+    shared = tmp_path / "shared"
+    shared.mkdir()
+    of_group(shared).chmod(0o755)
+    grouped = "import os; os.setegid(3000); os.umask(0o002); "
+    folder, _ = place(tmp_path, grouped + COMPILE, NUMBA_CACHE_DIR=str(shared))
+    index = next(folder.rglob("*.nbi"))
+    planting = (
+        f"import os; os.setgid(3000); os.setuid(2002); open({str(index)!r}, 'wb').write(b'planted')"
+    )
+    for one in tmp_path.parents[:-2]:
+        one.chmod(0o755)
+    tmp_path.chmod(0o755)
+    done = subprocess.run([sys.executable, "-c", planting], capture_output=True, text=True)
+    assert "PermissionError" in done.stderr
+    assert not index.read_bytes().startswith(b"planted")
 
 
 def test_a_cache_without_room_is_not_taken(tmp_path):

@@ -15,6 +15,7 @@ from typing import Any
 
 from numba.core.caching import IndexDataCacheFile
 
+from pipistrelle.kernel_folder import close_to_others
 from pipistrelle.kernel_turns import TURN
 
 _said: set[str] = set()
@@ -84,6 +85,8 @@ def checked(dispatcher: Any) -> Any:
     """
     if cache := getattr(dispatcher, "_cache", None):
         files = cache._cache_file
+        with suppress(OSError):
+            close_to_others(Path(files._cache_path))
         cache._cache_file = CheckedFiles.__new__(CheckedFiles)
         cache._cache_file.__dict__.update(files.__dict__)
     return dispatcher
