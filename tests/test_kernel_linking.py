@@ -1,14 +1,18 @@
 """Kernels that kernels call are linked: the same numbers as by Numba alone, and no code twice."""
 
 import math
+import os
 import subprocess
 import sys
+from pathlib import Path
 
+import numba
 import numpy as np
 import pytest
 from numba import njit
 
 from pipistrelle.jit import kernel
+from pipistrelle.kernel_linking import TESTED
 
 LINES = """
 import numpy as np
@@ -111,3 +115,86 @@ def test_linked_kernels_are_the_same_from_the_cache_of_another_process(tmp_path)
     assert first.split()[0] == second.split()[0]
     assert first.split(maxsplit=1)[1].strip() == "Counter()"
     assert second.split(maxsplit=1)[1].count(": 1") == 1
+
+
+HIDE = """
+import builtins
+whole = builtins.__import__
+
+def lacking(name, globals=None, *rest):
+    if str((globals or {{}}).get("__name__")).startswith("pipistrelle"):
+        if {name!r} in (name, f"{{name}}.{{(rest[1:2] or ((),))[0] and rest[1][0]}}"):
+            raise ImportError(name)
+    return whole(name, globals, *rest)
+
+builtins.__import__ = lacking
+"""
+NEWER = """
+import numba
+from numba.core.codegen import JITCodeLibrary
+
+def fails(self):
+    if type(self).__module__.startswith("pipistrelle"):
+        raise AttributeError("object caching")
+    return whole(self)
+
+whole, JITCodeLibrary.enable_object_caching = JITCodeLibrary.enable_object_caching, fails
+numba.version_info = numba.version_info._replace(short=(0, 99))
+"""
+LACKING = {
+    "a class": HIDE.format(name="numba.core.caching"),
+    "a module": HIDE.format(name="numba.core.environment"),
+    "its events": HIDE.format(name="numba.core.event"),
+    "a method, of a newer version": NEWER,
+}
+
+
+def by_a_numba_that_lacks(what, tmp_path, words, code):
+    """Run code, or the command line, in a process whose Numba lacks something."""
+    (tmp_path / "sitecustomize.py").write_text(LACKING[what])
+    environment = {"NUMBA_CACHE_DIR": str(tmp_path / "kept"), "PYTHONPATH": str(tmp_path)}
+    return subprocess.run(
+        [sys.executable, *words] if words else [sys.executable, "-c", code],
+        env=os.environ | environment,
+        cwd=tmp_path,
+        capture_output=True,
+        text=True,
+    )
+
+
+@pytest.mark.parametrize("what", LACKING)
+def test_kernels_are_the_same_by_a_numba_that_lacks_what_is_private(tmp_path, what):
+    (tmp_path / "linked.py").write_text(LINES)
+    code = f"from linked import rows, np; {SHOW.split(', rows.stats')[0]})"
+    done = by_a_numba_that_lacks(what, tmp_path, [], code)
+    wanted = np.array([0.1 + 0.1 * 0.1, 1.5 + 4.5, np.inf]).tobytes().hex()
+    assert done.stdout == wanted + "\n", done.stderr
+    lines = [line for line in done.stderr.splitlines() if "Compiling kernels" not in line]
+    if what == "its events":
+        assert lines == []
+        return
+    assert len(lines) == 1
+    assert lines[0].startswith(f"pipistrelle: Numba {numba.__version__} is not as those")
+    assert "takes longer" in lines[0]
+    assert list((tmp_path / "kept").rglob("*.nbc")), "it is kept, in a folder of one's own"
+    again = by_a_numba_that_lacks(what, tmp_path, [], code)
+    assert (again.stdout, len(again.stderr.splitlines())) == (done.stdout, 1)
+
+
+@pytest.mark.slow
+def test_a_mission_is_the_same_by_a_numba_that_lacks_what_is_private(tmp_path):
+    run = ["-m", "pipistrelle", "run", "--duration", "2", "--filter", "ekf", "--quiet", "-o"]
+    assert subprocess.run([sys.executable, *run, str(tmp_path / "as_it_is")]).returncode == 0
+    done = by_a_numba_that_lacks("a class", tmp_path, [*run, str(tmp_path / "plain")], "")
+    assert done.returncode == 0, done.stderr
+    assert sum("is not as those that were tested" in one for one in done.stderr.splitlines()) == 1
+    tracks = sorted((tmp_path / "as_it_is").glob("*.tum"))
+    assert len(tracks) > 2
+    for track in tracks:
+        assert track.read_bytes() == (tmp_path / "plain" / track.name).read_bytes()
+
+
+def test_the_newest_numba_that_is_allowed_is_the_newest_that_was_tested():
+    text = (Path(__file__).parents[1] / "pyproject.toml").read_text()
+    major, minor = TESTED
+    assert f'"numba>=0.61,<{major}.{minor + 1}"' in text

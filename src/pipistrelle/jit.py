@@ -8,20 +8,41 @@ A kernel takes eight arguments at most; what belongs together is a record, a Nam
 a record costs a microsecond and a plain tuple nothing, so a kernel that is called for every frame
 is handed the columns as a tuple and makes the record of them itself, which is free. None calls
 itself: those that are called are linked (`kernel_linking`), which recursion prevents.
+
+Linking and checked files need private parts of Numba. Where a Numba has them no more, kernels are
+compiled and kept by its public functions, with the same numbers, and a line says so.
 """
 
+import sys
 from collections.abc import Callable
+from contextlib import suppress
 from typing import Any, TypeVar
 
+import numba
 import numpy as np
 from numba import config
 
-from pipistrelle import kernel_clock  # noqa: F401 - which listens from the first kernel on
-from pipistrelle.kernel_cache import checked
+from pipistrelle import kernel_clock
 from pipistrelle.kernel_folder import place_kernels
-from pipistrelle.kernel_linking import Kernel
 
-place_kernels()
+_fault: Exception | None = None
+"""Why kernels are compiled by Numba's public functions."""
+try:
+    from pipistrelle.kernel_cache import checked
+    from pipistrelle.kernel_linking import Kernel, check
+
+    if not config.DISABLE_JIT:  # pyrefly: ignore[missing-attribute]
+        with kernel_clock.judging():
+            check()
+except Exception as error:
+    _fault = error
+if not place_kernels(plain=_fault is not None) and _fault is not None:
+    with suppress(OSError, AttributeError):  # there is no reader
+        print(
+            f"pipistrelle: Numba {numba.__version__} is not as those that were tested "
+            f"({type(_fault).__name__}): compiling kernels takes longer; install numba<0.69",
+            file=sys.stderr,
+        )
 
 Whole = int | np.integer
 """A whole number in a kernel: Numba's are Python's, those of arrays NumPy's."""
@@ -34,11 +55,15 @@ _Function = TypeVar("_Function", bound=Callable[..., Any])
 
 def _compiler(*, twice: bool = True, **options: bool | str) -> Callable[[_Function], _Function]:
     """Return a decorator that compiles, and keeps what it compiled in checked files."""
-    options |= {"nopython": True, "error_model": "numpy", "no_cfunc_wrapper": True}
+    public: dict[str, Any] = {name: value for name, value in options.items() if name == "inline"}
+    public |= {"nopython": True, "error_model": "numpy"}
+    options |= public | {"no_cfunc_wrapper": True}
 
     def compiled(function: Any) -> Any:
         if config.DISABLE_JIT:  # pyrefly: ignore[missing-attribute]
             return function
+        if _fault is not None:
+            return numba.jit(cache=True, **public)(function)
         dispatcher = Kernel(function, options, twice=twice)
         dispatcher.enable_caching()
         return checked(dispatcher)

@@ -8,8 +8,12 @@ import sys
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
+from typing import Any
 
-from numba.core.event import Event, Listener, register
+try:
+    from numba.core import event as _events
+except ImportError:  # of another Numba than those that were tested: nothing is announced
+    _events: Any = None
 
 COMPILING = (
     "Compiling the kernels of this kind of task, kept for the next time (a minute or two) ..."
@@ -18,7 +22,7 @@ _COMPILE, _LOCK = "numba:compile", "numba:compiler_lock"
 """Numba tells when it compiles, and when it compiles or loads."""
 
 
-class _Clock(Listener):
+class _Clock(_events.Listener if _events else object):  # pyrefly: ignore[invalid-inheritance]
     """Sum up the time in which kernels are compiled or loaded, and announce the first."""
 
     def __init__(self) -> None:
@@ -27,7 +31,7 @@ class _Clock(Listener):
         self.lost = (0.0, 0.0)
         self._began, self._depth = (0.0, 0.0), 0
 
-    def on_start(self, event: Event) -> None:
+    def on_start(self, event: Any) -> None:
         """Stop the clocks."""
         held = self.said or self.judging
         if event.kind == _COMPILE and self.tell is not None and not held:
@@ -37,7 +41,7 @@ class _Clock(Listener):
             self._began = _now()
         self._depth += 1
 
-    def on_end(self, event: Event) -> None:
+    def on_end(self, event: Any) -> None:
         """Let the clocks go on, when the outermost of nested events is at its end."""
         self._depth -= 1
         if not self._depth:
@@ -86,5 +90,5 @@ def _now() -> tuple[float, float]:
 
 
 _CLOCK = _Clock()
-for _kind in (_COMPILE, _LOCK):
-    register(_kind, _CLOCK)
+for _kind in (_COMPILE, _LOCK) if _events else ():
+    _events.register(_kind, _CLOCK)

@@ -9,6 +9,7 @@ import gc
 from functools import cached_property
 from typing import Any
 
+import numba
 from numba.core import types
 from numba.core.codegen import JITCodeLibrary
 from numba.core.compiler import Compiler
@@ -16,6 +17,9 @@ from numba.core.environment import lookup_environment
 from numba.core.registry import CPUDispatcher
 
 from pipistrelle.kernel_turns import TURN
+
+TESTED = (0, 68)
+"""The newest Numba whose private classes are known to be as they are taken here."""
 
 
 class Kernel(CPUDispatcher):
@@ -121,3 +125,22 @@ class _Linking(_Compiling):
         """Leave out the wrapper for Python, too."""
         self.state.flags.no_cpython_wrapper = True
         return super().define_pipelines()
+
+
+def check() -> None:
+    """Compile a kernel that calls another, by a Numba that is newer than any tested; or raise."""
+    if numba.version_info.short <= TESTED:
+        return
+    called = Kernel(_halved, {"nopython": True}, twice=True)
+
+    def calling(x: float) -> float:
+        return called(x) + called(x + 1.0)
+
+    found = Kernel(calling, {"nopython": True}, twice=False)(3.0)
+    if found != 3.5:
+        raise ArithmeticError(f"found {found}, expected 3.5")
+
+
+def _halved(x: float) -> float:
+    """Be compiled within another."""
+    return 0.5 * x
