@@ -121,11 +121,11 @@ HIDE = """
 import builtins
 whole = builtins.__import__
 
-def lacking(name, globals=None, *rest):
+def lacking(name, globals=None, locals=None, fromlist=(), level=0):
     if str((globals or {{}}).get("__name__")).startswith("pipistrelle"):
-        if {name!r} in (name, f"{{name}}.{{(rest[1:2] or ((),))[0] and rest[1][0]}}"):
+        if {name!r} in (name, *(f"{{name}}.{{one}}" for one in fromlist or ())):
             raise ImportError(name)
-    return whole(name, globals, *rest)
+    return whole(name, globals, locals, fromlist, level)
 
 builtins.__import__ = lacking
 """
