@@ -75,7 +75,6 @@ the frame.
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Self
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -152,7 +151,9 @@ class FastSlamBelief:
     """(b, n, 4 L), the slopes by the parent; no rows while no landmark has one."""
     best: int = 0  # the heaviest particle, or after a resampling its first copy
     mixed: bool = False  # whether the map is that of all particles
-    before: Self | None = None  # the belief before the resampling, as long as nothing has moved
+    before: "FastSlamBelief | None" = (
+        None  # the belief before the resampling, as long as nothing has moved
+    )
 
     def pose(self) -> Gaussian:
         """Return the vehicle's pose, (3) and (3, 3)."""
