@@ -1,19 +1,25 @@
 """NEES and its bounds: closed forms, laws, statistics with a control that must fail."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from scipy.linalg import expm
 
-from pipistrelle.estimation.beliefs import Gaussian
+from pipistrelle.detection.scans import make_scan
+from pipistrelle.estimation.beliefs import Gaussian, Track, no_landmarks
 from pipistrelle.evaluation.consistency import (
     anees,
     anees_bounds,
     diverged,
     nees,
+    strayed_landmarks,
     track_nees,
 )
+from pipistrelle.geometry import range_and_bearing
+from reference.missions import map_with
 
 SEED = st.integers(0, 2**32 - 1)
 
@@ -219,3 +225,49 @@ def test_a_run_diverges_by_one_nees_above_the_limit_and_not_by_one_at_it(limit):
 @pytest.mark.parametrize("value", [np.nan, np.inf])
 def test_a_run_diverges_by_one_nees_that_is_no_number(value):
     assert diverged(np.array([0.0, value]), 50.0)
+
+
+POSTS = np.array([[4.0, 3.0], [6.0, -2.0], [9.0, 1.0]])
+
+
+def track_past(posts, steps=60):
+    """Return the track of a vehicle that drives east past posts, and knows where all is."""
+    path = np.column_stack([np.linspace(0.0, 3.0, steps), np.zeros((steps, 2))])
+    small, size = 1e-6 * np.eye(3), len(posts)
+    landmarks = map_with(np.arange(size), posts, np.tile(small[:2, :2], (size, 1, 1)))
+    pose = Gaussian(mean=path, covariance=np.tile(small, (steps, 1, 1)))
+    return Track(time=np.arange(float(steps)), pose=pose, landmarks=landmarks, gated=0)
+
+
+def heard_on(track, posts_at, rng=None):
+    """Return a scan at each step of a track: bearings and ranges, a bearing only of the last."""
+    scans = []
+    for time, pose in zip(track.time, track.pose.mean, strict=True):
+        distance, bearing = range_and_bearing(pose, posts_at(time))
+        noise = rng.standard_normal((2, distance.size)) if rng else np.zeros((2, distance.size))
+        distance[-1] = np.nan
+        known = {"range": distance + 0.1 * noise[0], "range_std": 0.1, "bearing_std": 0.02}
+        labels = np.arange(distance.size)
+        scans.append(make_scan(time, labels, bearing + 0.02 * noise[1], **known))
+    return scans
+
+
+@pytest.mark.parametrize("moved", [0, 2])
+def test_a_landmark_that_was_moved_has_strayed_and_no_other(moved):
+    track = track_past(POSTS)
+    shift = np.eye(3)[moved][:, np.newaxis] * np.array([0.0, 1.0])
+    scans = heard_on(track, lambda time: POSTS + shift * (20 <= time < 33))
+    assert strayed_landmarks(track, scans, 0.999) == {moved: (20.0, 32.0, 13)}
+
+
+def test_what_is_far_by_chance_has_not_strayed():
+    track, rng = track_past(POSTS), np.random.default_rng(5)
+    assert strayed_landmarks(track, heard_on(track, lambda _: POSTS, rng), 0.9) == {}
+    once = heard_on(track, lambda time: POSTS + (time == 20.0))
+    assert strayed_landmarks(track, once, 0.999) == {}
+
+
+def test_a_map_without_landmarks_has_none_that_strayed():
+    track = replace(track_past(POSTS), landmarks=no_landmarks())
+    assert strayed_landmarks(track, heard_on(track, lambda _: POSTS), 0.999) == {}
+    assert strayed_landmarks(track, [], 0.999) == {}

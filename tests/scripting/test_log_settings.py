@@ -10,7 +10,7 @@ import pytest
 from pipistrelle.config import Config
 from pipistrelle.experiments.drives import NO_TRUTH
 from pipistrelle.scripting.log_settings import fit_warnings, log_warnings
-from reference.missions import scan_with
+from reference.missions import map_with, scan_with
 from reference.spoilt_logs import noisy_log
 
 LOG = noisy_log(steps=5)
@@ -25,7 +25,7 @@ def trial_of(scan, gated, labels=(), **more):
     track = SimpleNamespace(
         pose=SimpleNamespace(mean=np.zeros((2, 3))),
         labels=labels,
-        landmarks=SimpleNamespace(landmark=np.array([1])),
+        landmarks=map_with([1, 1]),
     )
     scores = SimpleNamespace(gated=gated, nis_mean=None)
     return SimpleNamespace(

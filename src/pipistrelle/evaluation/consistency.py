@@ -1,10 +1,17 @@
 """Consistency: whether a filter's covariance tells how far it is from the truth."""
 
+import math
+from collections.abc import Sequence
+
 import numpy as np
 from jaxtyping import Bool, Float
 
-from pipistrelle.estimation.beliefs import Gaussian
+from pipistrelle.detection.scans import BEARING, BEARING_STD, RANGE, RANGE_STD, Scan
+from pipistrelle.estimation.beliefs import Gaussian, Track, placed, some_of
+from pipistrelle.estimation.measurement import NEAREST
+from pipistrelle.estimation.rays import gate_bounds
 from pipistrelle.evaluation.accuracy import pose_error
+from pipistrelle.geometry import wrap
 
 
 def nees(
@@ -234,3 +241,79 @@ def diverged(nees: Float[np.ndarray, " k"], limit: float) -> bool:
     (False, True)
     """
     return not bool(np.all(np.isfinite(nees) & (nees <= limit)))
+
+
+CHANCE = 1e-3
+"""Probability that a sound track has a landmark that seems to have strayed."""
+
+
+def strayed_landmarks(
+    track: Track, scans: Sequence[Scan], gate: float
+) -> dict[int, tuple[float, float, int]]:
+    r"""Return landmarks of which many successive measurements are far from the final map and path.
+
+    A bearing, with its range if any, is far if its squared residual exceeds the bound of the gate,
+
+    .. math:: d^2 = \nu^T (H_x P_x H_x^T + H_m P_m H_m^T + R)^{-1} \nu
+
+    with the covariances of pose and landmark by themselves. One measurement in 1 / (1 - gate) is,
+    so of N measurements n in a row are with a probability below N (1 - gate)^n.
+
+    Parameters
+    ----------
+    track : Track
+    scans : sequence of Scan
+        With labels and standard deviations.
+    gate : float
+        Share of a predicted distribution that is accepted, below 1.
+
+    Returns
+    -------
+    dict of label to (float, float, int)
+        Of the longest such sequence, where chance is below `CHANCE`: the times of its first and its
+        last measurement [s], and how many they are.
+    """
+    label = np.concatenate([np.empty(0, np.int64), *(scan.landmark for scan in scans)])
+    time = np.repeat([scan.time for scan in scans], [scan.landmark.size for scan in scans])
+    squared, size = _residuals(track, label, time, scans)
+    bounds = np.array([math.inf, *gate_bounds(gate)])
+    far, least = squared > bounds[size], math.log(CHANCE / max(label.size, 1)) / math.log1p(-gate)
+    found = {}
+    for one in np.unique(label[far]).tolist():
+        mine = (label == one) & (size > 0)
+        ends = np.flatnonzero(np.diff(np.concatenate(([False], far[mine], [False])).astype(int)))
+        lengths = ends[1::2] - ends[::2]
+        longest = int(np.argmax(lengths))
+        if lengths[longest] >= least:
+            first, last = ends[2 * longest], ends[2 * longest + 1] - 1
+            found[one] = (*time[mine][[first, last]].tolist(), int(lengths[longest]))
+    return found
+
+
+def _residuals(
+    track: Track, label: np.ndarray, time: np.ndarray, scans: Sequence[Scan]
+) -> tuple[Float[np.ndarray, " m"], np.ndarray]:
+    """Return the squared residual of each row, and of how many numbers it is; 0 off the map."""
+    known = some_of(track.landmarks, placed(track.landmarks))
+    order = np.argsort(known.landmark)
+    at = np.searchsorted(known.landmark[order], label).clip(0, max(order.size - 1, 0))
+    if not order.size:
+        return np.zeros(label.size), np.zeros(label.size, np.int64)
+    n, step = order[at], np.searchsorted(track.time, time - 1e-9).clip(0, track.time.size - 1)
+    numbers = np.concatenate([scan.numbers for scan in scans], axis=1)
+    bearing, distance, bearing_std, range_std = numbers[[BEARING, RANGE, BEARING_STD, RANGE_STD]]
+    pose, P, C = track.pose.mean[step], track.pose.covariance[step], known.covariance[n]
+    dx, dy = (known.mean[n] - pose[:, :2]).T
+    r = np.maximum(np.hypot(dx, dy), NEAREST)
+    c, s, none, ones = dx / r, dy / r, np.zeros_like(r), np.ones_like(r)
+    H = np.array([[-c, -s, none], [s / r, -c / r, -ones]]).transpose(2, 0, 1)
+    S = np.einsum("mia,mab,mjb->mij", H, P, H)
+    S = S + np.einsum("mia,mab,mjb->mij", H[..., :2], C, H[..., :2])
+    S[:, 0, 0] += range_std**2
+    S[:, 1, 1] += bearing_std**2
+    off, turned = distance - r, wrap(bearing - np.arctan2(dy, dx) + pose[:, 2])
+    rest = turned - S[:, 0, 1] / S[:, 0, 0] * off
+    both = off**2 / S[:, 0, 0] + rest**2 / (S[:, 1, 1] - S[:, 0, 1] ** 2 / S[:, 0, 0])
+    size = np.where(np.isnan(bearing), 0, np.where(np.isnan(distance), 1, 2))
+    size[known.landmark[n] != label] = 0
+    return np.select([size == 2, size == 1], [both, turned**2 / S[:, 1, 1]], 0.0), size

@@ -10,7 +10,7 @@ from pydantic import create_model
 from pipistrelle.config import BagConfig, Config, InputError, Section
 from pipistrelle.detection.logs.readers import reader_of
 from pipistrelle.detection.scans import UNLABELLED, WIDEST
-from pipistrelle.estimation.catalogue import SECTIONS, gate_of, short_name
+from pipistrelle.estimation.catalogue import GATE, SECTIONS, gate_of, short_name
 from pipistrelle.experiments.named_settings import each_its_own, laid, own_config
 from pipistrelle.settings import Given, Key, Layer, resolve
 
@@ -279,6 +279,8 @@ def _rejected(trial: "TrialResult", recorded: "Log", config: Config) -> list[Que
     if MAX_IGNORED_SHARE * heard < gated:
         found = f"{gated} of {heard} measurements do not fit what was expected ({who})"
         return [(found, _units(recorded))]
+    if strayed := _strayed(trial, who):
+        return strayed
     expected = 1.0 - _gate(trial.filter, config)
     if (MAX_GATED_SHARE + expected) * heard < gated:
         found = (
@@ -291,6 +293,24 @@ def _rejected(trial: "TrialResult", recorded: "Log", config: Config) -> list[Que
         ]
     found, _, advice = nis_warning(trial).partition("; ")
     return [(found, advice)] if found else []
+
+
+def _strayed(trial: "TrialResult", who: str) -> list[Question]:
+    """Question landmarks of which many successive measurements are far from map and path."""
+    from pipistrelle.evaluation.consistency import strayed_landmarks
+
+    if trial.track.labels:
+        return []
+    strayed = strayed_landmarks(trial.track, trial.scans, GATE)
+    if not strayed:
+        return []
+    label, (first, last, count) = max(strayed.items(), key=lambda one: one[1][2])
+    others = f", and {len(strayed) - 1} more landmarks likewise" * (len(strayed) > 1)
+    found = (
+        f"{count} measurements of landmark {label} in a row, from {first:.15g} to {last:.15g} s, "
+        f"are far from the map and path at the end{others} ({who})"
+    )
+    return [(found, "was it moved, is its label right, or was a loop not closed?")]
 
 
 def _unmapped(trial: "TrialResult", recorded: "Log") -> list[Question]:
