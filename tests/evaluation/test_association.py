@@ -136,3 +136,15 @@ def test_map_that_is_turned_as_a_whole_has_no_false_landmark():
     assert matched(landmarks, *TRUE).names != {1: 7, 2: 8, 3: 9}
     motion = nearest_motion(landmarks.mean, TRUE[1], [STAY, back])
     assert matched(landmarks, *TRUE, motion).names == {1: 7, 2: 8, 3: 9}
+
+
+@pytest.mark.parametrize(
+    ("labels", "share"),
+    [([1, 1, 2, 2], 1.0), ([1, 1, 2, 1], 0.75), ([1, 1, -1, -1], 0.5), ([-1, -1, -1, -1], 0.0)],
+)
+def test_rows_of_landmarks_without_a_label_lower_the_share_that_is_found(labels, share):
+    causes = [np.array([7, 7, 9, 9])]
+    assert associated([np.array(labels)], causes).found == share
+    clutter = associated([np.array([*labels, -1, 3])], [np.array([*causes[0], -1, -1])])
+    assert clutter.found == share, "clutter is of no landmark"
+    assert associated([np.array([3])], [np.array([-1])]).found is None

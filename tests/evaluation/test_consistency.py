@@ -257,17 +257,17 @@ def test_a_landmark_that_was_moved_has_strayed_and_no_other(moved):
     track = track_past(POSTS)
     shift = np.eye(3)[moved][:, np.newaxis] * np.array([0.0, 1.0])
     scans = heard_on(track, lambda time: POSTS + shift * (20 <= time < 33))
-    assert strayed_landmarks(track, scans, 0.999) == {moved: (20.0, 32.0, 13)}
+    assert strayed_landmarks(track, scans, 0.999, 1e-3) == {moved: (20.0, 32.0, 13)}
 
 
 def test_what_is_far_by_chance_has_not_strayed():
     track, rng = track_past(POSTS), np.random.default_rng(5)
-    assert strayed_landmarks(track, heard_on(track, lambda _: POSTS, rng), 0.9) == {}
+    assert strayed_landmarks(track, heard_on(track, lambda _: POSTS, rng), 0.9, 0.1) == {}
     once = heard_on(track, lambda time: POSTS + (time == 20.0))
-    assert strayed_landmarks(track, once, 0.999) == {}
+    assert strayed_landmarks(track, once, 0.999, 1e-3) == {}
 
 
 def test_a_map_without_landmarks_has_none_that_strayed():
     track = replace(track_past(POSTS), landmarks=no_landmarks())
-    assert strayed_landmarks(track, heard_on(track, lambda _: POSTS), 0.999) == {}
-    assert strayed_landmarks(track, [], 0.999) == {}
+    assert strayed_landmarks(track, heard_on(track, lambda _: POSTS), 0.999, 1e-3) == {}
+    assert strayed_landmarks(track, [], 0.999, 1e-3) == {}

@@ -45,13 +45,25 @@ def test_units_are_asked_about_by_the_share_of_what_a_strategy_heard(gated, aske
 
 
 @pytest.mark.parametrize(("mapped", "asked"), [(5, False), (4, True)])
-def test_units_are_asked_about_where_few_rows_of_an_association_are_on_the_map(mapped, asked):
+def test_units_are_asked_about_where_few_rows_of_an_association_are_on_the_map(
+    monkeypatch, mapped, asked
+):
+    unexplained = lambda log: ("", False)  # noqa: E731
+    monkeypatch.setattr("pipistrelle.scripting.misreadings.misreading", unexplained)
     labels = (np.where(np.arange(10) < mapped, 1, -1),)
     log = log_of(distance=np.ones(10))
     lines = fit_warnings(log, [trial_of(log.scans[0], 0, labels)], Path("log"), Config())
     assert [line.split(" (")[0] for line in lines] == [
         "log: 4 of 10 rows are of landmarks of the map at the end"
     ] * asked
+
+
+def test_few_rows_on_the_map_are_no_question_in_a_log_of_few_scans():
+    log = log_of(distance=np.ones(10))
+    assert (
+        fit_warnings(log, [trial_of(log.scans[0], 0, (np.full(10, -1),))], Path("log"), Config())
+        == []
+    )
 
 
 def test_few_rows_on_the_map_are_no_question_where_the_columns_of_a_log_are_right():

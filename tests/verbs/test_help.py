@@ -49,7 +49,7 @@ def test_the_help_of_slam_leaves_out_what_a_log_decides(obey):
     found = set(re.findall(r"--[a-z]+\.[a-z-]+", obey("slam", "--help")[1]))
     rays = ("ratio", "density", "prune", "power", "weights", "likelihood", "spacing")
     rays = (*rays, "merge", "ranged")
-    swarm = ("particles", "resample-below", "mixture", "weights", "resampled-rays")
+    swarm = ("particles", "resample-below", "mixture", "weights", "estimate", "resampled-rays")
     assert found == {
         "--listening.timing",
         *(f"--association.{name}" for name in ("method", "detection", "clutter", "bearing-std")),

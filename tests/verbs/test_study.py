@@ -219,8 +219,8 @@ def test_a_length_of_time_is_worded_in_the_unit_that_fits(seconds, words):
             "--iterations: found 1000000000000, expected 1 to",
         ),
         (
-            "small.toml --receiver.engine block --emitter.frequency 3",
-            "emitter.frequency: found 3 Hz, expected a multiple",
+            "small.toml --receiver.engine block --emitter.frequency 3001",
+            "emitter.frequency: found 3001 Hz, expected a multiple",
         ),
         ("small.toml --emit pbs", 'Invalid value "pbs" for --emit'),
         ("small.toml --emitter.radius 0.01", "--emitter.radius: the plan varies this setting"),

@@ -9,7 +9,8 @@ constants, the truncated sum of squares
 
 with :math:`d_i^2` the squared residual over its variance S (of the measurement and, given the pose,
 of the map). An outlier has a uniform density u: any bearing, any range up to the reach of the
-sensor. So :math:`b_i = -2 \ln u - \ln |2 \pi S|`, and no less than the bound of the gate.
+sensor. So :math:`b_i = -2 \ln u - \ln |2 \pi S|`: the less sure a measurement is, the less it
+counts.
 
 Where the odometry is discarded, the pose has a wide prior of information :math:`\Lambda_0`, and the
 scan costs by Laplace's approximation
@@ -48,7 +49,6 @@ from pipistrelle.detection.scans import (
 )
 from pipistrelle.estimation.beliefs import Belief, JointGaussian
 from pipistrelle.estimation.measurement import excess_path_slopes, observe
-from pipistrelle.estimation.rays import gate_bounds
 from pipistrelle.geometry import wrap_angle
 from pipistrelle.jit import Whole, kernel, no_alloc
 
@@ -56,6 +56,8 @@ DEGREES = 3
 """Numbers of a pose."""
 FASTER = 1.4
 """Factor by which the cost is made less convex at each pass, Yang et al.'s."""
+UNTOLD = 1e-6
+"""Least cost of an outlier: a measurement that is less sure than none tells nothing."""
 SINGULAR = 1e-12
 """Least variance of a predicted pose [m^2, rad^2]."""
 
@@ -116,11 +118,11 @@ def recovered(before: B, after: B, scan: Scan, gate: float, reach: float) -> tup
     """
     if after.gated == before.gated:
         return 0.0
-    joint, bounds = before.joint(), (*gate_bounds(gate), reach)
+    joint = before.joint()
     problem = _problem(joint, scan)
     stds = np.array([reach, reach, math.pi])
-    kept = _cost(problem, after.pose().mean, bounds)[0]
-    pose, cost, fits = _fitted(problem, joint.mean[:3], stds, bounds)
+    kept = _cost(problem, after.pose().mean, reach)[0]
+    pose, cost, fits = _fitted(problem, joint.mean[:3], stds)
     doubt = max(0.0, before.doubt + kept - cost)  # 0 where a cost is not a number
     if doubt <= odometry_bound(gate):
         return doubt
@@ -133,8 +135,6 @@ def recovered(before: B, after: B, scan: Scan, gate: float, reach: float) -> tup
 Problem = tuple[Float[np.ndarray, "8 m"], Int[np.ndarray, "2 m"], np.ndarray, np.ndarray]
 """Numbers of a scan's rows, where landmark and caller of each stand in the joint mean (-1:
 nowhere), this mean, and its covariance given the pose."""
-Bounds = tuple[float, float, float]
-"""Bounds of the gate for one and for two numbers, and the reach of the sensor [m]."""
 
 
 def _problem(joint: JointGaussian, scan: Scan) -> Problem:
@@ -164,16 +164,15 @@ def _fitted(
     problem: Problem,
     predicted: Float[np.ndarray, "3"],
     stds: Float[np.ndarray, "3"],
-    bounds: Bounds,
 ) -> Fit:
     """Return the pose that costs least, by graduated non-convexity from the predicted one."""
-    pose, (_, ratios) = predicted.copy(), _cost(problem, predicted, bounds)
+    pose, (_, ratios) = predicted.copy(), _cost(problem, predicted, stds[0])
     largest = max(ratios.max(), 1.0)
     convexity = 1.0 / (2.0 * largest - 1.0)
     weights, sharp = np.ones(ratios.shape), False
     while not sharp and convexity <= largest:
         _step(problem, pose, weights, predicted, stds)
-        _, ratios = _cost(problem, pose, bounds)
+        _, ratios = _cost(problem, pose, stds[0])
         sharp = True
         for p in range(2):
             for m in range(ratios.shape[1]):
@@ -188,7 +187,7 @@ def _fitted(
         convexity *= FASTER
     _step(problem, pose, weights, predicted, stds)
     information = _step(problem, pose, weights, predicted, stds)
-    cost, ratios = _cost(problem, pose, bounds)
+    cost, ratios = _cost(problem, pose, stds[0])
     for std in stds:
         information += 2.0 * math.log(std)
     return pose, cost + information, ratios <= 1.0
@@ -196,7 +195,7 @@ def _fitted(
 
 @kernel
 def _cost(
-    problem: Problem, pose: Float[np.ndarray, "3"], bounds: Bounds
+    problem: Problem, pose: Float[np.ndarray, "3"], reach: float
 ) -> tuple[float, Float[np.ndarray, "2 m"]]:
     """Return the cost of a pose, and of each measurement the squared residual over its bound.
 
@@ -207,18 +206,17 @@ def _cost(
     for m in range(ratios.shape[1]):
         squared, det, size = _direction(problem, pose, m, 0.0, A, g)
         late, variance = _lateness(problem, pose, m, 0.0, A, g)
-        spread = 2.0 * math.pi if size == 1 else 2.0 * math.pi * bounds[2]
-        most = _outlier(spread, det, size, bounds)
-        latest = _outlier(2.0 * bounds[2], variance, 1, bounds)
+        most = _outlier(2.0 * math.pi * (1.0 if size == 1 else reach), det, size)
+        latest = _outlier(2.0 * reach, variance, 1)
         ratios[0, m], ratios[1, m] = squared / most, late / latest
         cost += min(squared, most) + min(late, latest)
     return cost, ratios
 
 
 @no_alloc
-def _outlier(spread: float, det: float, size: Whole, bounds: Bounds) -> float:
+def _outlier(spread: float, det: float, size: Whole) -> float:
     """Return the cost of an outlier, uniform over a spread, beside a normal measurement's."""
-    return max(2.0 * math.log(spread) - math.log((2.0 * math.pi) ** size * det), bounds[size - 1])
+    return max(2.0 * math.log(spread) - math.log((2.0 * math.pi) ** size * det), UNTOLD)
 
 
 @kernel

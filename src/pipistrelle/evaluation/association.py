@@ -50,6 +50,8 @@ class Associated:
     """How many rows have each label; from positions, 1 if the label is the nearest, else 0."""
     right: float | None
     """Share of the rows with a label that are of the landmark it stands for."""
+    found: float | None
+    """Share of the rows of landmarks that have a label which stands for their landmark."""
     heard: frozenset[int]
     """Landmarks that were heard in `OFTEN` scans or more; from positions, all."""
 
@@ -62,9 +64,9 @@ def associated(
     `moving`: callers that move, which are no landmarks.
 
     >>> labels, causes = [np.array([1, 2]), np.array([1, -1])], [np.array([7, 9])] * 2
-    >>> found = associated(labels, causes)
-    >>> found.names, found.right
-    ({1: 7, 2: 9}, 1.0)
+    >>> of = associated(labels, causes)
+    >>> of.names, of.right, of.found
+    ({1: 7, 2: 9}, 1.0, 0.75)
     """
     votes: dict[int, Counter[int]] = defaultdict(Counter)
     pairs: Counter[tuple[int, int]] = Counter()
@@ -77,11 +79,13 @@ def associated(
             votes[label][cause] = count
     names = {label: of.most_common(1)[0][0] for label, of in votes.items()}
     rows = {label: of.total() for label, of in votes.items()}
+    caused = sum(count for (_, cause), count in pairs.items() if cause != UNLABELLED)
     right = sum(votes[label][name] for label, name in names.items() if name != UNLABELLED)
     return Associated(
         names=names,
         rows=rows,
         right=right / sum(rows.values()) if rows else None,
+        found=right / caused if caused else None,
         heard=frozenset(
             cause for cause, count in scans.items() if count >= OFTEN and cause not in moving
         ),
@@ -152,6 +156,7 @@ def matched(
         names=dict(zip(labels, names, strict=True)),
         rows={label: int(row in partner) for row, label in enumerate(labels)},
         right=None,
+        found=None,
         heard=frozenset(true_landmark.tolist()),
     )
 

@@ -248,7 +248,7 @@ CHANCE = 1e-3
 
 
 def strayed_landmarks(
-    track: Track, scans: Sequence[Scan], gate: float
+    track: Track, scans: Sequence[Scan], gate: float, share: float
 ) -> dict[int, tuple[float, float, int]]:
     r"""Return landmarks of which many successive measurements are far from the final map and path.
 
@@ -256,8 +256,8 @@ def strayed_landmarks(
 
     .. math:: d^2 = \nu^T (H_x P_x H_x^T + H_m P_m H_m^T + R)^{-1} \nu
 
-    with the covariances of pose and landmark by themselves. One measurement in 1 / (1 - gate) is,
-    so of N measurements n in a row are with a probability below N (1 - gate)^n.
+    with the covariances of pose and landmark by themselves. If a share p of sound measurements is,
+    of N measurements n in a row are with a probability below N p^n.
 
     Parameters
     ----------
@@ -266,6 +266,8 @@ def strayed_landmarks(
         With labels and standard deviations.
     gate : float
         Share of a predicted distribution that is accepted, below 1.
+    share : float
+        Share of sound measurements that are far: 1 - gate, and more with outliers.
 
     Returns
     -------
@@ -277,7 +279,7 @@ def strayed_landmarks(
     time = np.repeat([scan.time for scan in scans], [scan.landmark.size for scan in scans])
     squared, size = _residuals(track, label, time, scans)
     bounds = np.array([math.inf, *gate_bounds(gate)])
-    far, least = squared > bounds[size], math.log(CHANCE / max(label.size, 1)) / math.log1p(-gate)
+    far, least = squared > bounds[size], math.log(CHANCE / max(label.size, 1)) / math.log(share)
     found = {}
     for one in np.unique(label[far]).tolist():
         mine = (label == one) & (size > 0)

@@ -91,6 +91,10 @@ SCORES = {
         title="rows rightly associated", digits=3,
         shown=_in("mission", "missions", "studies", "effects", "levels"),
     ),
+    "associated_found": Score(
+        title="rows of landmarks associated", digits=3,
+        shown=_in("mission", "missions", "levels"),
+    ),
     "landmarks_missed": Score(
         title="landmarks missed", unit="landmarks", digits=0, mean_digits=2,
         shown=_in("mission", "missions", "studies", "levels"),

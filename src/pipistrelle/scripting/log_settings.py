@@ -301,7 +301,7 @@ def _strayed(trial: "TrialResult", who: str) -> list[Question]:
 
     if trial.track.labels:
         return []
-    strayed = strayed_landmarks(trial.track, trial.scans, GATE)
+    strayed = strayed_landmarks(trial.track, trial.scans, GATE, MAX_GATED_SHARE + 1.0 - GATE)
     if not strayed:
         return []
     label, (first, last, count) = max(strayed.items(), key=lambda one: one[1][2])
@@ -345,11 +345,14 @@ def _nothing_used(trial: "TrialResult") -> str:
 
 
 def _unsure(trials: "Sequence[TrialResult]", log: Path, config: Config) -> list[str]:
-    """Warn of rows that an association leaves out as too unsure, and name what would take them."""
+    """Warn if an association leaves out most rows as too unsure, and name what would take them."""
     notes = []
     for trial in trials:
         settings = own_config(config, trial.filter).association
+        rows = sum(scan.landmark.size for scan in trial.heard)
         for name, stds in trial.left_out.items():
+            if stds.size < (1.0 - MAX_IGNORED_SHARE) * rows:
+                continue
             what, unit, most = UNSURE[name]
             limit, taken = getattr(settings, name), stds[stds <= most]
             spread = dict.fromkeys(f"{std:.2g}" for std in (stds.min(), stds.max()))

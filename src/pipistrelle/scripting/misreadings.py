@@ -145,12 +145,12 @@ def misreading(recorded: "Log") -> tuple[str, bool]:
     recorded, than with any other mistake undone, and than if no row had a landmark. By the sign
     test over scans, chance names one with a probability of `CHANCE` at most. Else the words are
     empty. Rows fit without if they are more probable so than without landmarks, or than with any
-    mistake undone.
+    mistake undone; and rows of so few scans that nothing could be named count as fitting.
     """
     scan, fits = _fits(recorded)
     scans = np.unique(scan)
-    if not scans.size:
-        return "", False
+    if 2.0**scans.size * CHANCE < len(MISTAKES):
+        return "", True
     total = np.array([fits[scan == one].sum(axis=0) for one in scans])
     best = int(np.argmax(total.sum(axis=0)))
     rivals = np.delete(total, best, axis=1).T

@@ -95,7 +95,9 @@ def test_what_somebody_else_calls_latest_is_left_alone(here, kind):
     before = mine.lstat()
     folder = ran()
     assert names(here) == [folder.name, "latest"]
-    assert mine.lstat() == before
+    after = mine.lstat()
+    for name in ("st_ino", "st_mode", "st_size", "st_mtime_ns"):  # a link may be read
+        assert getattr(after, name) == getattr(before, name)
 
 
 def test_a_link_of_ours_to_a_folder_that_was_removed_is_replaced(here):

@@ -254,6 +254,7 @@ OTHERS = {
     "fastslam.mixture": "exact",
     "fastslam.weights": "sampled",
     "fastslam.resampled_rays": "restart",
+    "fastslam.estimate": "mixture",
 }
 """Another value of every setting, far enough from its default to be heard or believed."""
 FEW = ("air.spreading", "water.spreading", "target.shape", "emitter.radius", "beacon.level_db",

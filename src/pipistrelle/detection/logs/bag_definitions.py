@@ -174,7 +174,7 @@ def _parts(
 def read_definition(name: str, text: str, *, idl: bool = False) -> dict[str, Fields]:
     r"""Read the definitions of a type and of the records in it, by the names of types.
 
-    >>> read_definition("a_msgs/msg/Pair", "float64 x  # ahead\\nfloat64[2] y\\n")
+    >>> read_definition("a_msgs/msg/Pair", "float64 x  # ahead\nfloat64[2] y\n")
     {'a_msgs/msg/Pair': [('x', (1, ('float64', 0))), ('y', (3, ((1, ('float64', 0)), 2)))]}
     """
     if len(text) > LONGEST:

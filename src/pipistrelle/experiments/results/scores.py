@@ -33,7 +33,8 @@ from pipistrelle.evaluation.consistency import diverged, track_nees
 from pipistrelle.experiments.drives import Drive, Truth, split_at
 
 OF_ASSOCIATION = (
-    "associated_right", "landmarks_missed", "landmarks_false", "landmarks_twice",
+    "associated_right", "associated_found",
+    "landmarks_missed", "landmarks_false", "landmarks_twice",
     "gospa_m", "gospa_error_m", "gospa_missed", "gospa_false",
 )  # fmt: skip
 """Scores that known labels do not have."""
@@ -92,6 +93,9 @@ class Scores:
         Share of the rows that an association gave a label which are of the landmark that the label
         stands for (`evaluation.association`); None if no row of a log has a label. None of known
         labels, as are those that follow.
+    associated_found : float or None
+        Share of the rows of landmarks that an association gave the right label: low where much of
+        the map is lost, or where many rows are too unsure to be used.
     landmarks_missed, landmarks_false, landmarks_twice : int or None
         Heard in three scans or more and not on the map; on the map and none, or near none
         (`map_motion`); there twice. If no row of a log has a label, all true landmarks count as
@@ -122,6 +126,7 @@ class Scores:
     gated: int
     nis_mean: float | None = None
     associated_right: float | None = None
+    associated_found: float | None = None
     landmarks_missed: int | None = None
     landmarks_false: int | None = None
     landmarks_twice: int | None = None
@@ -258,6 +263,7 @@ def with_association(
     scores = replace(
         scores,
         associated_right=found.right,
+        associated_found=found.found,
         landmarks_missed=counts.missed,
         landmarks_false=counts.false,
         landmarks_twice=counts.twice,
