@@ -60,7 +60,7 @@ def hear(
         faults = faults_of(recording, config)
         put("\n".join(faults) or "nothing odd was found")
         if faults:
-            warn(f"{recording}: odd in {len(faults)} ways")
+            warn(f"{recording}: found {len(faults)} fault{'s' * (len(faults) > 1)}")
         return 1 if faults else 0
     described(recording)
     if output is None:
