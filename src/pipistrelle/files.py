@@ -100,6 +100,15 @@ def upright(text: str) -> str:
     return "".join(repr(c)[1:-1] if bidirectional(c) in _TURNS else c for c in text)
 
 
+def without_links(path: Path) -> Path:
+    """Return a path without links; that of a link to itself stands as it is.
+
+    >>> without_links(Path("/dev/../dev"))
+    PosixPath('/dev')
+    """
+    return Path(os.path.realpath(path))  # Path.resolve raises RuntimeError for such a link
+
+
 def partial_of(path: Path) -> Path:
     """Return a new name beside a file, under which it is written before it is whole."""
     return path.with_name(f"{path.name}.{uuid4().hex[:8]}.partial")

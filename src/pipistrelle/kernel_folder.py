@@ -161,14 +161,14 @@ def _wanted(plain: bool) -> Path:
         ours = folder.parent.name in ("pipistrelle", _of_user())
         if ours and re.fullmatch(_KEY, folder.name):  # by the process that has started this one
             return folder.with_name(key)
-        return folder.resolve() / _of_user() / key
+        return Path(os.path.realpath(folder)) / _of_user() / key
     cache = Path(os.environ.get("XDG_CACHE_HOME", ""))
     if not cache.is_absolute():  # as the specification wants it
         try:
             cache = Path("~/.cache").expanduser()
         except RuntimeError:  # a user without a home
             cache = Path(os.devnull)
-    return cache.resolve() / "pipistrelle" / key
+    return Path(os.path.realpath(cache)) / "pipistrelle" / key
 
 
 def _drop_old(folder: Path) -> None:

@@ -18,6 +18,7 @@ from pipistrelle.evaluation.bound import IN_ONE_WORLD
 from pipistrelle.scripting import missions
 from pipistrelle.settings import from_text
 from reference.command_line import COMPILING, SHORT, contents, summary, table, track
+from reference.results import loop, mission_folder
 
 
 def test_a_run_tells_its_stages_its_scores_and_last_its_folder(obey):
@@ -296,6 +297,17 @@ def test_a_log_is_saved_to_a_folder_of_its_own(obey, refused, undrawn):
     Path("log/notes.txt").write_text("mine")
     assert "log: is not empty" in refused("run", *SHORT, "--save-log", "log")
     assert "is that of --output" in refused("run", "--save-log", "new", "-o", "./new")
+
+
+def test_a_link_to_itself_is_refused_in_place_of_any_folder(refused, undrawn):
+    Path("loop").symlink_to("loop")
+    mission_folder(Path("one"), {("fused", "ekf"): loop()})
+    for flag in ("--save-log", "--save-world", "--save-sound", "-o"):
+        assert "loop: cannot be used as a folder" in refused("run", *SHORT, flag, "loop")
+    for name in ("loop/a", "a" * 250):
+        assert f"{name}.html: cannot be written" in refused("view", "one", "-o", f"{name}.html")
+    assert "loop: found no such folder" in refused("compare", "loop", "one")
+    assert "loop: found no such folder" in refused("compare", "one", "loop")
 
 
 @pytest.mark.parametrize("name", ["log.toml", "truth.csv", "README.md"])

@@ -9,6 +9,7 @@ from cyclopts import Parameter
 
 from pipistrelle.config import InputError
 from pipistrelle.experiments.named_settings import own_config
+from pipistrelle.files import without_links
 from pipistrelle.own_files import LOG, SOUND, WORLD, Kind, OwnFiles, claim
 from pipistrelle.scripting.arguments import named_strategies
 from pipistrelle.verbs.options import (
@@ -132,7 +133,7 @@ def _check_apart(**folders: Path | None) -> None:
         flag = f"--{name.replace('_', '-')}"
         if folder is None:
             continue
-        if (other := seen.setdefault(folder.resolve(), flag)) != flag:
+        if (other := seen.setdefault(without_links(folder), flag)) != flag:
             raise InputError(f"{flag}: {folder} is that of {other}; name another")
 
 

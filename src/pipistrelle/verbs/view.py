@@ -1,6 +1,7 @@
 """`pipistrelle view`: a mission, frame by frame, on one page."""
 
 import os
+from contextlib import suppress
 from pathlib import Path
 from tempfile import TemporaryFile
 from typing import TYPE_CHECKING, Annotated
@@ -8,8 +9,8 @@ from typing import TYPE_CHECKING, Annotated
 from cyclopts import Parameter
 
 from pipistrelle.config import InputError
-from pipistrelle.files import write_whole
-from pipistrelle.own_files import RESULTS, OwnFiles
+from pipistrelle.files import partial_of, without_links, write_whole
+from pipistrelle.own_files import RESULTS, OwnFiles, make_folder, remove_empty
 
 if TYPE_CHECKING:
     from pipistrelle.figures.player.playback import Playback
@@ -134,16 +135,21 @@ def check_place(path: Path, folder: Path | None, ending: str, option: str, overw
         raise InputError(f"{path}: is of {other.there} of Pipistrelle, which stays whole; {fix}")
     elif os.path.lexists(path) and not overwrite:
         raise InputError(f"{path}: is there already; {fix}, or add --overwrite")
-    if path.parent.exists():
+    try:
+        made = make_folder(path.parent)
         try:
             TemporaryFile(dir=path.parent).close()
-        except OSError as error:
-            raise InputError(f"{path}: cannot be written ({error.strerror}); {fix}") from None
+            with suppress(FileNotFoundError):
+                partial_of(path).lstat()  # an error of a name that is too long
+        finally:
+            remove_empty(made)
+    except OSError as error:
+        raise InputError(f"{path}: cannot be written ({error.strerror}); {fix}") from None
 
 
 def _is_in(path: Path, folder: Path) -> bool:
     """Tell whether a file's place is the result folder itself."""
-    return path.parent.resolve() == folder.resolve()
+    return without_links(path.parent) == without_links(folder)
 
 
 def write_file(path: Path, folder: Path | None, data: bytes, overwrite: bool) -> None:

@@ -6,6 +6,7 @@ from typing import Literal
 
 from pipistrelle.config import InputError
 from pipistrelle.experiments.results.stored import results_in
+from pipistrelle.files import without_links
 
 LETTERS = "ABCDEFGHIJKLMNOPQRSTUVWXYZ"
 """What folders are called where their names have no room."""
@@ -31,7 +32,7 @@ def kind_of(folders: Sequence[Path]) -> Kind:
         raise InputError(f"compare: {found}, {expected}{alone * (len(folders) == 1)}")
     seen: dict[Path, int] = {}
     for i, folder in enumerate(folders):
-        first = seen.setdefault(folder.resolve(), i)
+        first = seen.setdefault(without_links(folder), i)
         if first != i:
             twice = f"is given twice, as {LETTERS[first]} and {LETTERS[i]}"
             also = "" if folders[first].absolute() == folder.absolute() else f" ({folder})"
