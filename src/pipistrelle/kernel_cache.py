@@ -39,8 +39,9 @@ class CheckedFiles(IndexDataCacheFile):
             super().save(key, data)
         except OSError as error:
             _say(
-                f"{self._cache_path}: compiled kernels could not be kept ({error.strerror}), so "
-                "they are compiled at every start; make room or set NUMBA_CACHE_DIR"
+                f"{Path(self._cache_path).parent}: compiled kernels could not be kept "
+                f"({error.strerror}), so they are compiled at every start; make room or set "
+                "NUMBA_CACHE_DIR"
             )
 
     def _load_index(self) -> dict[Any, str]:
@@ -63,7 +64,7 @@ class CheckedFiles(IndexDataCacheFile):
             return False
         if sha256(found[:-32]).digest() == found[-32:]:
             return True
-        _say(f"{path.parent}: a compiled kernel was damaged, and is compiled anew")
+        _say(f"{path.parent.parent}: compiled kernels were damaged, and are compiled anew")
         with suppress(OSError):
             path.unlink()
         return False
