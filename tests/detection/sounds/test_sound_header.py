@@ -117,6 +117,21 @@ def test_a_flac_that_claims_more_than_its_bytes_can_hold_is_refused(tmp_path, sa
     assert "samples" in said
 
 
+@pytest.mark.parametrize("kind", [("flac", "FLAC", "PCM_16"), ("caf", "CAF", "ALAC_16")])
+def test_hours_of_digital_silence_in_a_few_bytes_are_refused_before_they_are_read(tmp_path, kind):
+    import soundfile
+
+    ending, form, width = kind
+    path = recording(tmp_path / "tape")
+    path.unlink()
+    path = path.with_suffix(f".{ending}")
+    soundfile.write(path, np.zeros((400_000, 3)), 96_000, width, format=form)
+    assert "a header of 1200000 samples in" in refused(path.parent)
+    noise = np.random.default_rng(1).normal(0.0, 2.0**-15, (100_000, 3))
+    soundfile.write(path, noise, 96_000, width, format=form)
+    assert samples_of(path.parent) == (100_000, 3)
+
+
 def test_doors_that_are_odd_are_named(tmp_path):
     import os
 

@@ -1,8 +1,9 @@
 """Headers of sound files: whether the bytes that they announce are there, and fit their fields.
 
 Libraries read a file that was cut as a shorter one. WAV (RIFF, RIFX, RF64), W64, AIFF and CAF are
-chunks of a name and a size, of which one holds the sound; AU has one header. Of FLAC no size is
-announced, only a number of samples, of which so many bytes can hold so many at most.
+chunks of a name and a size, of which one holds the sound; AU has one header. FLAC and ALAC announce
+no size but a number of samples. They spend a bit or more on each sample that is not predicted
+exactly: a file of fewer bits than samples is mostly digital silence, or holds fewer than it says.
 """
 
 import struct
@@ -24,8 +25,8 @@ UNTIL_THE_END = {b"caff": 2**64 - 1, b".snd": 0xFFFFFFFF}
 """Sizes that mean all that follows."""
 MOST_CHUNKS = 10_000
 """Most chunks that are looked at."""
-FLAC_BLOCK, FLAC_FRAME = 65_535, 8.0
-"""FLAC: most samples of a block, and fewest bytes of its frame but for 1.5 a channel."""
+PACKED = ("FLAC", "ALAC_16", "ALAC_20", "ALAC_24", "ALAC_32")
+"""Formats and subtypes that pack samples without loss, by prediction and Rice's code."""
 
 
 class _Kind(NamedTuple):
@@ -93,10 +94,11 @@ def check_header(path: Path, file: "SoundFile", header: Header) -> None:
     if not 1 <= file.frames < 2**50:
         found = "no samples, or a number of them that was never filled in, as in a pipe"
         raise refusal(path, found, "a whole sound file", "convert it to WAV")
-    frame = FLAC_FRAME + 1.5 * file.channels
-    if magic == b"fLaC" and file.frames > FLAC_BLOCK * (length / frame + 1.0):
-        found = f"a header of {file.frames} samples, which {length} bytes cannot hold"
-        raise refusal(path, found, "a whole sound file", "copy it again")
+    samples = file.frames * file.channels
+    if {file.format, file.subtype} & {*PACKED} and samples > 8 * length:
+        found = f"a header of {samples} samples in {length} bytes"
+        expected = "a bit or more for each: the noise of microphones takes several"
+        raise refusal(path, found, expected, "copy it again, or cut digital silence out")
 
 
 def _check_size(path: Path, file: "SoundFile", said: _Announced, magic: bytes) -> None:
