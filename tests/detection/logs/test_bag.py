@@ -12,6 +12,7 @@ import pytest
 from pipistrelle.__main__ import main
 from pipistrelle.config import BagConfig, Config, InputError
 from pipistrelle.detection.logs.bag import opened
+from pipistrelle.detection.logs.bag_unpacking import bounded_unpacking
 from pipistrelle.detection.logs.folder import read_log
 from pipistrelle.detection.logs.poses import poses_along
 from pipistrelle.experiments.drives import Truth
@@ -703,6 +704,47 @@ def test_compressed_bags_are_read(tmp_path, name, how):
     told = sorted([*drive(), seen(0.2)], key=lambda one: one[2])
     path = write_bag(tmp_path / name, told, compression=how)
     assert only(load(path)[0]).landmark[0] == 7
+
+
+@pytest.mark.parametrize(
+    ("name", "how"),
+    [
+        ("walk", "FILE"),
+        ("walk", "MESSAGE"),
+        ("walk.mcap", "STORAGE"),
+        ("walk.bag", "LZ4"),
+        ("walk.bag", "BZ2"),
+    ],
+)
+def test_compressed_parts_that_unpack_to_too_much_are_refused(tmp_path, monkeypatch, name, how):
+    told = sorted([*drive(), seen(0.2)], key=lambda one: one[2])
+    path = write_bag(tmp_path / name, told, compression=how)
+    with monkeypatch.context() as patch:
+        patch.setattr("pipistrelle.detection.logs.bag_unpacking.MOST_UNPACKED", 90)
+        patch.setattr("pipistrelle.detection.logs.bag_unpacking.ROOM", 0.0)
+        words = "of the room in" if how == "FILE" else "that unpack to more than 90"
+        refused(path, words)
+    assert only(load(path)[0]).landmark[0] == 7
+
+
+@pytest.mark.parametrize("form", ["zstd", "lz4"])
+def test_a_chunk_of_a_few_bytes_that_unpacks_to_gigabytes_takes_little_memory(form):
+    from importlib import import_module
+
+    from rosbags.rosbag2 import reader
+    from rosbags.rosbag2.storage_mcap import DECOMPRESSORS
+
+    pack = reader.zstd if form == "zstd" else import_module("lz4.frame")
+    bomb, sound = pack.compress(bytes(2**30)), pack.compress(b"sound")
+    with bounded_unpacking():
+        unpack = DECOMPRESSORS[form]
+        with pytest.raises(ValueError, match="unpack to more than 128000000"):
+            unpack(bomb, 5)
+        assert unpack(sound * 100, 500) == b"sound" * 100
+        for odd, said in ((sound * 101, "100 frames"), (sound[:-1], "cut"), (b"", "cut")):
+            with pytest.raises(ValueError, match=said):
+                unpack(odd, 5)
+    assert unpack is not DECOMPRESSORS[form]
 
 
 def ending(path):

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 from pipistrelle.config import InputError
 from pipistrelle.detection.logs.bag_definitions import types_of
+from pipistrelle.detection.logs.bag_unpacking import bounded_unpacking
 from pipistrelle.detection.logs.readers import storages
 from pipistrelle.files import check_ordinary
 from pipistrelle.refusals import meant, refusal, shown
@@ -150,6 +151,7 @@ def opened(path: Path) -> Iterator[Bag]:
 
     kind: Any = Reader1 if whole.suffix == ".bag" and whole.is_file() else Reader2
     with ExitStack() as stack:
+        stack.enter_context(bounded_unpacking())
         with faults_named(str(path)):
             reader = stack.enter_context(kind(whole))
             if kind is Reader2:
