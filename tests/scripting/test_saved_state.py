@@ -201,6 +201,16 @@ def nested(count):
     return spoil
 
 
+def shared(kind, *more):
+    """Return what nests a container in itself so that it has 9^12 parts, and uses it."""
+
+    def spoil(header, data):
+        nodes = [["tuple", 1], *(["tuple", *[[i]] * 9] for i in range(12)), [kind, *more]]
+        return header | {"nodes": [*nodes, *header["nodes"]]}, data
+
+    return spoil
+
+
 def spelt(header, word):
     """Return a line of JSON with a word in place of a number."""
     return json.dumps(header).encode().replace(b"0.1", word)
@@ -254,6 +264,9 @@ SPOILT = {
     "nodes that are words": lambda header, data: (header | {"nodes": "tuple"}, data),
     "tuples within tuples": nested(DEEPEST),
     "a million tuples within tuples": nested(10**6),
+    "a key that takes years to hash": shared("dict", [12], 1),
+    "a member that takes years to hash": shared("set", [12]),
+    "a field that takes years to check": shared("record", "EkfBelief", *[[12]] * 8),
     "lists within lists": lambda header, data: (b"[" * 10**6 + b"]" * 10**6, data),
     "a number of a million digits": lambda header, data: (b"[1" + b"0" * 10**6 + b"]", data),
     "no number": lambda header, data: (spelt(header, b"NaN"), data),

@@ -43,6 +43,9 @@ OWN = ":"
 """Begins the name of a record of a module from outside."""
 DEEPEST = 32
 """Most nodes within each other: a belief in a session's memory has about ten."""
+MOST_SHARED = 1_000_000
+"""Parts that a file may save by sharing: a node that names another several times, and is named so
+itself, and so on, has as many parts as could never be walked through."""
 _SCALARS = (type(None), bool, int, str)
 _CONTAINERS: dict[str, Callable[..., Any]] = {
     one.__name__: one for one in (tuple, list, set, frozenset)
@@ -247,15 +250,21 @@ class _Read:
         self._dtypes = _DTYPES if modules else _OURS
         self._values: list[Any] = []
         self._depths: list[int] = []
+        self._sizes: list[int] = []
+        """Parts of each value, and of all within it."""
+        self._parts = self._walked = 0
 
     def all(self, nodes: list[Any]) -> Any:
         """Return the value of the last node."""
         for kind, *rest in nodes:
-            self._depth = 0
+            self._depth, before = 0, self._walked
+            self._parts += 1 + len(rest)
+            self._walked += 1 + len(rest)
             self._values.append(self._value(kind, rest))
             if self._depth >= DEEPEST:
                 raise ValueError("too deep")
             self._depths.append(1 + self._depth)
+            self._sizes.append(self._walked - before)
         if self._at != len(self._data):
             raise ValueError("bytes of no array")
         return self._values[-1]
@@ -283,6 +292,9 @@ class _Read:
         if type(number) is not int or not 0 <= number < len(self._values):
             raise IndexError(number)
         self._depth = max(self._depth, self._depths[number])
+        self._walked += self._sizes[number]
+        if self._walked > DEEPEST * (self._parts + MOST_SHARED):
+            raise ValueError("too many parts")
         return self._values[number]
 
     def _record(self, name: str, *parts: Any) -> Any:
