@@ -94,6 +94,7 @@ AT_THE_DISK = {
     "experiments/studies/store.py": {"unlink"},  # what a killed writer left, by its name
     "experiments/studies/world_files.py": {"scan_parquet", "unlink"},  # checked; left by a kill
     "detection/sounds/sound_header.py": {"open"},  # a few bytes of an ordinary file
+    "detection/logs/bag_unpacking.py": {"open"},  # of a compressed file that rosbags has opened
     "detection/logs/text_tables.py": {"loadtxt"},  # of lines that were read
     "figures/player/page.py": {"read_text"},  # the package's own pages
     "report/page/page.py": {"read_text"},
