@@ -132,6 +132,18 @@ def test_a_drive_that_is_saved_and_loaded_goes_on_to_the_same_bits(tmp_path, nam
     assert parts_of(twice.save(tmp_path / "twice.slam"))[1] == parts_of(tmp_path / "whole.slam")[1]
 
 
+@pytest.mark.parametrize("stated", [{}, {"place": [9.0, 4.0], "place_std": [0.1, 0.1]}])
+def test_a_drive_with_a_caller_is_saved_and_loaded_without_labels(tmp_path, stated):
+    robot = ROBOT | {"callers": [{"name": "mate", "landmark": 900, **stated}]}
+    whole = Slam(robot, filter="iekf", association__method="marginal")
+    driven(whole, 10)
+    again = Slam.load(whole.save(tmp_path / "half.slam"))
+    driven(again, 5, seed=6)
+    driven(whole, 5, seed=6)
+    assert again.map.equals(whole.map)
+    assert (900 in again.map["landmark"]) == bool(stated)
+
+
 def popen(module, name):
     """Return a pickle that calls something of a module, by a name that may have dots."""
     word = lambda text: b"\x8c" + bytes([len(text)]) + text.encode()  # noqa: E731

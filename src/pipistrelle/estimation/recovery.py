@@ -28,6 +28,7 @@ Letters 5 (2020).
 """
 
 import math
+from collections.abc import Callable
 from dataclasses import replace
 from functools import cache
 from typing import Any, Protocol, Self, TypeVar
@@ -94,6 +95,23 @@ def odometry_bound(gate: float) -> float:
     from scipy.special import gammaincinv
 
     return float(2.0 * gammaincinv(0.5 * DEGREES, gate))
+
+
+def corrected(
+    correct: Callable[[B, Scan], B], belief: B, scan: Scan, gate: float, reach: float
+) -> B:
+    """Correct a belief with a scan, without the odometry before it if that failed (`recovered`).
+
+    ``correct``: the correction of an estimator.
+    """
+    after: Any = correct(belief, scan)
+    if gate >= 1.0:
+        return after
+    found = recovered(belief, after, scan, gate, reach)
+    if isinstance(found, float):
+        return replace(after, doubt=found)
+    free: Any = correct(*found)
+    return replace(free, doubt=0.0)
 
 
 def recovered(before: B, after: B, scan: Scan, gate: float, reach: float) -> tuple[B, Scan] | float:

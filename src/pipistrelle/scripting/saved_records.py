@@ -131,9 +131,9 @@ def _is_pose(gaussian: Gaussian) -> bool:
 
 
 def _memory(memory: Memory) -> bool:
-    """Labels are those that were given."""
-    labels = [*memory.known.label.tolist(), *(caller.label for caller in memory.callers.values())]
-    return memory.scan >= 0 and within(labels, 0, memory.labels + 1)
+    """Labels are those that were given, and those of callers whose place was stated."""
+    known, callers = memory.known.label, [caller.label for caller in memory.callers.values()]
+    return memory.scan >= 0 and within(known, 0, memory.labels + 1) and min(callers, default=0) >= 0
 
 
 def _known(known: Known) -> bool:

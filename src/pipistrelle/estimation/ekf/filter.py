@@ -19,6 +19,7 @@ from jaxtyping import Bool, Float, Int
 
 from pipistrelle.config import RayConfig
 from pipistrelle.detection.scans import Scan
+from pipistrelle.estimation import recovery
 from pipistrelle.estimation.beliefs import (
     NO_INNOVATIONS,
     Gaussian,
@@ -54,7 +55,6 @@ from pipistrelle.estimation.ekf.invariant_error import (
 from pipistrelle.estimation.measurement import columns_of, timings_of
 from pipistrelle.estimation.motion import Motion, motion_numbers
 from pipistrelle.estimation.rays import update_params
-from pipistrelle.estimation.recovery import recovered
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -366,13 +366,9 @@ class EkfSlam:
         scan = usable_scan(scan)
         if scan.landmark.size == 0:
             return belief
-        after = self._corrected(belief, scan)
-        if self.gate < 1.0:
-            found = recovered(belief, after, scan, self.gate, self.rays.range_bounds[1])
-            if isinstance(found, float):
-                return replace(after, doubt=found)
-            after = replace(self._corrected(*found), doubt=0.0)
-        return after
+        return recovery.corrected(
+            self._corrected, belief, scan, self.gate, self.rays.range_bounds[1]
+        )
 
     def _corrected(self, belief: EkfBelief, scan: Scan) -> EkfBelief:
         """Correct the belief with the measurements that pass the gate."""

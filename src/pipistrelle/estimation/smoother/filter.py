@@ -37,7 +37,7 @@ from pipistrelle.estimation.checking import (
 from pipistrelle.estimation.measurement import HUBER_K
 from pipistrelle.estimation.motion import Motion
 from pipistrelle.estimation.rays import gate_bounds
-from pipistrelle.estimation.recovery import recovered
+from pipistrelle.estimation.recovery import corrected
 from pipistrelle.estimation.smoother.belief import SmootherBelief
 from pipistrelle.estimation.smoother.calibration import NOTHING, Calibration
 from pipistrelle.estimation.smoother.chain import eliminated, off_line, relinearised, stepped
@@ -162,13 +162,7 @@ class Smoother:
         scan = usable_scan(scan)
         if scan.landmark.size == 0:
             return belief
-        after = self._corrected(belief, scan)
-        if self.gate < 1.0:
-            found = recovered(belief, after, scan, self.gate, self.rays.range_bounds[1])
-            if isinstance(found, float):
-                return replace(after, doubt=found)
-            after = replace(self._corrected(*found), doubt=0.0)
-        return after
+        return corrected(self._corrected, belief, scan, self.gate, self.rays.range_bounds[1])
 
     def _corrected(self, belief: SmootherBelief, scan: Scan) -> SmootherBelief:
         """Correct the belief with the measurements that pass the gate."""
