@@ -75,6 +75,7 @@ import pytest
         ("slam one two", "slam: found 'two', but slam takes one argument"),
         ("config show extra", "config show: found 'extra', but config show takes no arguments"),
         ("run --scenario.start 0 0", "--scenario.start: found 2 values, expected 3"),
+        ("run --scenario.start {a=1}", "--scenario.start: Incorrect number of arguments"),
         (
             "run --scenario.start -1e308 0 0",
             "--scenario.start: found (-1e+308, 0.0, 0.0), expected",

@@ -190,6 +190,9 @@ def _explained(error: Exception, words: Sequence[str]) -> str | None:
         if expected > 1:
             found = len(error.tokens_so_far) % expected
             return f"{error.keyword}: found {found} values, expected {expected}"
+    argument = getattr(error, "argument", None)
+    if isinstance(error, CycloptsError) and argument and argument.name not in str(error):
+        return f"{argument.name}: {error}"
     return str(error) if isinstance(error, (CycloptsError, InputError)) else None
 
 

@@ -143,6 +143,8 @@ def check_place(path: Path, folder: Path | None, ending: str, option: str, overw
                 partial_of(path).lstat()  # an error of a name that is too long
         finally:
             remove_empty(made)
+    except FileExistsError:  # what should be the folder
+        raise InputError(f"{path}: cannot be written (Not a directory); {fix}") from None
     except OSError as error:
         raise InputError(f"{path}: cannot be written ({error.strerror}); {fix}") from None
 
