@@ -14,6 +14,8 @@ from benchmarks.machine import answer
 from benchmarks.promises import row
 from benchmarks.table import Row
 from pipistrelle import Slam
+from pipistrelle.estimation.motion import Motion, motion_step
+from pipistrelle.geometry import range_and_bearing
 
 ROBOT = {
     "motion": "unicycle",
@@ -23,6 +25,7 @@ ROBOT = {
     "bearing_std": 0.01,
     "range_bounds": [0.5, 50.0],
 }
+MOTION, CONTROL = Motion(model="unicycle", control_std=(0.05, 0.05)), (0.5, 0.1)
 ESTIMATORS, LANDMARKS = ("ekf", "iekf"), (50, 200, 1000)
 HEARD, SCANS, STEP = 25, 1000, 0.1
 """Rows of a scan, scans that are timed, and the time from one to the next [s]."""
@@ -48,14 +51,15 @@ def latencies(name: str, landmarks: int) -> list[float]:
     """Return the median, the 99th of a hundred, and the worst time of a scan [ms]."""
     rng, slam, seconds = np.random.default_rng(0), Slam(ROBOT, filter=name), []
     places = rng.uniform(-20.0, 20.0, (landmarks, 2))
-    rounds = -(-landmarks // HEARD)
+    rounds, pose = -(-landmarks // HEARD), np.zeros(3)
     for k in range(rounds + SCANS):
-        slam.move([0.5, 0.1], dt=STEP)
+        slam.move(CONTROL, dt=STEP)
+        pose = motion_step(MOTION, pose, np.array(CONTROL), STEP)
         if k < rounds:
             heard = np.arange(landmarks)[HEARD * k : HEARD * (k + 1)]
         else:
             heard = rng.choice(landmarks, HEARD, replace=False)
-        columns = _measured(slam, places[heard], rng)
+        columns = _measured(pose, places[heard], rng)
         began = time.thread_time()
         slam.hear(landmark=heard, **columns)
         seconds.append(time.thread_time() - began)
@@ -63,14 +67,14 @@ def latencies(name: str, landmarks: int) -> list[float]:
 
 
 def _measured(
-    slam: Slam, places: Float[np.ndarray, "m 2"], rng: np.random.Generator
+    pose: Float[np.ndarray, "3"], places: Float[np.ndarray, "m 2"], rng: np.random.Generator
 ) -> dict[str, Float[np.ndarray, " m"]]:
-    """Return bearings and ranges of places, as if the vehicle was where it thinks it is."""
-    x, y = (places - (slam.pose.x, slam.pose.y)).T
+    """Return bearings and ranges of places from a pose."""
+    distance, bearing = range_and_bearing(pose, places)
     noise = rng.normal(0.0, 1.0, (2, len(places)))
     return {
-        "bearing": np.arctan2(y, x) - slam.pose.heading + ROBOT["bearing_std"] * noise[0],
-        "range": np.hypot(x, y) + ROBOT["range_std"] * noise[1],
+        "bearing": bearing + ROBOT["bearing_std"] * noise[0],
+        "range": np.maximum(distance + ROBOT["range_std"] * noise[1], ROBOT["range_std"]),
     }
 
 

@@ -159,3 +159,15 @@ def test_the_fitted_pose_is_the_true_one_though_half_of_the_rows_are_wrong(kind)
     free, kept = found
     np.testing.assert_array_equal(kept.landmark, scan.landmark[~wrong])
     assert np.abs(free.pose().mean - poses[-1]).max() < 0.1
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_part_of_the_joint_gaussian_is_that_of_some_landmarks(kind):
+    (_, belief) = followed(slam_of(kind), driven(30)[1])[-1]
+    whole, labels = belief.joint(), belief.joint().landmark[::2]
+    part = belief.joint(labels)
+    np.testing.assert_array_equal(np.sort(part.landmark), np.sort(labels))
+    places = [3 + 2 * whole.landmark.tolist().index(label) for label in part.landmark]
+    at = np.concatenate([[0, 1, 2], *([i, i + 1] for i in places)])
+    np.testing.assert_array_equal(part.mean, whole.mean[at])
+    np.testing.assert_allclose(part.covariance, whole.covariance[np.ix_(at, at)], atol=1e-15)

@@ -71,8 +71,8 @@ class Recoverable(Belief, Protocol):
         """Sum of what discarding the odometry would have gained in the last scans."""
         ...
 
-    def joint(self) -> JointGaussian:
-        """Return pose and landmarks together."""
+    def joint(self, among: Int[np.ndarray, " n"] | None = None) -> JointGaussian:
+        """Return pose and landmarks together, or only the landmarks among some labels."""
         ...
 
     def freed(self, pose: Float[np.ndarray, "3"], stds: Float[np.ndarray, "3"]) -> Self:
@@ -109,7 +109,7 @@ def corrected(
         return after
     found = recovered(belief, after, scan, gate, reach)
     if isinstance(found, float):
-        return replace(after, doubt=found)
+        return after if found == after.doubt else replace(after, doubt=found)
     free: Any = correct(*found)
     return replace(free, doubt=0.0)
 
@@ -136,7 +136,8 @@ def recovered(before: B, after: B, scan: Scan, gate: float, reach: float) -> tup
     """
     if after.gated == before.gated:
         return 0.0
-    joint = before.joint()
+    callers = scan.callers[scan.caller[scan.caller < scan.callers.size]]
+    joint = before.joint(np.append(scan.landmark, callers))
     problem = _problem(joint, scan)
     stds = np.array([reach, reach, math.pi])
     kept = _cost(problem, after.pose().mean, reach)[0]

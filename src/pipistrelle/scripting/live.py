@@ -1,6 +1,7 @@
 """A vehicle that drives now: a step and a scan at a time, as the robot has them."""
 
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple, Self, TypeVar
@@ -447,6 +448,9 @@ def _fault(pose: Gaussian) -> tuple[str, str] | None:
     """
     if not (np.isfinite(pose.mean).all() and np.isfinite(pose.covariance).all()):
         return "a pose that is no number", "a finite one"
+    with suppress(np.linalg.LinAlgError):
+        np.linalg.cholesky(pose.covariance)  # sooner than the eigenvalues
+        return None
     least, *_, largest = np.linalg.eigvalsh(pose.covariance).tolist()
     if least < -ROUNDING * largest:
         return f"a pose unsure to {largest**0.5:.3g} m, beyond what numbers can hold", "a surer one"

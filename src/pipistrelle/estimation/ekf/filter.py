@@ -108,9 +108,14 @@ class EkfBelief:
         mean, covariance = self._linear(kept, with_pose=False)
         return _map_of(self.landmark[kept], self.weight[kept], mean.reshape(-1, 2), covariance)
 
-    def joint(self) -> JointGaussian:
-        """Return pose and placed landmarks together, callers that move among them."""
+    def joint(self, among: Int[np.ndarray, " n"] | None = None) -> JointGaussian:
+        """Return pose and placed landmarks together, callers that move among them.
+
+        ``among``: labels of the only landmarks that are returned.
+        """
         placed = is_placed(self.landmark)
+        if among is not None:
+            placed &= np.isin(self.landmark, among)
         mean, covariance = self._linear(placed, with_pose=True)
         return JointGaussian(landmark=self.landmark[placed], mean=mean, covariance=covariance)
 

@@ -5,7 +5,7 @@ from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
 from pipistrelle.config import RayConfig
 from pipistrelle.detection.scans import BEARING, BEARING_STD
@@ -121,11 +121,16 @@ class SmootherBelief:
         """Return the labels of all landmarks and callers, placed or not."""
         return [label for label, _ in self.history.slots if label >= 0]
 
-    def joint(self) -> JointGaussian:
-        """Return pose and placed landmarks together, callers that move among them."""
+    def joint(self, among: Int[np.ndarray, " n"] | None = None) -> JointGaussian:
+        """Return pose and placed landmarks together, callers that move among them.
+
+        ``among``: labels of the only landmarks that are returned, besides callers that move.
+        """
         solution, steps = self.solution, self.ahead.mean[:2] - self.at.mean[:2]
         d, n, callers = len(solution.state), solution.beta.size, self._callers()
         there = np.flatnonzero(solution.columns)
+        if among is not None:
+            there = there[np.isin(np.array(self.history.placed, np.int64)[there], among)]
         at, rows = solution.columns[there], 3 + 2 * np.arange(there.size)
         first, seconds = 3 + 2 * there.size, self.odometry.seconds
         size, guess = first + 2 * len(callers), self.guess()
