@@ -59,7 +59,7 @@ def mixture_map(belief: "FastSlamBelief") -> Landmarks:
     off = of.members[..., :2] - of.spots
     spread = np.einsum("pn,pna,pnb->nab", of.share, off, off)
     own = np.einsum("pn,pne->ne", of.share, of.members[..., 2:5])[:, [0, 1, 1, 2]]
-    labels, rows = [belief.landmark[of.there]], [of.spots]
+    numbers, rows = [of.there], [of.spots]
     spreads, weights = [spread + own.reshape(-1, 2, 2)], [np.ones(of.there.size)]
     count = _lanes(belief.count)[: of.weight.size]
     for n in np.setdiff1d(np.arange(belief.landmark.size), of.there).tolist():
@@ -67,14 +67,14 @@ def mixture_map(belief: "FastSlamBelief") -> Landmarks:
         first, size = belief.first[n], count[best, n]
         lane = belief.member[best // LANES, first : first + size]
         members = lane.reshape(size, 6, LANES)[..., best % LANES]
-        labels.append(np.full(size, belief.landmark[n]))
+        numbers.append(np.full(size, n))
         rows.append(members[:, :2])
         spreads.append(members[:, [2, 3, 3, 4]].reshape(-1, 2, 2))
         weights.append(np.exp(members[:, 5]))
-    label = np.concatenate(labels)
-    order = np.argsort([belief.landmark.tolist().index(one) for one in label], kind="stable")
+    number = np.concatenate(numbers)
+    order = np.argsort(number, kind="stable")
     return Landmarks(
-        landmark=label[order],
+        landmark=belief.landmark[number[order]],
         mean=np.concatenate(rows)[order],
         covariance=np.concatenate(spreads)[order],
         weight=np.concatenate(weights)[order],
