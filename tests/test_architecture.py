@@ -71,9 +71,17 @@ def test_a_door_is_narrow(room):
     assert len(offered) <= 8
 
 
-@pytest.mark.parametrize("path", SOURCES, ids=lambda path: str(path.relative_to(PACKAGE)))
-def test_the_body_of_a_function_fits_on_a_screen(path):
-    assert {f.name: body_lines(f) for f in functions(path) if body_lines(f) > 40} == {}
+def most_lines(function: ast.FunctionDef) -> int:
+    """Return how long the body of a function may be."""
+    compiled = {"kernel", "inlined", "no_alloc", "no_alloc_inlined", "optimised_once"}
+    marks = {part.id for part in function.decorator_list if isinstance(part, ast.Name)}
+    return 90 if marks & compiled else 60
+
+
+def test_the_body_of_a_function_fits_on_a_screen():
+    all_functions = ((path.name, f) for path in SOURCES for f in functions(path))
+    long = [(name, f.name) for name, f in all_functions if body_lines(f) > most_lines(f)]
+    assert long == []
 
 
 def test_no_module_is_a_drawer():

@@ -8,7 +8,7 @@ import pytest
 
 RULE = Path(__file__).parents[1] / ".ci" / "commit-message"
 HOME = "/".join(("", "home", "ann"))
-SOUND = "Bearings are wrapped before they are compared\n\nAt the back they differed by a turn.\n"
+SOUND = "Matching: wrap bearings before they are compared\n\nAt the back they differed by a turn.\n"
 
 
 def told(tmp_path: Path, message: str) -> tuple[int, str]:
@@ -28,19 +28,21 @@ def test_a_message_says_what_and_why(tmp_path):
 @pytest.mark.parametrize(
     ("message", "fault"),
     [
-        ("Mend it\n", "nothing says why"),
-        ("Mend it\n\n# a remark\n", "nothing says why"),
-        ("x" * 73 + "\n\nwhy\n", "the first line has 73 characters, expected 1 to 72"),
+        ("Bags: mend it\n", "nothing says why"),
+        ("Bags: mend it\n\n# a remark\n", "nothing says why"),
+        ("Bags: " + "x" * 67 + "\n\nwhy\n", "the first line has 73 characters, expected 1 to 72"),
         ("\n", "the first line has 0 characters"),
-        ("Mend it.\n\nwhy\n", "without a full stop"),
-        ("Mend it\nwhy\n", "the second line holds text"),
+        ("Bags: mend it.\n\nwhy\n", "without a full stop"),
+        ("Bags: mend it\nwhy\n", "the second line holds text"),
+        ("Mend the bags\n\nwhy\n", "expected 'Area: verb object'"),
+        ("bags: mend it\n\nwhy\n", "expected 'Area: verb object'"),
         ("Merge branch 'other'\n\nwhy\n", "history is a line"),
         (
-            f"Mend it\n\nAs {HOME}/try.py shows.\n",
+            f"Bags: mend it\n\nAs {HOME}/try.py shows.\n",
             f"'{HOME}/try.py' is a folder of one machine",
         ),
-        ("Mend it\n\nAs {}\\ann shows.\n".format("C:"), "is a folder of one machine"),
-        ("Mend it\n\nAs ~/try.py shows.\n", "'~/try.py' is a folder of one machine"),
+        ("Bags: mend it\n\nAs {}\\ann shows.\n".format("C:"), "is a folder of one machine"),
+        ("Bags: mend it\n\nAs ~/try.py shows.\n", "'~/try.py' is a folder of one machine"),
     ],
 )
 def test_a_message_that_does_not_is_refused_with_the_reason(tmp_path, message, fault):

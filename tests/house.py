@@ -1,0 +1,265 @@
+"""Measure the size and the prose of the house: `./dev house` prints them beside their budgets."""
+
+import argparse
+import ast
+import re
+import sys
+import tomllib
+from collections import Counter
+from collections.abc import Iterator
+from functools import cache
+from pathlib import Path
+from typing import NamedTuple
+
+ROOT = Path(__file__).resolve().parents[1]
+BUDGETS = Path(__file__).with_suffix(".toml")
+
+SLACK = 0.02
+"""How far a measure may fall below its budget, as a share of the budget, before it is lowered."""
+
+RULES = {
+    "R1 nominal what": r"\bwhat\b(?! to\b)",
+    "R2 tell, say": r"\b(tells?|told|says?|said)\b",
+    "R3 who, nobody": r"\b(who|whom|whose|whoever|nobody|anybody|somebody)\b",
+    "R4 of which": r"\b(of|by|in|from|to|with|on|at) (which|whom)\b",
+    "R5 those, that of": r"\bthose\b|\bthat of\b|\bas one\b",
+    "R6 alone, anew": r"\b(alone|anew|alike|likewise|apart|beside)\b",
+    "R7 hang, stand, lie": r"\b(hangs?|stands?|lies?|lay|laid|bears?|throws?|thrown)\b",
+    "R8 its own": r"\b(its|their|one's|our|his) own\b",
+    "R9 one": r"\b(each|every|this|that|the|no|which|any|some|another) one\b"
+    r"|\bones?\b(?= (that|which|is|are|has))",
+    "R10 as it is": r"\bas (it|they|one|these|those) (is|was|are|were|has|have|do|does)\b",
+    "R11 too, more": r", too\b|\b(range|row|slot|landmark|step)s? more\b",
+}
+"""Constructions that a first line, a text of a setting and the name of a test avoid."""
+
+IDIOM = re.compile(
+    r"\bwhat\b|\b(who|whom|whose|whoever)\b|\b(nobody|somebody|anybody|everybody)\b"
+    r"|\b(tells?|told|telling)\b|\b(says?|said)\b|\bhangs? on\b"
+    r"|\b(of|by|in|from|to|with|on) (which|whom)\b|\banew\b|\balone\b|\bstands?\b"
+    r"|\b(alike|likewise)\b|\bthose\b|\bbut for\b|, too\b|\bone\b|\bbears?\b|\bapart\b"
+    r"|\bas (it|they) (is|was|are|were|has|have)\b",
+    re.IGNORECASE,
+)
+"""Words that are counted in whole docstrings."""
+
+LEANING = re.compile(r"(Of|Or|Else|The same|As above)\b")
+"""How the text of a setting begins if it needs the text before it."""
+
+
+class Flagged(NamedTuple):
+    """A line that breaks rules of prose."""
+
+    where: str
+    text: str
+    rules: list[str]
+
+
+class House(NamedTuple):
+    """The measures by name, and the lines that were flagged."""
+
+    measures: dict[str, float]
+    flagged: list[Flagged]
+
+
+def broken_rules(line: str) -> list[str]:
+    """Return the names of the rules that a line breaks."""
+    return [name for name, rule in RULES.items() if re.search(rule, line, re.IGNORECASE)]
+
+
+def is_record(node: ast.AST) -> bool:
+    """Return whether a node is a dataclass or a named tuple."""
+    return isinstance(node, ast.ClassDef) and (
+        any("dataclass" in ast.dump(decorator) for decorator in node.decorator_list)
+        or any("NamedTuple" in ast.dump(base) for base in node.bases)
+    )
+
+
+def docstring_lines(tree: ast.Module) -> set[int]:
+    """Return the numbers of the lines of all bare strings: docstrings, and texts below fields."""
+    bodies = (getattr(node, "body", None) for node in ast.walk(tree))
+    strings = (
+        statement
+        for body in bodies
+        if isinstance(body, list)
+        for statement in body
+        if isinstance(statement, ast.Expr)
+        and isinstance(statement.value, ast.Constant)
+        and isinstance(statement.value.value, str)
+    )
+    return {line for text in strings for line in range(text.lineno, (text.end_lineno or 0) + 1)}
+
+
+def numeric_constants(tree: ast.Module) -> int:
+    """Count the upper-case names of a module that are given numbers."""
+    count = 0
+    for node in tree.body:
+        if isinstance(node, ast.Assign | ast.AnnAssign) and node.value is not None:
+            targets = node.targets if isinstance(node, ast.Assign) else [node.target]
+            names = [
+                part
+                for target in targets
+                for part in ast.walk(target)
+                if isinstance(part, ast.Name) and part.id.strip("_").isupper()
+            ]
+            numbers = [
+                part
+                for part in ast.walk(node.value)
+                if isinstance(part, ast.Constant) and type(part.value) in (int, float)
+            ]
+            count += min(len(names), len(numbers))
+    return count
+
+
+def docstrings(tree: ast.Module) -> Iterator[tuple[int, str, str]]:
+    """Yield line, name and docstring of a module, its classes and its functions."""
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Module | ast.ClassDef | ast.FunctionDef | ast.AsyncFunctionDef):
+            text = ast.get_docstring(node)
+            if text:
+                yield getattr(node, "lineno", 1), getattr(node, "name", "(module)"), text
+
+
+def leaning_texts(tree: ast.Module) -> Iterator[tuple[int, str]]:
+    """Yield line and first line of each field's text that leans on the text before it."""
+    for node in ast.walk(tree):
+        if isinstance(node, ast.ClassDef):
+            for field, text in zip(node.body, node.body[1:], strict=False):
+                if (
+                    isinstance(field, ast.AnnAssign)
+                    and isinstance(text, ast.Expr)
+                    and isinstance(text.value, ast.Constant)
+                    and LEANING.match(str(text.value.value))
+                ):
+                    yield text.lineno, str(text.value.value).splitlines()[0]
+
+
+def imported(tree: ast.Module, module: str, modules: set[str], package: bool) -> set[str]:
+    """Return the modules of the package that a module imports, in functions as well."""
+    names = set()
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Import):
+            names |= {alias.name for alias in node.names}
+        elif isinstance(node, ast.ImportFrom):
+            above = module.split(".")[: len(module.split(".")) - node.level + package]
+            base = ".".join(above) if node.level else ""
+            base = ".".join(part for part in (base, node.module or "") if part)
+            within = {f"{base}.{alias.name}" for alias in node.names}
+            names |= {name if name in modules else base for name in within}
+    return (names & modules) - {module}
+
+
+def files_in_cycles(graph: dict[str, set[str]]) -> int:
+    """Count the modules that import themselves by way of others."""
+
+    @cache
+    def reached(module: str) -> frozenset[str]:
+        seen, open_ends = set(), list(graph[module])
+        while open_ends:
+            end = open_ends.pop()
+            if end not in seen:
+                seen.add(end)
+                open_ends += graph[end]
+        return frozenset(seen)
+
+    return sum(module in reached(module) for module in graph)
+
+
+def measure(root: Path = ROOT) -> House:
+    """Measure `src` and `tests` below a folder."""
+    count: Counter[str] = Counter()
+    words = idiom = 0
+    flagged = []
+    source = root / "src" / "pipistrelle"
+    paths = sorted(source.rglob("*.py"))
+    names = {".".join(path.relative_to(root / "src").with_suffix("").parts): path for path in paths}
+    modules = {name.removesuffix(".__init__"): path for name, path in names.items()}
+    graph = {}
+    for module, path in modules.items():
+        text = path.read_text(encoding="utf-8")
+        tree, rows, room = ast.parse(text), text.splitlines(), module.split(".")[1:2]
+        strings = docstring_lines(tree)
+        count["files"] += 1
+        count["lines"] += len(rows)
+        count["code lines"] += sum(
+            number not in strings and bool(row.strip()) and not row.strip().startswith("#")
+            for number, row in enumerate(rows, start=1)
+        )
+        count["records"] += sum(is_record(node) for node in ast.walk(tree))
+        count["numeric constants"] += numeric_constants(tree)
+        graph[module] = imported(tree, module, set(modules), path.name == "__init__.py")
+        in_a_room = room[0] if (source / "".join(room)).is_dir() and room else "top level"
+        count[f"first lines of {in_a_room}"] += 0
+        place = path.relative_to(root).as_posix()
+        for line, name, docstring in docstrings(tree):
+            first = docstring.split("\n")[0]
+            plain = re.sub(r"(?m)^\s*(>>>|\.\.\.).*$", "", docstring)
+            words += len(re.findall(r"[A-Za-z][A-Za-z'-]*", plain))
+            idiom += len(IDIOM.findall(plain))
+            if rules := broken_rules(first):
+                count[f"first lines of {in_a_room}"] += 1
+                flagged.append(Flagged(f"{place}:{line} {name}", first, rules))
+        if module == "pipistrelle.config":
+            for line, first in leaning_texts(tree):
+                count["leaning texts of settings"] += 1
+                flagged.append(Flagged(f"{place}:{line}", first, ["leans on a neighbour"]))
+    for path in sorted((root / "tests").rglob("*.py")):
+        text = path.read_text(encoding="utf-8")
+        count["lines of tests"] += text.count("\n")
+        for node in ast.walk(ast.parse(text)):
+            is_test = isinstance(node, ast.FunctionDef) and node.name.startswith("test_")
+            if is_test and (rules := broken_rules(node.name.replace("_", " "))):
+                count["names of tests"] += 1
+                place = path.relative_to(root).as_posix()
+                flagged.append(Flagged(f"{place}:{node.lineno}", node.name, rules))
+    measures: dict[str, float] = dict.fromkeys(budgets(), 0) | count
+    measures["files in cycles of imports"] = files_in_cycles(graph)
+    measures["idiom per 1,000 words"] = round(1000 * idiom / max(words, 1), 1)
+    return House(measures, flagged)
+
+
+def budgets(text: str | None = None) -> dict[str, float]:
+    """Return the budget of each measure."""
+    table = tomllib.loads(BUDGETS.read_text(encoding="utf-8") if text is None else text)
+    return {key: value for part in table.values() for key, value in part.items()}
+
+
+def floor(budget: float) -> float:
+    """Return the smallest measure that its budget may have."""
+    return budget * (1 - SLACK)
+
+
+def lower(measures: dict[str, float]) -> None:
+    """Lower the budgets to the measures, where these are smaller."""
+    text = BUDGETS.read_text(encoding="utf-8")
+    for name, budget in budgets(text).items():
+        if measures[name] < budget:
+            key = re.escape(name if re.fullmatch(r"[\w-]+", name) else f'"{name}"')
+            text = re.sub(rf"(?m)^({key} = ).*$", rf"\g<1>{measures[name]}", text)
+    BUDGETS.write_text(text, encoding="utf-8")
+
+
+def main() -> None:
+    """Print the measures beside their budgets."""
+    parser = argparse.ArgumentParser(prog="./dev house", description=__doc__)
+    parser.add_argument("--lines", action="store_true", help="list the lines that are flagged")
+    parser.add_argument("--lower", action="store_true", help="lower the budgets to the measures")
+    asked = parser.parse_args()
+    measures, flagged = measure()
+    if asked.lines:
+        for line in flagged:
+            print(f"{line.where} | {line.text} | {', '.join(line.rules)}")
+    if asked.lower:
+        lower(measures)
+    over = 0
+    print(f"{'':34}{'now':>9}{'budget':>9}")
+    for name, budget in budgets().items():
+        now = measures[name]
+        over += now > budget
+        note = "over" if now > budget else "lower the budget" if now < floor(budget) else ""
+        print(f"{name:34}{now:>9,}{budget:>9,}  {note}".rstrip())
+    sys.exit(bool(over))
+
+
+if __name__ == "__main__":
+    main()
