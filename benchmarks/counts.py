@@ -8,8 +8,8 @@ from pipistrelle.config import Config
 from pipistrelle.detection.scans import Scan
 from pipistrelle.estimation.ekf.filter import EkfBelief
 from pipistrelle.estimation.fastslam.filter import FastSlamBelief
-from pipistrelle.experiments.cases import Case
 from pipistrelle.experiments.drives import Drive
+from pipistrelle.experiments.named_settings import Case
 from pipistrelle.experiments.runs.trial import run_trial
 
 

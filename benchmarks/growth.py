@@ -68,8 +68,8 @@ def _heard(landmarks: int) -> dict[str, float]:
     """Time a frame, and a measurement in FastSLAM, in a world of so many landmarks."""
     from benchmarks.worlds import scans_of, some_frames, world_of
     from pipistrelle.config import Config, ScenarioConfig
-    from pipistrelle.experiments.cases import Case
     from pipistrelle.experiments.hearing.listening import listen
+    from pipistrelle.experiments.named_settings import Case
     from pipistrelle.experiments.runs.heard_world import drive_of
     from pipistrelle.experiments.runs.trial import run_trial
 

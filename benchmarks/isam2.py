@@ -34,13 +34,12 @@ from pipistrelle.estimation.beliefs import Track, placed
 from pipistrelle.estimation.catalogue import entry
 from pipistrelle.estimation.motion import Motion, motion_jacobians, motion_step
 from pipistrelle.estimation.smoother.belief import SmootherBelief
-from pipistrelle.estimation.smoother.stack import Stack
+from pipistrelle.estimation.smoother.records import Stack
 from pipistrelle.evaluation.accuracy import position_error, rmse
-from pipistrelle.experiments.cases import Case
 from pipistrelle.experiments.drives import Drive
-from pipistrelle.experiments.runs.filtering import run_filter
+from pipistrelle.experiments.named_settings import Case
 from pipistrelle.experiments.runs.heard_world import drive_of
-from pipistrelle.experiments.runs.trial import run_trial
+from pipistrelle.experiments.runs.trial import run_filter, run_trial
 
 PARALLAX = 0.5
 """Least angle between two bearings that place a landmark [rad]."""

@@ -11,7 +11,7 @@ from tempfile import TemporaryDirectory
 
 from pipistrelle.experiments.runs.compiling import compile_kernels
 from pipistrelle.experiments.studies import world
-from pipistrelle.experiments.studies.plan_file import find_plan, read_plan
+from pipistrelle.experiments.studies.plan import find_plan, read_plan
 from pipistrelle.experiments.studies.store import load_study
 from pipistrelle.experiments.studies.study import run_study
 

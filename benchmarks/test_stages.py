@@ -14,9 +14,9 @@ from benchmarks.counts import covariance_updates, elementary_functions
 from benchmarks.limits import elementary_function, multiply_add
 from benchmarks.worlds import RADII, scans_of, some_frames, world_of
 from pipistrelle.config import Config, FilterConfig, RayConfig, ReceiverConfig
-from pipistrelle.experiments.cases import Case
 from pipistrelle.experiments.hearing.listening import listen
 from pipistrelle.experiments.machine import keep_freed_memory
+from pipistrelle.experiments.named_settings import Case
 from pipistrelle.experiments.runs.heard_world import drive_of
 from pipistrelle.experiments.runs.trial import run_trial
 from reference.drives import turn_and_drive

@@ -9,7 +9,7 @@ from pipistrelle.detection.scans import Scan
 from pipistrelle.experiments.hearing.listening import listen
 from pipistrelle.experiments.hearing.scenario import Scenario, world_of
 from pipistrelle.experiments.runs import heard_world
-from pipistrelle.experiments.studies.plan_file import find_plan, read_plan
+from pipistrelle.experiments.studies.plan import find_plan, read_plan
 
 RADII = tuple(read_plan(find_plan("paper")).grid["emitter.radius"])
 """The paper's twelve pistons [m]."""

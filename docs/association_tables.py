@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 import polars as pl
 
-from pipistrelle.experiments.studies.plan_file import find_plan, plan_of
+from pipistrelle.experiments.studies.plan import find_plan, plan_of
 
 BEAMS = {"180°": 0.0025, "33°": 0.0088, "11°": 0.025}
 COLUMNS = [(f"{strategy} {beam}", strategy, radius)

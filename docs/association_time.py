@@ -14,7 +14,7 @@ from association_tables import BEAMS, settings_of
 
 from pipistrelle.detection.noise import noise_of
 from pipistrelle.estimation.catalogue import entry
-from pipistrelle.estimation.data_association.methods import association_of
+from pipistrelle.estimation.data_association.sequential import association_of
 from pipistrelle.estimation.session import Session
 from pipistrelle.experiments.hearing.listening import listen
 from pipistrelle.experiments.hearing.scenario import world_of

@@ -29,8 +29,8 @@ class Ear:
 
     def __init__(self, call):
         """Settle how the call is recorded, matched and found."""
-        from pipistrelle.acoustics.callers import callers_of
-        from pipistrelle.arrays.bands import band_of
+        from pipistrelle.acoustics.call import band_of
+        from pipistrelle.acoustics.paths import callers_of
         from pipistrelle.arrays.layout import Layout, layout_of
         from pipistrelle.arrays.sampling import sampling
         from pipistrelle.config import Config

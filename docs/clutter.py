@@ -15,17 +15,16 @@ from pathlib import Path
 import numpy as np
 from association_tables import BEAMS, settings_of
 
-from pipistrelle.detection.merging import labelled
 from pipistrelle.detection.noise import noise_of, without_hidden
-from pipistrelle.detection.scans import BEARING, EXCESS_PATH, RANGE, UNLABELLED
+from pipistrelle.detection.scans import BEARING, EXCESS_PATH, RANGE, UNLABELLED, labelled
 from pipistrelle.detection.scans import rows_of as some_rows
 from pipistrelle.estimation.catalogue import entry
-from pipistrelle.estimation.data_association.methods import METHODS, association_of
+from pipistrelle.estimation.data_association.sequential import METHODS, association_of
 from pipistrelle.evaluation.accuracy import alignment, moved, position_error, rmse
 from pipistrelle.experiments.hearing.listening import listen
 from pipistrelle.experiments.hearing.scenario import standing_landmarks, world_of
-from pipistrelle.experiments.runs.filtering import run_filter
 from pipistrelle.experiments.runs.heard_world import drive_of
+from pipistrelle.experiments.runs.trial import run_filter
 
 SEED = 60606
 CLUTTER = (0, 5, 10, 20)

@@ -15,9 +15,9 @@ import numpy as np
 from association_tables import BEAMS, planned, settings_of
 
 import pipistrelle
-from pipistrelle.acoustics.callers import VEHICLE
+from pipistrelle.acoustics.paths import VEHICLE
 from pipistrelle.config import Config
-from pipistrelle.detection.faces import same_echo
+from pipistrelle.detection.front_end import same_echo
 from pipistrelle.detection.scans import UNLABELLED
 from pipistrelle.experiments.hearing.listening import listen
 from pipistrelle.experiments.hearing.oracle import label_detections

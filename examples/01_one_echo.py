@@ -12,8 +12,8 @@ import numpy as np
 from pipistrelle import Config
 from pipistrelle.acoustics import propagation
 from pipistrelle.acoustics.arrivals import Arrivals
-from pipistrelle.acoustics.callers import callers_of
 from pipistrelle.acoustics.emitter import piston_directivity
+from pipistrelle.acoustics.paths import callers_of
 from pipistrelle.arrays.layout import square_of_four
 from pipistrelle.arrays.receiver import record_samples
 from pipistrelle.arrays.sampling import blocks_to_hear, sampling

@@ -12,7 +12,7 @@ import numpy as np
 
 from pipistrelle import Config
 from pipistrelle.acoustics.arrivals import arrivals_of_emission, through_piston
-from pipistrelle.acoustics.callers import callers_of
+from pipistrelle.acoustics.paths import callers_of
 from pipistrelle.arrays.layout import square_of_four
 from pipistrelle.arrays.receiver import record_samples
 from pipistrelle.arrays.sampling import BLOCK, blocks_to_hear, sampling

@@ -15,7 +15,7 @@ import numpy as np
 from pipistrelle.config import RayConfig
 from pipistrelle.detection.scans import make_scan
 from pipistrelle.estimation.beliefs import Gaussian
-from pipistrelle.estimation.ekf.invariant import InvariantEkfSlam
+from pipistrelle.estimation.ekf.filter import InvariantEkfSlam
 from pipistrelle.estimation.measurement import excess_path_of
 from pipistrelle.estimation.motion import Motion
 from pipistrelle.figures.outlines import RAY, ellipses, excess_path_ellipse

@@ -96,22 +96,20 @@ DISK = {
 """Methods that read, write or remove files."""
 AT_THE_DISK = {
     "experiments/machine.py": {"read_text"},  # of the system: how much memory a process may have
-    "experiments/results/folder.py": {"symlink_to", "unlink"},  # runs/latest
-    "experiments/results/stored.py": {"loadtxt"},  # of bytes that were read
+    "experiments/results/writing.py": {"symlink_to", "unlink"},  # runs/latest
+    "experiments/results/reading.py": {"loadtxt"},  # of bytes that were read
     "experiments/runs/rerun.py": {"open"},  # sums of a log's files, of ordinary ones alone
     "experiments/studies/store.py": {"unlink"},  # what a killed writer left, by its name
-    "experiments/studies/world_files.py": {"scan_parquet", "unlink"},  # checked; left by a kill
-    "detection/sounds/sound_header.py": {"open"},  # a few bytes of an ordinary file
-    "detection/logs/bag_unpacking.py": {"open"},  # of a compressed file that rosbags has opened
+    "experiments/studies/world.py": {"scan_parquet", "unlink"},  # checked; left by a kill
+    "detection/sounds/sound_file.py": {"open"},  # a few bytes of an ordinary file
+    "detection/logs/bag.py": {"open"},  # of a compressed file that rosbags has opened
     "detection/logs/text_tables.py": {"loadtxt"},  # of lines that were read
     "figures/player/page.py": {"read_text"},  # the package's own pages
     "report/page/page.py": {"read_text"},
-    "files.py": {"read_bytes", "open", "unlink"},
-    "own_files.py": {"read_bytes", "unlink", "rmdir"},
+    "files.py": {"read_bytes", "open", "unlink", "rmdir"},
     "figures/player/rerun_file.py": {"read_bytes"},  # what it wrote into a temporary folder
-    "kernel_cache.py": {"read_bytes", "unlink"},  # our own cache
-    "kernel_folder.py": {"read_bytes", "rmtree"},
-    "kernel_turns.py": {"open"},  # a file that is locked, and holds nothing
+    "kernel_linking.py": {"read_bytes", "unlink"},  # our own cache
+    "kernel_folder.py": {"read_bytes", "rmtree", "open"},  # a file that is locked is opened
     "verbs/streams.py": {"open"},  # /dev/null
     "version.py": {"read_text"},  # our own pyproject.toml
 }

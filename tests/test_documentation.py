@@ -104,7 +104,7 @@ def guide():
 
 def test_the_guides_beam_changes_active_arrivals_outside_it_alone(guide):
     from pipistrelle.acoustics.arrivals import arrivals_of_emission
-    from pipistrelle.acoustics.callers import callers_of
+    from pipistrelle.acoustics.paths import callers_of
     from pipistrelle.config import Config
 
     posts, beacon = np.array([[5.0, 0.5], [2.0, 5.0]]), np.array([0.0, 9.0])
@@ -128,8 +128,8 @@ def test_the_guides_array_finds_a_bearing(guide):
 
 def test_the_guides_shape_call_and_medium_are_heard(guide):
     from pipistrelle.acoustics.arrivals import arrivals_of_emissions
-    from pipistrelle.acoustics.callers import callers_of
-    from pipistrelle.acoustics.target import SHAPES
+    from pipistrelle.acoustics.emitter import SHAPES
+    from pipistrelle.acoustics.paths import callers_of
     from pipistrelle.config import BeaconConfig, Config, ScenarioConfig
     from pipistrelle.experiments.hearing.listening import listen
     from pipistrelle.experiments.hearing.scenario import world_of
@@ -160,8 +160,8 @@ def test_the_guides_filter_drives_a_mission(guide):
     from pipistrelle.estimation.catalogue import entry
     from pipistrelle.experiments.hearing.scenario import draw_scenario
     from pipistrelle.experiments.hearing.trajectories import motion_of
-    from pipistrelle.experiments.runs.filtering import run_filter
     from pipistrelle.experiments.runs.heard_world import drive_of
+    from pipistrelle.experiments.runs.trial import run_filter
 
     config = Config(scenario=ScenarioConfig(steps=40, landmarks=3))
     world = draw_scenario(config, np.random.default_rng(7))
@@ -187,11 +187,10 @@ def heard_and_drive(steps=120):
 
 
 def test_the_guides_association_finds_again_what_the_oracle_knew(guide):
-    from pipistrelle.detection.merging import scan_of
     from pipistrelle.detection.noise import without_hidden
-    from pipistrelle.detection.scans import NO_CALLERS, without_labels
+    from pipistrelle.detection.scans import NO_CALLERS, scan_of, without_labels
     from pipistrelle.estimation.association import Assignment
-    from pipistrelle.experiments.cases import Case
+    from pipistrelle.experiments.named_settings import Case
     from pipistrelle.experiments.runs.heard_world import scans_of
     from pipistrelle.experiments.runs.trial import run_trial
 
@@ -235,9 +234,9 @@ def test_the_guides_session_ends_where_a_filter_of_the_whole_drive_does(guide):
 
 
 def test_the_guides_noise_reaches_the_filter_row_by_row(guide):
-    from pipistrelle.detection.merging import scan_of
     from pipistrelle.detection.noise import without_hidden
-    from pipistrelle.experiments.cases import Case
+    from pipistrelle.detection.scans import scan_of
+    from pipistrelle.experiments.named_settings import Case
     from pipistrelle.experiments.runs.heard_world import scans_of
     from pipistrelle.experiments.runs.trial import run_trial
 
@@ -313,7 +312,7 @@ def test_the_guides_filter_goes_by_its_name(tmp_path, monkeypatch):
 
 
 def test_the_plans_of_the_page_on_robustness_have_the_truth_among_their_values(tmp_path):
-    from pipistrelle.experiments.studies.plan_file import read_plan
+    from pipistrelle.experiments.studies.plan import read_plan
     from pipistrelle.report.reading import read_study
     from report.planted import write_planted
 

@@ -7,8 +7,8 @@ import time
 
 import pytest
 
-from pipistrelle import kernel_turns
-from pipistrelle.kernel_turns import Turn
+from pipistrelle import kernel_folder as kernel_turns
+from pipistrelle.kernel_folder import Turn
 
 LINES = """
 from pipistrelle.jit import kernel
@@ -21,7 +21,7 @@ COMPILE = "import slow; slow.doubled(1.0); print(sum(slow.doubled.stats.cache_mi
 HOLD = """
 import sys
 from pathlib import Path
-from pipistrelle.kernel_turns import Turn
+from pipistrelle.kernel_folder import Turn
 
 Turn().take(Path(sys.argv[1]))
 print("mine", flush=True)

@@ -11,8 +11,17 @@ import pytest
 
 from pipistrelle import files
 from pipistrelle.config import InputError
-from pipistrelle.files import partial_of
-from pipistrelle.own_files import KINDS, LOG, REPORT, RESULTS, SUMS, OwnFiles, claim, drawn_files
+from pipistrelle.files import (
+    KINDS,
+    LOG,
+    REPORT,
+    RESULTS,
+    SUMS,
+    OwnFiles,
+    claim,
+    drawn_files,
+    partial_of,
+)
 
 
 def tree(folder):
@@ -272,7 +281,7 @@ def test_a_full_disk_leaves_all_as_it_was(tmp_path, monkeypatch, before, room):
         return files.write_down(path, data)
 
     with monkeypatch.context() as patched:
-        patched.setattr("pipistrelle.own_files.write_down", full)
+        patched.setattr("pipistrelle.files.write_down", full)
         new = {f"figures/{n}.png": bytes(1000) for n in "abc"} | {"index.html": "second"}
         with pytest.raises(InputError, match=r"could not be written \(No space left"):
             own.replace(new)

@@ -13,8 +13,7 @@ from hypothesis import strategies as st
 from pydantic import ValidationError
 
 from pipistrelle.config import AirConfig, Config, InputError, RayConfig, ScenarioConfig, Section
-from pipistrelle.experiments.studies.plan import cases_of
-from pipistrelle.experiments.studies.plan_file import plan_text, read_plan
+from pipistrelle.experiments.studies.plan import cases_of, plan_text, read_plan
 from pipistrelle.settings import (
     CALLERS,
     OWN,

@@ -121,7 +121,7 @@ def test_whoever_says_the_version_says_the_same(tmp_path):
     from pipistrelle.config import Config
     from pipistrelle.experiments.drives import NO_TRUTH
     from pipistrelle.experiments.results.writing import write_results
-    from pipistrelle.own_files import RESULTS, OwnFiles
+    from pipistrelle.files import RESULTS, OwnFiles
     from pipistrelle.report.page import summary
 
     mission = {"command": "pipistrelle", "seed": 7, "trials": (), "ignored_rows": {}}

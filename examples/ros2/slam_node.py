@@ -21,7 +21,7 @@ from tf2_ros import TransformBroadcaster
 from pipistrelle import InputError, Slam
 from pipistrelle.config import BagConfig
 from pipistrelle.detection.logs import live_messages as live
-from pipistrelle.detection.logs.bag_frames import TRANSFORMS, Frames
+from pipistrelle.detection.logs.bag_log import TRANSFORMS, Frames
 from pipistrelle.detection.logs.vehicle import read_vehicle
 from pipistrelle.experiments.results import ros
 

@@ -32,13 +32,13 @@ import numpy as np
 import tomli_w
 
 from pipistrelle.config import Config
-from pipistrelle.detection.merging import scan_of
-from pipistrelle.experiments.cases import Case
+from pipistrelle.detection.scans import scan_of
 from pipistrelle.experiments.hearing.listening import listen
 from pipistrelle.experiments.hearing.scenario import world_of
+from pipistrelle.experiments.named_settings import Case
 from pipistrelle.experiments.runs.heard_world import drive_of, scans_of
 from pipistrelle.experiments.runs.trial import run_trial
-from pipistrelle.experiments.studies.plan_file import PLANS, find_plan, read_plan
+from pipistrelle.experiments.studies.plan import PLANS, find_plan, read_plan
 
 SEED = 1000
 BEAMS = {"180": 0.0025, "33": 0.0088, "11": 0.025}

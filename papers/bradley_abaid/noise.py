@@ -34,12 +34,12 @@ from readings import (
 
 from pipistrelle.arithmetic.random_stream import stream_key
 from pipistrelle.config import Config
-from pipistrelle.detection.faces import FrameMeasurements
+from pipistrelle.detection.front_end import FrameMeasurements
 from pipistrelle.detection.scans import BEARING, RANGE
 from pipistrelle.estimation.catalogue import PAPERS
-from pipistrelle.experiments.cases import Case
 from pipistrelle.experiments.hearing.listening import listen
 from pipistrelle.experiments.hearing.scenario import world_of
+from pipistrelle.experiments.named_settings import Case
 from pipistrelle.experiments.runs.heard_world import drive_of, scans_of
 from pipistrelle.experiments.runs.trial import run_trial
 from pipistrelle.geometry import wrap

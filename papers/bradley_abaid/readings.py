@@ -57,13 +57,13 @@ import polars as pl
 from calibration import PAPER_FULL, SEED, Run, at_least, changed, fit_levels, in_worlds
 
 from pipistrelle.config import STRATEGIES, Config, Strategy
-from pipistrelle.detection.faces import FrameMeasurements
+from pipistrelle.detection.front_end import FrameMeasurements
 from pipistrelle.estimation.rays import RANGED as RANGE_READINGS
 from pipistrelle.evaluation.accuracy import rmse
 from pipistrelle.evaluation.comparison import pooled_std
-from pipistrelle.experiments.cases import Case
 from pipistrelle.experiments.hearing.listening import listen
 from pipistrelle.experiments.hearing.scenario import world_of
+from pipistrelle.experiments.named_settings import Case
 from pipistrelle.experiments.runs.heard_world import drive_of, scans_of
 from pipistrelle.experiments.runs.trial import run_trial
 from pipistrelle.files import write_whole

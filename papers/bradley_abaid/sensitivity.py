@@ -22,9 +22,9 @@ import polars as pl
 from calibration import BEAMS, SEED, Run, changed, fit_levels, in_worlds
 
 from pipistrelle.config import STRATEGIES, Config
-from pipistrelle.experiments.cases import Case
 from pipistrelle.experiments.hearing.listening import listen
 from pipistrelle.experiments.hearing.scenario import world_of
+from pipistrelle.experiments.named_settings import Case
 from pipistrelle.experiments.results.scores import Scores
 from pipistrelle.experiments.runs.heard_world import drive_of, scans_of
 from pipistrelle.experiments.runs.trial import run_trial

@@ -17,11 +17,11 @@ from statistics import fmean
 import numpy as np
 
 from pipistrelle.config import Config, FastSlamConfig, Strategy
-from pipistrelle.detection.faces import FrameMeasurements
+from pipistrelle.detection.front_end import FrameMeasurements
 from pipistrelle.detection.scans import Scan
-from pipistrelle.experiments.cases import Case
 from pipistrelle.experiments.hearing.listening import listen
 from pipistrelle.experiments.hearing.scenario import Scenario, standing_landmarks, world_of
+from pipistrelle.experiments.named_settings import Case
 from pipistrelle.experiments.runs.heard_world import drive_of, scans_of
 from pipistrelle.experiments.runs.trial import run_trial
 from pipistrelle.geometry import range_and_bearing, wrap

@@ -2,17 +2,32 @@
 
 A pipe or a device may never end, so neither is read. A file is written beside its place, under a
 new name that no link can have, and renamed when it is whole.
+
+Folders that we write into: which files in them are ours, and how these are replaced.
+
+``SHA256SUMS``, as ``sha256sum -c`` reads it, lists what we wrote into a folder. Such lists lie
+beside many downloads, so one is ours only if its first line says so and each name on it is one that
+we write. What it names is ours as long as it is an ordinary file of that sum, reached through no
+link. Only that is ever replaced or removed; everything else is somebody's, the list itself too.
+
+Whatever is written into a folder that a user names passes `claim` before the work, and
+`OwnFiles.replace` after it.
 """
 
 import contextlib
 import os
 import re
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from dataclasses import dataclass
+from fnmatch import fnmatchcase
 from hashlib import file_digest, sha256
-from pathlib import Path
+from pathlib import Path, PurePosixPath
+from tempfile import TemporaryDirectory, TemporaryFile, gettempdir
+from typing import get_args
 from unicodedata import bidirectional
 from uuid import uuid4
 
-from pipistrelle.config import InputError
+from pipistrelle.config import InputError, Strategy
 from pipistrelle.refusals import refusal, shown
 
 _TURNS = {"LRE", "RLE", "LRO", "RLO", "PDF", "LRI", "RLI", "FSI", "PDI"}
@@ -242,3 +257,397 @@ def _put_where_nothing_is(partial: Path, path: Path) -> None:
         partial.replace(path)
         return
     partial.unlink()
+
+
+SUMS = "SHA256SUMS"
+_HEAD = "# Of Pipistrelle: {}"
+_LINE = re.compile(r"([0-9a-f]{64}) [ *](.+)")
+
+
+@dataclass(frozen=True, slots=True)
+class Kind:
+    """A kind of output folder, with the names of its files; one kind never replaces another."""
+
+    title: str
+    names: tuple[str, ...]
+    """Patterns of names: a user's file of such a name is in the way."""
+    more: tuple[str, ...] = ()
+    """Patterns of names that are checked one by one, when they are written."""
+
+    def writes(self, name: str) -> bool:
+        """Tell whether we write a file of this name, relative to the folder."""
+        path = PurePosixPath(name)
+        inside = not path.is_absolute() and ".." not in path.parts and path.as_posix() == name
+        return inside and _matches(name, (*self.names, *self.more))
+
+
+def _matches(name: str, patterns: Iterable[str]) -> bool:
+    """Tell whether a name is like one of some patterns, in letters of any case."""
+    return any(fnmatchcase(name.lower(), pattern.lower()) for pattern in patterns)
+
+
+RESULTS = Kind(
+    "results",
+    (
+        "config.toml",
+        "README.md",
+        *(f"track_{strategy}_*.tum" for strategy in get_args(Strategy)),
+        *(f"map_{strategy}_*.csv" for strategy in get_args(Strategy)),
+        "caller_*.tum",
+        "truth.tum",
+        "truth_*.tum",
+        "steps.parquet",
+        "landmarks.parquet",
+        "measurements.parquet",
+        *(f"mission.{ending}" for ending in ("png", "pdf", "gif", "mp4", "mcap")),
+        "summary.json",
+    ),
+    ("worlds/*", "*.html", "*.rrd"),
+)
+REPORT = Kind("a report", ("index.html", "summary.json"), ("figures/*",))
+LOG = Kind(
+    "a log",
+    ("log.toml", "odometry.csv", "measurements.csv", "truth.csv", "landmarks.csv", "README.md"),
+    ("hearing.png",),
+)
+SOUND = Kind(
+    "a sound recording",
+    (
+        *("recording.toml", "recording.wav", "array.csv", "calls.csv"),
+        *("odometry.csv", "truth.csv", "landmarks.csv", "README.md"),
+    ),
+    ("call_*.wav",),
+)
+WORLD = Kind("a world", ("world.toml", "landmarks.csv", "path.csv", "README.md"), ("caller_*.csv",))
+COMPARISON = Kind("a comparison", ("comparison.*", "settings.csv", "README.md"))
+KINDS = (RESULTS, REPORT, LOG, SOUND, WORLD, COMPARISON)
+COMMAND_LINE = ("-o DIR", "--overwrite")
+"""How a user of the command line names another folder, and allows that results are replaced."""
+
+
+def claim(
+    folder: Path, kind: Kind, *, overwrite: bool, flags: tuple[str, str] = COMMAND_LINE
+) -> "OwnFiles":
+    """Accept a folder to write into: a new or empty one, or one with our results.
+
+    Whether it can be written is tried; nothing is left there by that.
+
+    `kind`: kind of result; `overwrite`: whether what we wrote there may be replaced;
+    `flags`: how the user names another folder, and allows to replace.
+
+    >>> with TemporaryDirectory() as name:
+    ...     own = claim(Path(name) / "new", LOG, overwrite=False)
+    ...     own.replace({"log.toml": b"format = 1"})
+    ...     sorted(path.name for path in own.folder.iterdir())
+    ['SHA256SUMS', 'log.toml']
+    """
+    (another, allow), word = flags, kind.title.removeprefix("a ")
+    try:
+        made = make_folder(folder)
+        try:
+            TemporaryFile(dir=folder).close()
+            empty = all(whole_name(path.name) == SUMS for path in folder.iterdir())
+        finally:
+            remove_empty(made)
+    except OSError as error:
+        raise InputError(
+            f"{folder}: cannot be used as a folder for {kind.title} ({error.strerror}); name one "
+            f"that can be written with {another}"
+        ) from error
+    own = OwnFiles(folder, kind)
+    if empty:
+        return own
+    own.check_kind()
+    if own.there and not overwrite:
+        raise InputError(
+            f"{folder}: is not empty; name a new folder with {another}, or add {allow} to replace "
+            f"the {word} there"
+        )
+    if not own.there:
+        listed = os.path.lexists(folder / SUMS)
+        named = f"its {SUMS} is not Pipistrelle's" if listed else f"no {SUMS} names any"
+        raise InputError(
+            f"{folder}: is not empty and holds no {word} of Pipistrelle's ({named}), so nothing in "
+            f"it is replaced; name a new folder with {another}"
+        )
+    own.check()
+    return own
+
+
+def make_folder(folder: Path) -> list[Path]:
+    """Make a folder; return what of it and of those around it was missing, the innermost first."""
+    missing = [path for path in (folder, *folder.parents) if not path.exists()]
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError:
+        remove_empty(missing)
+        raise
+    return missing
+
+
+def remove_empty(folders: Iterable[Path]) -> None:
+    """Remove folders that we made, the innermost first, as far as they are empty."""
+    with contextlib.suppress(OSError):
+        for folder in folders:
+            folder.rmdir()
+
+
+def drawn_files(draw: Callable[[Path], None], under: str = "") -> dict[str, bytes]:
+    """Return the files that a function draws, by name.
+
+    `under` is put before each name, as in "figures/".
+    """
+    try:
+        with TemporaryDirectory(prefix="pipistrelle-") as place:
+            draw(Path(place))
+            drawn = sorted(Path(place).iterdir())
+            return {f"{under}{path.name}": path.read_bytes() for path in drawn}
+    except OSError as error:
+        raise InputError(
+            f"{gettempdir()}: pictures could not be drawn there ({error.strerror}); make room, or "
+            "set TMPDIR to a folder that has some"
+        ) from error
+
+
+class OwnFiles:
+    """The files that we wrote into a folder, known by its list of sums; it writes more of them.
+
+    Parameters
+    ----------
+    folder : Path
+    kind : Kind
+        What is read or written. Where the folder holds another kind, nothing is written.
+
+    Examples
+    --------
+    >>> with TemporaryDirectory() as name:
+    ...     own, notes = OwnFiles(Path(name), LOG), Path(name) / "notes.txt"
+    ...     own.replace({"README.md": b"one", "log.toml": b"two"})
+    ...     _ = notes.write_text("a user's")
+    ...     own.replace({"log.toml": b"three"})
+    ...     sorted(path.name for path in Path(name).iterdir())
+    ['SHA256SUMS', 'log.toml', 'notes.txt']
+    """
+
+    def __init__(self, folder: Path, kind: Kind) -> None:
+        self.folder, self.kind = folder, kind
+        self._list = _list_in(folder)
+        self._there, self._sums = _sums_of(self._list)
+
+    @property
+    def there(self) -> str | None:
+        """The title of the kind that is there; None where nothing is of ours."""
+        return self._there
+
+    def __contains__(self, name: str) -> bool:
+        """Tell whether a file is on the list: we wrote it, or began to."""
+        return name in self._sums
+
+    def read(self, name: str) -> bytes:
+        """Read a file if it is unchanged since we wrote it."""
+        path = self.folder / name
+        try:
+            data = read_file(path)
+        except FileNotFoundError:
+            raise InputError(f"{path}: is missing; run again what wrote the others") from None
+        except OSError as error:
+            raise InputError(f"{path}: could not be read ({error.strerror})") from error
+        if name not in self._sums:
+            raise InputError(f"{path}: is not Pipistrelle's: {SUMS} does not name it")
+        if sha256(data).hexdigest() not in self._sums[name]:
+            raise InputError(
+                f"{path}: was changed since Pipistrelle wrote it; run again what wrote it"
+            )
+        return data
+
+    def check_kind(self) -> None:
+        """Refuse a folder that holds results of another kind."""
+        if self._there not in (None, self.kind.title):
+            raise InputError(
+                f"{self.folder}: holds {self._there} of Pipistrelle, which {self.kind.title} does "
+                "not replace; name another folder"
+            )
+
+    def check(self) -> None:
+        """Refuse a folder that holds changed files under the names to be replaced."""
+        self.check_kind()
+        named = (name for name in _names_in(self.folder) if _matches(name, self.kind.names))
+        for name in sorted({*named, *self._sums}):
+            self.refuse(name)
+
+    def refuse(self, name: str) -> None:
+        """Refuse to replace a file that we did not write or that was changed since."""
+        if "\n" in name:
+            raise InputError(f"{name!r}: holds a line break; choose another name")
+        if self._there is None and os.path.lexists(self.folder / SUMS):
+            raise _in_the_way(self.folder / SUMS, "is not Pipistrelle's")
+        for parent in reversed(PurePosixPath(name).parents[:-1]):
+            place = self.folder / parent
+            if place.is_symlink() or (place.exists() and not place.is_dir()):
+                raise _in_the_way(place, "is a link" if place.is_symlink() else "is no folder")
+        if os.path.lexists(self.folder / name) and not self._is_ours(name):
+            changed, strange = "was changed since Pipistrelle wrote it", "is not Pipistrelle's"
+            raise _in_the_way(self.folder / name, changed if name in self._sums else strange)
+
+    def _is_ours(self, name: str) -> bool:
+        """Tell whether a file is as we wrote it."""
+        path = self.folder / name
+        if name not in self._sums or path.is_symlink() or not path.is_file():
+            return False
+        with contextlib.suppress(OSError):
+            return sum_of(path) in self._sums[name]
+        return False
+
+    def replace(self, files: Mapping[str, str | bytes | PiecesFile]) -> None:
+        """Write files in place of all that we wrote here before: all of them, or none.
+
+        Parameters
+        ----------
+        files : mapping of name to content
+            Names are relative to the folder, with slashes. The last is taken away first and put in
+            place last: where it stands, all stand. A file that was written in pieces is beside its
+            place already, and closed.
+
+        Raises
+        ------
+        InputError
+            As `check`; also where somebody else has written here since this object was made, or
+            where there is no room, and all is as it was.
+        """
+        if _list_in(self.folder) != self._list:
+            raise InputError(
+                f"{self.folder}: somebody else wrote into it meanwhile, so nothing there is "
+                "replaced; name another folder"
+            )
+        self.check()
+        self._write(files, keep=False)
+
+    def add(self, name: str, content: bytes) -> None:
+        """Write one file beside the others, in place of what we wrote there before."""
+        self.check_kind()
+        self._write({name: content}, keep=True)
+
+    def _write(self, files: Mapping[str, str | bytes | PiecesFile], *, keep: bool) -> None:
+        """Write files under other names, list them, and then give them their own."""
+        contents = {n: c.encode() if isinstance(c, str) else c for n, c in files.items()}
+        for name in contents:
+            if not self.kind.writes(name):
+                raise ValueError(f"{name}: is no file of {self.kind.title}")
+            self.refuse(name)
+        before, new = self._sums, {n: {_sum_of(c)} for n, c in contents.items()}
+        partials = {
+            name: c.path if isinstance(c, PiecesFile) else partial_of(self.folder / name)
+            for name, c in contents.items()
+        }
+        made: list[Path] = []
+        at = self.folder
+        try:
+            try:
+                made = make_folder(self.folder)
+                self._list_sums({n: before.get(n, set()) | new.get(n, set()) for n in before | new})
+                for name, partial in partials.items():
+                    at = self.folder / name
+                    made = [*make_folder(partial.parent), *made]
+                    content = contents[name]
+                    if isinstance(content, bytes):
+                        write_down(partial, content)
+            except BaseException:
+                self._list_again(before, partials.values(), made)
+                raise
+            self._put_in_place(partials, () if keep else before.keys() - new.keys())
+            self._list_sums(before | new if keep else new)
+        except OSError as error:
+            raise InputError(
+                f"{at}: could not be written ({error.strerror}); make room or name another folder"
+            ) from error
+        finally:
+            with contextlib.suppress(OSError):
+                _remove(partials.values())
+
+    def _list_again(
+        self, sums: Mapping[str, set[str]], partials: Iterable[Path], made: Iterable[Path]
+    ) -> None:
+        """Restore a folder's list after files could not be written."""
+        with contextlib.suppress(OSError):
+            _remove(partials)
+            if sums:
+                self._list_sums(sums)
+            elif self._there:
+                (self.folder / SUMS).unlink(missing_ok=True)
+        remove_empty(made)
+
+    def _put_in_place(self, partials: Mapping[str, Path], old: Iterable[str]) -> None:
+        """Give files their names; take away what is old, and what a killed process left."""
+        *_, last = partials
+        _remove(self.folder / name for name in (*([last] if last in self._sums else ()), *old))
+        left = (self.folder / name for name in _names_in(self.folder) if self._is_left(name))
+        _remove([path for path in left if path not in partials.values()])
+        for name, partial in partials.items():
+            put_in_place(partial, self.folder / name, replace=self._is_ours(name))
+
+    def _is_left(self, name: str) -> bool:
+        """Tell whether a file is what a killed process left of one of ours."""
+        path = self.folder / name
+        return whole_name(name) in (*self._sums, SUMS) and path.is_file() and not path.is_symlink()
+
+    def _list_sums(self, sums: Mapping[str, set[str]]) -> None:
+        """Write the list: from then on what it names is known as ours, whatever ends us."""
+        lines = [f"{one}  {name}" for name, some in sums.items() for one in sorted(some)]
+        text = "\n".join([_HEAD.format(self.kind.title), *lines, ""])
+        data = text.encode(errors="surrogateescape")
+        write_whole(self.folder / SUMS, data, replace=self._there is not None)
+        self._list, self._there, self._sums = data, self.kind.title, dict(sums)
+
+
+def _sum_of(content: bytes | PiecesFile) -> str:
+    """Return the sum of what is to be a file."""
+    return content.sum if isinstance(content, PiecesFile) else sha256(content).hexdigest()
+
+
+def _in_the_way(path: Path, what: str) -> InputError:
+    """Return the error for a file or folder that is not replaced."""
+    return InputError(
+        f"{path}: {what}, so it is not replaced; move it away, or name another folder"
+    )
+
+
+def _list_in(folder: Path) -> bytes | None:
+    """Return the list that stands in a folder; None where there is none that is a file."""
+    path = folder / SUMS
+    if path.is_symlink():
+        return None
+    try:
+        return read_file(path)
+    except OSError:
+        return None
+
+
+def _sums_of(text: bytes | None) -> tuple[str | None, dict[str, set[str]]]:
+    """Read from a list of ours what is there, and the sums of its files; a user's has none.
+
+    While files are replaced, the list has the old sums and the new ones.
+    """
+    head, *lines = (text or b"").decode(errors="surrogateescape").split("\n")
+    kind = next((kind for kind in KINDS if head == _HEAD.format(kind.title)), None)
+    sums: dict[str, set[str]] = {}
+    if kind is None or not lines or lines.pop():  # each line has its end
+        return None, {}
+    for line in lines:
+        found = _LINE.fullmatch(line)
+        if not found or not kind.writes(found[2]):
+            return None, {}
+        sums.setdefault(found[2], set()).add(found[1])
+    return kind.title, sums
+
+
+def _names_in(folder: Path) -> Iterator[str]:
+    """Name all that is in a folder and below it, relative to it; no link is followed."""
+    for place, folders, files in os.walk(folder):
+        for name in (*folders, *files):
+            yield (Path(place) / name).relative_to(folder).as_posix()
+
+
+def _remove(paths: Iterable[Path]) -> None:
+    """Remove files, as far as they are there."""
+    for path in paths:
+        path.unlink(missing_ok=True)

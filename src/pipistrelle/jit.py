@@ -28,8 +28,7 @@ from pipistrelle.kernel_folder import place_kernels
 _fault: Exception | None = None
 """Why kernels are compiled by Numba's public functions."""
 try:
-    from pipistrelle.kernel_cache import checked
-    from pipistrelle.kernel_linking import Kernel, check
+    from pipistrelle.kernel_linking import Kernel, check, checked
 
     if not config.DISABLE_JIT:  # pyrefly: ignore[missing-attribute]
         with kernel_clock.judging():

@@ -15,9 +15,8 @@ from pipistrelle.acoustics.arrivals import (
     arrivals_of_emissions,
     through_piston,
 )
-from pipistrelle.acoustics.callers import VEHICLE, callers_of
-from pipistrelle.acoustics.emitter import piston_directivity
-from pipistrelle.acoustics.target import Bodies
+from pipistrelle.acoustics.emitter import Bodies, piston_directivity
+from pipistrelle.acoustics.paths import VEHICLE, callers_of
 from pipistrelle.config import (
     AirConfig,
     BeaconConfig,

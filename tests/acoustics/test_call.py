@@ -4,8 +4,7 @@ import numpy as np
 import pytest
 import soundfile
 
-from pipistrelle.acoustics.call import Sweep, ToneBurst, coupling
-from pipistrelle.acoustics.call_settings import settings_of, sound_of
+from pipistrelle.acoustics.call import Sweep, ToneBurst, coupling, settings_of, sound_of
 from pipistrelle.config import CallConfig, InputError
 
 LENGTH, RATE = 2.8e-3, 1e6

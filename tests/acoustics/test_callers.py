@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from scipy.optimize import brentq
 
 from pipistrelle.acoustics.arrivals import Arrivals, arrivals_of_emission, arrivals_of_emissions
-from pipistrelle.acoustics.callers import Caller, callers_at, callers_of, check_caller, moves
+from pipistrelle.acoustics.paths import Caller, callers_at, callers_of, check_caller, moves
 from pipistrelle.acoustics.propagation import absorption_db_per_m
 from pipistrelle.config import BeaconConfig, Config, EmitterConfig, InputError
 

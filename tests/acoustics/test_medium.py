@@ -3,8 +3,7 @@
 import numpy as np
 import pytest
 
-from pipistrelle.acoustics.medium import medium_of
-from pipistrelle.acoustics.propagation import water_absorption_db_per_m
+from pipistrelle.acoustics.propagation import medium_of, water_absorption_db_per_m
 from pipistrelle.config import AirConfig, Config, ScenarioConfig, WaterConfig
 
 

@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from pipistrelle.acoustics.surfaces import reflecting_points
+from pipistrelle.acoustics.paths import reflecting_points
 
 law = settings(deadline=None, max_examples=300)
 SEEDS = st.integers(0, 2**32 - 1)

@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.special import eval_legendre, h1vp, jvp, spherical_jn, spherical_yn
 
-from pipistrelle.acoustics.target import target_strength_db
+from pipistrelle.acoustics.emitter import target_strength_db
 from pipistrelle.config import InputError
 
 law = settings(deadline=None)

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from pipistrelle.acoustics.arrivals import Arrivals
-from pipistrelle.acoustics.callers import callers_of
+from pipistrelle.acoustics.paths import callers_of
 from pipistrelle.arithmetic.random_stream import stream_key
 from pipistrelle.arrays.beamforming import bearing_bound
 from pipistrelle.arrays.layout import Layout, square_of_four

@@ -7,7 +7,7 @@ import pytest
 from scipy.stats import ks_2samp
 
 from pipistrelle.acoustics.arrivals import Arrivals, arrivals_of_emission
-from pipistrelle.acoustics.callers import callers_of
+from pipistrelle.acoustics.paths import callers_of
 from pipistrelle.arithmetic.random_stream import stream_key
 from pipistrelle.arrays.layout import Layout, square_of_four
 from pipistrelle.arrays.receiver import add_echo_blocks, noise_blocks, record_samples

@@ -6,7 +6,7 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from pipistrelle.acoustics.arrivals import Arrivals, arrivals_of_emission
-from pipistrelle.acoustics.callers import VEHICLE, Caller, callers_of
+from pipistrelle.acoustics.paths import VEHICLE, Caller, callers_of
 from pipistrelle.arrays.layout import square_of_four
 from pipistrelle.arrays.receiver import add_echo_blocks, noise_blocks, record_samples
 from pipistrelle.arrays.sampling import blocks_to_hear, sampling

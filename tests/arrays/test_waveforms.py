@@ -3,11 +3,10 @@
 import numpy as np
 
 from pipistrelle.acoustics.arrivals import Arrivals
-from pipistrelle.acoustics.callers import callers_of
+from pipistrelle.acoustics.paths import callers_of
 from pipistrelle.arrays.layout import square_of_four
-from pipistrelle.arrays.receiver import add_echo_blocks, noise_blocks
+from pipistrelle.arrays.receiver import add_echo_blocks, noise_blocks, real_samples
 from pipistrelle.arrays.sampling import sampling
-from pipistrelle.arrays.waveforms import real_samples
 from pipistrelle.config import Config
 
 CONFIG = Config()

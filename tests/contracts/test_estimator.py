@@ -12,13 +12,12 @@ from pipistrelle.config import Config, FastSlamConfig
 from pipistrelle.detection.scans import Scan, with_columns
 from pipistrelle.estimation.beliefs import Gaussian, Landmarks
 from pipistrelle.estimation.catalogue import entry
-from pipistrelle.estimation.ekf.filter import EkfSlam
-from pipistrelle.estimation.ekf.invariant import InvariantEkfSlam
+from pipistrelle.estimation.ekf.filter import EkfSlam, InvariantEkfSlam
 from pipistrelle.estimation.fastslam.filter import FastSlam
 from pipistrelle.estimation.motion import Motion, motion_jacobians, motion_noise, motion_step
 from pipistrelle.estimation.smoother.filter import Smoother
 from pipistrelle.experiments.drives import Drive
-from pipistrelle.experiments.runs.filtering import run_filter
+from pipistrelle.experiments.runs.trial import run_filter
 from pipistrelle.geometry import wrap
 from reference.missions import (
     BICYCLE,

@@ -22,9 +22,9 @@ import pytest
 
 from pipistrelle.config import InputError
 from pipistrelle.experiments.studies import executors, study
-from pipistrelle.experiments.studies.plan_file import plan_text
+from pipistrelle.experiments.studies.plan import plan_text
 from pipistrelle.experiments.studies.study import run_study
-from pipistrelle.experiments.studies.world_files import done_worlds
+from pipistrelle.experiments.studies.world import done_worlds
 from reference.studies import SMALL, assert_same, fatal, leftovers, lost, plan_of, results
 
 UNTIL_KILLED = """\
@@ -32,7 +32,7 @@ import os, signal, sys
 from pathlib import Path
 from pipistrelle import files
 from pipistrelle.experiments.studies import world_files
-from pipistrelle.experiments.studies.plan_file import read_plan
+from pipistrelle.experiments.studies.plan import read_plan
 from pipistrelle.experiments.studies.study import run_study
 
 left = int(sys.argv[3])
@@ -166,7 +166,7 @@ class TestWorkersEndWithTheProcessThatIsKilled(ExecutorContract):
             "import os, signal, sys\n"
             "from pathlib import Path\n"
             "from multiprocessing import active_children\n"
-            "from pipistrelle.experiments.studies.plan_file import read_plan\n"
+            "from pipistrelle.experiments.studies.plan import read_plan\n"
             "from pipistrelle.experiments.studies.study import run_study\n"
             "def progress(standing):\n"
             "    if standing.done:\n"

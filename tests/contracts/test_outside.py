@@ -15,7 +15,7 @@ from pipistrelle.__main__ import main
 from pipistrelle.config import Config, FilterConfig, InputError, RayConfig, ScenarioConfig
 from pipistrelle.estimation.catalogue import CATALOGUE, PAPERS, entry, title_of
 from pipistrelle.experiments.runs.trial import run_mission
-from pipistrelle.experiments.studies.plan_file import find_plan, plan_text, read_plan
+from pipistrelle.experiments.studies.plan import find_plan, plan_text, read_plan
 from pipistrelle.experiments.studies.store import load_study
 from pipistrelle.experiments.studies.study import run_study
 from reference.missions import BICYCLE

@@ -8,26 +8,26 @@ import pytest
 from scipy.stats import gamma
 
 from pipistrelle.acoustics.arrivals import Arrivals
-from pipistrelle.acoustics.callers import callers_of
+from pipistrelle.acoustics.paths import callers_of
 from pipistrelle.arithmetic.random_stream import stream_key
 from pipistrelle.arrays.beamforming import bearing_bound, steering_vector
 from pipistrelle.arrays.layout import square_of_four
 from pipistrelle.arrays.receiver import add_echo_blocks, noise_blocks
 from pipistrelle.arrays.sampling import sampling
 from pipistrelle.config import BLOCK, Config, DetectionConfig
-from pipistrelle.detection.certainty import (
+from pipistrelle.detection.matched import filter_blocks
+from pipistrelle.detection.noise import (
     MIN_POWER_OVER_NOISE,
     bearing_std,
     delay_std,
     loudest_noise,
     over_noise,
 )
-from pipistrelle.detection.matched import filter_blocks
 from pipistrelle.detection.scans import OWN
 from pipistrelle.detection.snapshots import Detections, detect, detector
 from pipistrelle.experiments.hearing.listening import listen
 from pipistrelle.experiments.hearing.scenario import standing_landmarks
-from pipistrelle.experiments.runs.validate_mission import world_of
+from pipistrelle.experiments.runs.validate import world_of
 from pipistrelle.geometry import range_and_bearing, wrap
 
 CONFIG = Config()

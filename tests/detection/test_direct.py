@@ -7,13 +7,12 @@ import numpy as np
 import pytest
 
 from pipistrelle.acoustics.arrivals import Arrivals
-from pipistrelle.acoustics.callers import callers_of
+from pipistrelle.acoustics.paths import callers_of
 from pipistrelle.arithmetic.random_stream import stream_key
 from pipistrelle.arrays.layout import square_of_four
 from pipistrelle.arrays.receiver import add_echo_blocks, noise_blocks
 from pipistrelle.arrays.sampling import sampling
 from pipistrelle.config import BLOCK, Config, MatchingConfig
-from pipistrelle.detection.certainty import EXCESS_PATH_FLOOR
 from pipistrelle.detection.direct import (
     MIN_EDGE_ENERGY,
     DirectCalls,
@@ -21,8 +20,9 @@ from pipistrelle.detection.direct import (
     front_edge,
     loudest_first,
 )
-from pipistrelle.detection.faces import average_faces
+from pipistrelle.detection.front_end import average_faces
 from pipistrelle.detection.matched import filter_blocks
+from pipistrelle.detection.noise import EXCESS_PATH_FLOOR
 from pipistrelle.detection.scans import with_columns
 from pipistrelle.detection.snapshots import Detections, detect, detector
 from pipistrelle.experiments.hearing.listening import listen

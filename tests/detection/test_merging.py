@@ -5,10 +5,16 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from pipistrelle.detection.certainty import BEARING_FLOOR, RANGE_FLOOR
-from pipistrelle.detection.faces import FrameMeasurements, average_faces, same_echo
-from pipistrelle.detection.merging import scan_of
-from pipistrelle.detection.scans import COLUMNS, OWN, UNLABELLED, with_columns, without_labels
+from pipistrelle.detection.front_end import FrameMeasurements, average_faces, same_echo
+from pipistrelle.detection.noise import BEARING_FLOOR, RANGE_FLOOR
+from pipistrelle.detection.scans import (
+    COLUMNS,
+    OWN,
+    UNLABELLED,
+    scan_of,
+    with_columns,
+    without_labels,
+)
 from pipistrelle.detection.snapshots import Detections
 from pipistrelle.geometry import circular_mean, wrap
 from reference.missions import scan_with

@@ -4,9 +4,14 @@ import numpy as np
 import pytest
 
 from pipistrelle.config import Config, FilterConfig
-from pipistrelle.detection.certainty import BEARING_FLOOR, RANGE_FLOOR
-from pipistrelle.detection.faces import FrameMeasurements, average_faces
-from pipistrelle.detection.noise import ConstantNoise, noise_of, without_hidden
+from pipistrelle.detection.front_end import FrameMeasurements, average_faces
+from pipistrelle.detection.noise import (
+    BEARING_FLOOR,
+    RANGE_FLOOR,
+    ConstantNoise,
+    noise_of,
+    without_hidden,
+)
 from pipistrelle.detection.scans import COLUMNS, with_columns
 from pipistrelle.detection.snapshots import Detections
 from pipistrelle.experiments.runs.heard_world import scans_of

@@ -11,14 +11,14 @@ from scipy.optimize import minimize
 from scipy.stats import binom
 
 from pipistrelle.acoustics.arrivals import Arrivals
-from pipistrelle.acoustics.callers import callers_of
+from pipistrelle.acoustics.paths import callers_of
 from pipistrelle.arithmetic.random_stream import stream_key
 from pipistrelle.arrays.layout import square_of_four
 from pipistrelle.arrays.receiver import add_echo_blocks, noise_blocks
 from pipistrelle.arrays.sampling import sampling
 from pipistrelle.config import BLOCK, Config, DetectionConfig, ScenarioConfig
-from pipistrelle.detection.certainty import EDGE_FLOOR, NOISE_QUANTILE, bearing_std
 from pipistrelle.detection.matched import filter_blocks
+from pipistrelle.detection.noise import EDGE_FLOOR, NOISE_QUANTILE, bearing_std
 from pipistrelle.detection.overlaps import MOST, deviation, most_left, resolve, room_for
 from pipistrelle.detection.scans import UNLABELLED
 from pipistrelle.detection.snapshots import Detections, detect, detector

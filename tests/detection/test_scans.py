@@ -4,9 +4,8 @@ import numpy as np
 import pytest
 
 from pipistrelle.config import InputError
-from pipistrelle.detection.merging import labelled
 from pipistrelle.detection.noise import ConstantNoise
-from pipistrelle.detection.scans import COLUMNS, OWN, make_scan, rows_of, with_columns
+from pipistrelle.detection.scans import COLUMNS, OWN, labelled, make_scan, rows_of, with_columns
 
 
 def test_rows_of_a_scan_keep_all_their_columns_and_the_time():

@@ -10,7 +10,7 @@ from scipy.signal import find_peaks
 from scipy.stats import binom, gamma
 
 from pipistrelle.acoustics.arrivals import Arrivals, arrivals_of_emission, through_piston
-from pipistrelle.acoustics.callers import Caller, callers_of
+from pipistrelle.acoustics.paths import Caller, callers_of
 from pipistrelle.arithmetic.random_stream import complex_noise, stream_key
 from pipistrelle.arrays.beamforming import beamscan
 from pipistrelle.arrays.layout import Layout, square_of_four

@@ -8,10 +8,9 @@ import pytest
 from scipy.stats import binom, chi2
 
 from pipistrelle.acoustics.arrivals import Arrivals
-from pipistrelle.acoustics.call import Sweep, ToneBurst
-from pipistrelle.acoustics.callers import callers_of
+from pipistrelle.acoustics.call import Sweep, ToneBurst, band_of, cross_talk, replica
+from pipistrelle.acoustics.paths import callers_of
 from pipistrelle.arrays.array_file import microphones_of
-from pipistrelle.arrays.bands import band_of, cross_talk, replica
 from pipistrelle.arrays.layout import Layout, scattered, square_of_four
 from pipistrelle.arrays.receiver import record_samples
 from pipistrelle.arrays.sampling import sampling

@@ -5,11 +5,10 @@ import numpy as np
 import pytest
 
 from pipistrelle.config import AssociationConfig, Config, InputError, RayConfig
-from pipistrelle.detection.merging import labelled
-from pipistrelle.detection.scans import UNLABELLED, make_scan
+from pipistrelle.detection.scans import UNLABELLED, labelled, make_scan
 from pipistrelle.estimation.association import Assignment, edited, expected
 from pipistrelle.estimation.beliefs import Gaussian
-from pipistrelle.estimation.data_association.methods import association_of
+from pipistrelle.estimation.data_association.sequential import association_of
 from pipistrelle.estimation.ekf.filter import EkfSlam
 from pipistrelle.estimation.ekf.gaussian import INVARIANT, LINEAR
 from pipistrelle.estimation.motion import Motion

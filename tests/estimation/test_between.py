@@ -8,8 +8,7 @@ import pytest
 from pipistrelle.config import FastSlamConfig
 from pipistrelle.detection.scans import make_scan
 from pipistrelle.estimation.beliefs import Gaussian, placed
-from pipistrelle.estimation.ekf.filter import EkfSlam
-from pipistrelle.estimation.ekf.invariant import InvariantEkfSlam
+from pipistrelle.estimation.ekf.filter import EkfSlam, InvariantEkfSlam
 from pipistrelle.estimation.fastslam.filter import FastSlam
 from pipistrelle.estimation.measurement import excess_path_of, landmark_range
 from pipistrelle.estimation.smoother.filter import Smoother

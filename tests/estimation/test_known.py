@@ -8,13 +8,12 @@ import pytest
 from pipistrelle.config import FastSlamConfig, InputError
 from pipistrelle.detection.scans import make_scan
 from pipistrelle.estimation.beliefs import AcceptsMap, Gaussian
-from pipistrelle.estimation.ekf.filter import EkfSlam
-from pipistrelle.estimation.ekf.invariant import InvariantEkfSlam
+from pipistrelle.estimation.ekf.filter import EkfSlam, InvariantEkfSlam
 from pipistrelle.estimation.fastslam.filter import FastSlam
 from pipistrelle.estimation.measurement import excess_path_of, measurement_jacobians
 from pipistrelle.estimation.smoother.filter import Smoother
 from pipistrelle.experiments.drives import Drive
-from pipistrelle.experiments.runs.filtering import run_filter
+from pipistrelle.experiments.runs.trial import run_filter
 from pipistrelle.geometry import range_and_bearing
 from reference.missions import BICYCLE, map_with, ray_config, scan_with
 

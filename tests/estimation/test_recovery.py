@@ -8,8 +8,7 @@ import pytest
 from pipistrelle.config import RayConfig
 from pipistrelle.detection.scans import make_scan, with_columns
 from pipistrelle.estimation.beliefs import Gaussian
-from pipistrelle.estimation.ekf.filter import EkfSlam
-from pipistrelle.estimation.ekf.invariant import InvariantEkfSlam
+from pipistrelle.estimation.ekf.filter import EkfSlam, InvariantEkfSlam
 from pipistrelle.estimation.motion import Motion, motion_step
 from pipistrelle.estimation.recovery import odometry_bound, recovered
 from pipistrelle.estimation.smoother.filter import Smoother

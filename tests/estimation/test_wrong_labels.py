@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from pipistrelle.config import Config
-from pipistrelle.detection.merging import labelled
+from pipistrelle.detection.scans import labelled
 from pipistrelle.estimation.catalogue import entry
 from reference.missions import BICYCLE, followed, measured_to, paper_mission
 

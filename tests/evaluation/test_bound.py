@@ -17,8 +17,8 @@ from pipistrelle.evaluation.consistency import anees_bounds_about
 from pipistrelle.experiments.drives import Drive, Truth
 from pipistrelle.experiments.hearing.listening import listen
 from pipistrelle.experiments.hearing.scenario import standing_landmarks, world_of
-from pipistrelle.experiments.runs.filtering import run_filter
 from pipistrelle.experiments.runs.heard_world import drive_of, scans_of
+from pipistrelle.experiments.runs.trial import run_filter
 from pipistrelle.geometry import range_and_bearing, wrap
 from reference.ekf_slam import moved
 from reference.missions import BICYCLE, CIRCLE, START, scan_with, scattered

@@ -11,8 +11,8 @@ from pipistrelle.detection.scans import make_scan
 from pipistrelle.estimation.beliefs import Gaussian
 from pipistrelle.estimation.catalogue import entry
 from pipistrelle.estimation.motion import Motion, motion_step
-from pipistrelle.experiments.cases import Case
 from pipistrelle.experiments.drives import Drive, Truth, at_sensor, at_vehicle, carried, split_at
+from pipistrelle.experiments.named_settings import Case
 from pipistrelle.experiments.runs.trial import run_trial
 from pipistrelle.settings import from_flags, resolve
 from reference.missions import scan_with

@@ -20,7 +20,7 @@ from pipistrelle.config import (
 from pipistrelle.estimation.catalogue import COPIES
 from pipistrelle.experiments import machine
 from pipistrelle.experiments.machine import check_length, check_memory
-from pipistrelle.experiments.runs import validate_mission
+from pipistrelle.experiments.runs import validate as validate_mission
 from pipistrelle.experiments.runs.trial import run_mission
 from pipistrelle.experiments.studies.plan import Plan
 from pipistrelle.experiments.studies.study import run_study

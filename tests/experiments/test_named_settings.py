@@ -14,8 +14,7 @@ from pipistrelle.estimation.catalogue import CATALOGUE
 from pipistrelle.experiments.named_settings import NAMES, PLANS, check_own, over_named, own_config
 from pipistrelle.experiments.results.tables import tum_text
 from pipistrelle.experiments.runs.trial import run_mission
-from pipistrelle.experiments.studies.plan import cases_of
-from pipistrelle.experiments.studies.plan_file import find_plan, plan_of, plan_text, read_plan
+from pipistrelle.experiments.studies.plan import cases_of, find_plan, plan_of, plan_text, read_plan
 from pipistrelle.settings import from_flags, known_settings, resolve
 
 WORLD = ("--duration", "4", "--landmarks", "10")

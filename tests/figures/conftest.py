@@ -5,13 +5,13 @@ from dataclasses import dataclass, replace
 import numpy as np
 import pytest
 
-from pipistrelle.acoustics.callers import Caller
+from pipistrelle.acoustics.paths import Caller
 from pipistrelle.config import CallerConfig, Config, ListeningConfig, ScenarioConfig
 from pipistrelle.detection.scans import Scan
 from pipistrelle.estimation.beliefs import Gaussian, Landmarks, Track
 from pipistrelle.experiments.drives import Truth
 from pipistrelle.experiments.results.scores import Scores, TrialResult
-from pipistrelle.experiments.runs import mission as missions
+from pipistrelle.experiments.runs import heard_world as missions
 from pipistrelle.experiments.runs.trial import run_mission
 from pipistrelle.figures.recorder import MissionRecorder
 from pipistrelle.geometry import range_and_bearing, wrap

@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from matplotlib.figure import Figure
 
-from pipistrelle.acoustics.callers import Caller
+from pipistrelle.acoustics.paths import Caller
 from pipistrelle.experiments.drives import NO_TRUTH, Truth
 from pipistrelle.figures.maps import (
     callers_shown,

@@ -12,7 +12,7 @@ from numpy.random import Generator
 from fuzz.judging import Tried, contents, faults_of
 from fuzz.mutations import one_of
 from fuzz.running import command, undrawn
-from pipistrelle.own_files import KINDS, SUMS
+from pipistrelle.files import KINDS, SUMS
 from reference.command_line import SHORT
 from reference.studies import TINY
 

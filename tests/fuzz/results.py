@@ -11,7 +11,7 @@ from numpy.random import Generator
 from fuzz.judging import Tried, contents, faults_of
 from fuzz.mutations import BYTES, one_of, spoiled
 from fuzz.running import command, undrawn
-from pipistrelle.own_files import SUMS
+from pipistrelle.files import SUMS
 from reference.command_line import SHORT
 
 RUN = ("run", *SHORT, "--strategy", "fused", "--quiet", "-o", "one")

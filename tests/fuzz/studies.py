@@ -122,8 +122,8 @@ def tables(study: Path) -> "dict[str, pl.DataFrame]":
     """Return the tables of a study's own worlds, but for the time that they took."""
     import polars as pl
 
-    from pipistrelle.experiments.studies.plan_file import read_plan
-    from pipistrelle.experiments.studies.world_files import TABLES, world_file
+    from pipistrelle.experiments.studies.plan import read_plan
+    from pipistrelle.experiments.studies.world import TABLES, world_file
 
     found = {}
     for world in range(read_plan(study / "plan.toml").iterations):
@@ -137,8 +137,8 @@ def make_strange(sound: Path) -> None:
     """Make tables of other columns, of nulls and of no rows, some with sums that are right."""
     import polars as pl
 
-    from pipistrelle.experiments.studies.plan_file import read_plan
-    from pipistrelle.experiments.studies.world_files import TABLES, with_sums
+    from pipistrelle.experiments.studies.plan import read_plan
+    from pipistrelle.experiments.studies.world import TABLES, with_sums
 
     (sound / "strange").mkdir()
     plan = read_plan(sound / "study" / "plan.toml")

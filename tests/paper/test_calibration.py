@@ -9,7 +9,7 @@ from statistics import fmean
 import pytest
 
 from pipistrelle.config import Config
-from pipistrelle.experiments.studies.plan_file import find_plan, read_plan
+from pipistrelle.experiments.studies.plan import find_plan, read_plan
 from pipistrelle.report.claims.published import TABLE_II
 
 SCRIPT = Path(__file__).parents[2] / "papers/bradley_abaid/calibration.py"

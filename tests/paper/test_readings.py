@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 from pipistrelle.estimation.rays import RANGED
-from pipistrelle.experiments.studies.plan_file import find_plan, read_plan
+from pipistrelle.experiments.studies.plan import find_plan, read_plan
 
 TABLE = Path(__file__).parents[2] / "papers/bradley_abaid/readings.csv"
 READ_AS = {

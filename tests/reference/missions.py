@@ -7,8 +7,7 @@ import numpy as np
 from pipistrelle.config import RayConfig
 from pipistrelle.detection.scans import Scan, make_scan, with_columns
 from pipistrelle.estimation.beliefs import Gaussian, Landmarks
-from pipistrelle.estimation.ekf.filter import EkfSlam
-from pipistrelle.estimation.ekf.invariant import InvariantEkfSlam
+from pipistrelle.estimation.ekf.filter import EkfSlam, InvariantEkfSlam
 from pipistrelle.estimation.motion import Motion, motion_step
 from pipistrelle.geometry import range_and_bearing, wrap
 

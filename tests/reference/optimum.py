@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 
 from pipistrelle.estimation.smoother.chain import converged, eliminated
-from pipistrelle.estimation.smoother.stack import Stack
+from pipistrelle.estimation.smoother.records import Stack
 
 
 def from_the_truth(belief, path, places):

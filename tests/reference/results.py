@@ -9,9 +9,8 @@ from pipistrelle.experiments.results.scores import Scores, TrialResult, score
 from pipistrelle.experiments.results.writing import write_results
 from pipistrelle.experiments.studies.plan import cases_of
 from pipistrelle.experiments.studies.store import open_store
-from pipistrelle.experiments.studies.world import TrialRecord
-from pipistrelle.experiments.studies.world_files import write_world
-from pipistrelle.own_files import RESULTS, OwnFiles
+from pipistrelle.experiments.studies.world import TrialRecord, write_world
+from pipistrelle.files import RESULTS, OwnFiles
 from reference.missions import map_with, scan_with
 
 STEPS = 40

@@ -8,9 +8,9 @@ import numpy as np
 
 import pipistrelle
 from pipistrelle.arrays.array_file import array_text, microphones_of
+from pipistrelle.arrays.beamforming import spread_towards
 from pipistrelle.arrays.layout import scattered
-from pipistrelle.arrays.pattern import spread_towards
-from pipistrelle.detection.certainty import BEARING_FLOOR, RANGE_FLOOR
+from pipistrelle.detection.noise import BEARING_FLOOR, RANGE_FLOOR
 from pipistrelle.geometry import wrap
 from reference.sounds import write_beside
 

@@ -6,9 +6,9 @@ from pathlib import Path
 
 import polars as pl
 
-from pipistrelle.experiments.studies.plan_file import read_plan
+from pipistrelle.experiments.studies.plan import read_plan
 from pipistrelle.experiments.studies.store import load_study
-from pipistrelle.experiments.studies.world_files import TABLES
+from pipistrelle.experiments.studies.world import TABLES
 
 SMALL = """\
 format = 1

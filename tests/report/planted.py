@@ -6,11 +6,9 @@ from pathlib import Path
 import numpy as np
 import polars as pl
 
-from pipistrelle.experiments.studies.plan import cases_of
-from pipistrelle.experiments.studies.plan_file import read_plan
+from pipistrelle.experiments.studies.plan import cases_of, read_plan
 from pipistrelle.experiments.studies.store import open_store
-from pipistrelle.experiments.studies.world import world_schemas
-from pipistrelle.experiments.studies.world_files import TABLES, with_sums, world_file
+from pipistrelle.experiments.studies.world import TABLES, with_sums, world_file, world_schemas
 from report.invented import noise
 
 FRAMES, LANDMARKS = 6, 5

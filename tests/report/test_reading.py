@@ -7,9 +7,8 @@ import polars as pl
 import pytest
 
 from pipistrelle.config import InputError
-from pipistrelle.experiments.studies.plan import cases_of
-from pipistrelle.experiments.studies.plan_file import read_plan
-from pipistrelle.experiments.studies.world_files import TABLES, with_sums, world_file
+from pipistrelle.experiments.studies.plan import cases_of, read_plan
+from pipistrelle.experiments.studies.world import TABLES, with_sums, world_file
 from pipistrelle.report.reading import read_study
 from pipistrelle.report.studied import (
     COMMON,

@@ -12,7 +12,7 @@ import pytest
 
 from pipistrelle.config import Config, FilterConfig
 from pipistrelle.experiments.studies.plan import Plan
-from pipistrelle.own_files import SUMS
+from pipistrelle.files import SUMS
 from reference.command_line import COMPILING, SHORT, contents
 from reference.results import loop, mission_folder, study_folder, turned
 

@@ -7,7 +7,7 @@ from itertools import product
 import numpy as np
 
 from pipistrelle.config import Config
-from pipistrelle.estimation.data_association.methods import METHODS
+from pipistrelle.estimation.data_association.sequential import METHODS
 from pipistrelle.experiments.runs import compiling
 
 

@@ -6,7 +6,7 @@ import pytest
 import soundfile
 
 import pipistrelle
-from pipistrelle.own_files import SOUND, OwnFiles
+from pipistrelle.files import SOUND, OwnFiles
 from reference.sounds import FEW, foreign, record, swept
 
 

@@ -11,7 +11,8 @@ import polars as pl
 import pytest
 
 import pipistrelle
-from pipistrelle import kernel_clock, own_files
+from pipistrelle import files as own_files
+from pipistrelle import kernel_clock
 from pipistrelle.estimation.catalogue import PAPERS
 from pipistrelle.estimation.fastslam.filter import FastSlam
 from pipistrelle.evaluation.bound import IN_ONE_WORLD

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from pipistrelle.experiments.studies.world_files import done_worlds
+from pipistrelle.experiments.studies.world import done_worlds
 from pipistrelle.verbs.signals import heard_signals
 
 PLAN = """\

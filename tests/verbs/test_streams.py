@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from pipistrelle.__main__ import main
-from pipistrelle.experiments.studies.world_files import done_worlds
+from pipistrelle.experiments.studies.world import done_worlds
 from reference.command_line import SHORT, summary
 
 TINY = """\

@@ -13,8 +13,8 @@ from pipistrelle import kernel_clock
 from pipistrelle.__main__ import main
 from pipistrelle.experiments.runs import compiling
 from pipistrelle.experiments.studies import study, world
-from pipistrelle.experiments.studies.plan_file import read_plan
-from pipistrelle.experiments.studies.world_files import done_worlds
+from pipistrelle.experiments.studies.plan import read_plan
+from pipistrelle.experiments.studies.world import done_worlds
 from pipistrelle.verbs import study as verb
 from reference.command_line import COMPILING
 from reference.studies import SMALL, assert_same, results

@@ -11,10 +11,18 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Bool, Float, Int, Int8
 
-from pipistrelle.acoustics.callers import VEHICLE, Caller
-from pipistrelle.acoustics.emitter import in_front, piston_directivity
-from pipistrelle.acoustics.medium import Medium, medium_of
+from pipistrelle.acoustics.emitter import (
+    Bodies,
+    backscatter_db,
+    in_front,
+    piston_directivity,
+    strength_of_bodies_db,
+    target_strength_db,
+    with_usual,
+)
 from pipistrelle.acoustics.paths import (
+    VEHICLE,
+    Caller,
     SoundPaths,
     paths_over_surfaces,
     paths_to_vehicle,
@@ -22,16 +30,11 @@ from pipistrelle.acoustics.paths import (
     turn_of_sound,
 )
 from pipistrelle.acoustics.propagation import (
+    Medium,
     doppler_frequency,
+    medium_of,
     passive_spreading_loss_db,
     spreading_loss_db,
-)
-from pipistrelle.acoustics.target import (
-    Bodies,
-    backscatter_db,
-    strength_of_bodies_db,
-    target_strength_db,
-    with_usual,
 )
 from pipistrelle.config import Config, TargetConfig
 from pipistrelle.geometry import wrap
@@ -114,7 +117,7 @@ def arrivals_of_emission(
     --------
     The second landmark is behind the baffle: only the beacon's call shows it.
 
-    >>> from pipistrelle.acoustics.callers import callers_of
+    >>> from pipistrelle.acoustics.paths import callers_of
     >>> east, still = np.zeros(3), np.zeros(2)
     >>> landmarks, beacon = np.array([[5.0, 0.0], [-5.0, 0.0]]), np.array([0.0, 9.0])
     >>> heard = arrivals_of_emission(east, still, landmarks, callers_of(Config(), beacon), Config())
@@ -148,7 +151,7 @@ def arrivals_of_emissions(
 
     The vehicle turns round, and its next call meets the beacon instead of the landmark.
 
-    >>> from pipistrelle.acoustics.callers import callers_of
+    >>> from pipistrelle.acoustics.paths import callers_of
     >>> poses, still = np.array([[0.0, 0.0, 0.0], [0.0, 0.0, np.pi]]), np.zeros((2, 2))
     >>> landmarks, beacon = np.array([[5.0, 0.0]]), np.array([-9.0, 0.0])
     >>> callers = callers_of(Config(), beacon)

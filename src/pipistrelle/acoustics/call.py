@@ -20,13 +20,37 @@ to first order (`coupling`).
 Sources: Klauder et al., Bell System Technical Journal 39 (1960), for the linear law; Kroszczynski,
 Proceedings of the IEEE 57 (1969), and Altes & Titlebaum, Journal of the Acoustical Society of
 America 48 (1970), for the hyperbolic one.
+
+Calls as the settings have them: a tone, a sweep, or a WAV file of one's own.
+
+Bands: which frequencies a call has, and how much of it is another's.
+
+A real recording is matched in each call's band, the middle of its spectrum that holds nearly all of
+its energy. Outputs of the matched filter follow it so closely that nothing between them is lost:
+twice as many in a second as the widest band has Hz, at least. Of the spectrum S in the band,
+
+.. math:: f_c = \frac{\int f |S|^2}{\int |S|^2}, \qquad
+          \beta^2 = (2\pi)^2 \frac{\int (f - f_c)^2 |S|^2}{\int |S|^2} ,
+
+the Cramer-Rao bound of a delay is :math:`1 / (2 p \beta^2)`, with p the power of the output in
+units of its noise.
+
+Source: Van Trees, Detection, Estimation, and Modulation Theory III (1971), Sec. 10.2.
 """
 
-from dataclasses import dataclass
-from typing import Literal, Protocol
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple, Protocol
 
 import numpy as np
 from jaxtyping import Complex, Float
+
+from pipistrelle.config import SWEEP, TONE, CallConfig, InputError
+from pipistrelle.files import check_ordinary
+from pipistrelle.refusals import refusal
+from pipistrelle.settings import CALL_KEYS, CALLERS, Layer, beside
 
 
 class Call(Protocol):
@@ -137,3 +161,237 @@ def coupling(call: Call) -> float:
     if not isinstance(call, Sweep) or call.start == call.end:
         return 0.0
     return -call.end * call.duration / (call.end - call.start)
+
+
+if TYPE_CHECKING:
+    from scipy.interpolate import CubicSpline
+
+FINER = 8
+"""How much finer than its file's samples a recorded call is interpolated."""
+LEAST_SAMPLES = 10
+"""Fewest samples of a recorded call."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class RecordedCall:
+    """A call from a file, between its samples as its band has it, and silence after them."""
+
+    path: str
+    frequency: float
+    """Where its band lies [Hz]."""
+    duration: float
+    """Length, silence included [s]."""
+    rate: float
+    """Sample rate of the file [Hz]."""
+    samples: Float[np.ndarray, " n"]
+    """As the file has them."""
+    _envelope: "CubicSpline" = field(init=False, repr=False)
+
+    def __post_init__(self) -> None:
+        """Interpolate the analytic signal, turned back by the band's frequency."""
+        from scipy.fft import fft, ifft, next_fast_len
+        from scipy.interpolate import CubicSpline
+
+        count = next_fast_len(2 * self.samples.size + 64)
+        spectrum = fft(self.samples - self.samples.mean(), count)
+        spectrum[count // 2 :] = 0.0  # what is left is the analytic signal's half
+        fine = np.zeros(FINER * count, dtype=np.complex128)
+        fine[: count // 2] = spectrum[: count // 2]
+        signal = 2.0 * FINER * ifft(fine)[: FINER * self.samples.size]
+        time = np.arange(signal.size) / (FINER * self.rate)
+        envelope = signal * np.exp(-2j * np.pi * self.frequency * time) / np.abs(signal).max()
+        object.__setattr__(self, "_envelope", CubicSpline(time, envelope))
+
+    def waveform(
+        self, time: Float[np.ndarray, "*n"], frequency: float
+    ) -> Complex[np.ndarray, "*n"]:
+        """Return the call as it is received; silence before and after."""
+        own = np.asarray(time) * (frequency / self.frequency)
+        inside = (own >= 0.0) & (own <= (self.samples.size - 1) / self.rate)
+        turned = np.exp(2j * np.pi * self.frequency * own)
+        return np.where(inside, self._envelope(np.where(inside, own, 0.0)) * turned, 0.0)
+
+
+def sound_of(settings: CallConfig, duration: float, key: str) -> Call | None:
+    """Return what a caller sends, or None where it is a plain tone.
+
+    `duration`: of every call [s]; `key`: the caller's section, for refusals.
+
+    >>> sound_of(CallConfig(call="sweep"), 2.8e-3, "emitter")
+    Sweep(start=60000.0, end=35000.0, duration=0.0028, law='linear', taper=0.0)
+    """
+    if settings.call == TONE:
+        if settings.taper == 0.0:
+            return None
+        return Sweep(settings.frequency, settings.frequency, duration, taper=settings.taper)
+    if settings.call == SWEEP:
+        return Sweep(*settings.band, duration, settings.sweep, settings.taper)
+    if settings.taper != 0.0:
+        raise InputError(
+            f"{key}.taper: found {settings.taper:g} beside the file {settings.call}, which has its "
+            "own; expected 0"
+        )
+    return read_call(Path(settings.call), settings.frequency, duration, f"{key}.call")
+
+
+def settings_of(sound: Call | None) -> dict[str, Any]:
+    """Return the settings that give a caller's sound again; none of a plain tone.
+
+    >>> settings_of(Sweep(60e3, 35e3, 2.8e-3))["band"]
+    [60000.0, 35000.0]
+    """
+    if isinstance(sound, RecordedCall):
+        return {"call": sound.path}
+    if not isinstance(sound, Sweep):
+        return {}
+    if sound.start == sound.end:
+        return {"taper": sound.taper}
+    band = [sound.start, sound.end]
+    return {"call": SWEEP, "sweep": sound.law, "band": band, "taper": sound.taper}
+
+
+def with_calls(layer: Layer) -> Layer:
+    """Return settings whose calls' files are named from the root, so that they hold anywhere."""
+    here = Path.cwd() / "settings"
+    calls = {key: given for key, given in layer.items() if key in CALL_KEYS}
+    named = {
+        key: given._replace(value=str(here.parent / given.value))
+        for key, given in calls.items()
+        if isinstance(given.value, str) and given.value not in ("", TONE, SWEEP)
+    }
+    if CALLERS in layer:
+        given = layer[CALLERS]
+        named[CALLERS] = given._replace(value=beside(here, given.value))
+    return layer | named
+
+
+def read_call(path: Path, frequency: float, duration: float, where: str) -> RecordedCall:
+    """Read a call from a sound file of one channel, or refuse it.
+
+    `frequency`: where its band lies [Hz]; `duration`: the longest that it may be [s]; `where` the
+    file is named, for refusals.
+    """
+    rate, samples = _samples(path, where)
+    place, longest = f"{where}: {path}", round(duration * rate)
+    if not LEAST_SAMPLES <= samples.size <= longest:
+        fix = "cut it, or set emitter.pulse, which all calls last"
+        expected = f"{LEAST_SAMPLES} to {longest} ({duration:g} s)"
+        raise refusal(place, f"{samples.size} samples at {rate:g} Hz", expected, fix)
+    if not np.isfinite(samples).all() or not np.ptp(samples) > 0.0:
+        found = "samples that are no finite numbers" if np.ptp(samples) != 0.0 else "silence"
+        raise refusal(place, found, "a call", "record it anew")
+    power = np.abs(np.fft.rfft(samples - samples.mean(), 8 * samples.size)) ** 2
+    centre = float(np.sum(power * np.arange(power.size)) / power.sum() * rate / (8 * samples.size))
+    section = where.rpartition(".")[0]
+    if not 0.5 * centre <= frequency <= 2.0 * centre:
+        expected = f"about {centre:.0f} Hz, where the band of {path} lies"
+        raise refusal(f"{section}.frequency", f"{frequency:g} Hz", expected, "correct it")
+    return RecordedCall(str(path), frequency, duration, rate, samples)
+
+
+def _samples(path: Path, where: str) -> tuple[float, Float[np.ndarray, " n"]]:
+    """Return rate and samples of a sound file of one channel, or refuse it."""
+    try:
+        import soundfile
+    except ImportError:
+        raise InputError(
+            f"{where}: {path} is read by the package soundfile, which is not installed; install it "
+            "by python -m pip install 'pipistrelle[sound]'"
+        ) from None
+    expected = f"{TONE!r}, {SWEEP!r}, or a sound file of one channel"
+    check_ordinary(path)
+    if not path.exists():
+        raise refusal(where, f"{str(path)!r}, no such file", expected, "check the path")
+    try:
+        with soundfile.SoundFile(path) as file:
+            if file.channels != 1 or not LEAST_SAMPLES <= file.frames <= 10 * file.samplerate:
+                found = f"{path} with {file.channels} channels and {file.frames} samples"
+                raise refusal(where, found, expected, "save one call alone")
+            return float(file.samplerate), file.read(dtype="float64")
+    except (soundfile.SoundFileError, OSError, ValueError, TypeError) as error:
+        if isinstance(error, InputError):
+            raise
+        found = f"{path}, no sound that can be read"
+        raise refusal(where, found, expected, "convert it to WAV") from None
+
+
+ENERGY = 0.995
+"""Share of a call's energy that its band holds."""
+MAX_CROSS_TALK = 0.06
+"""Largest share of a call's power that the matched filter of another may answer."""
+PADDING = 8
+"""How much finer than its length asks for a call's spectrum is looked at."""
+
+
+class Band(NamedTuple):
+    """The frequencies of a call."""
+
+    low: float
+    high: float
+    centre: float
+    """`low`, `high` and `centre`, the mean over the energy [Hz]."""
+    spread: float
+    """Root mean square angular frequency about the centre [rad/s]."""
+    energy: float
+    """Sum of the squares of its samples, in units of its amplitude's."""
+
+
+def replica(call: Call, rate: float, scale: float = 1.0) -> Complex[np.ndarray, " n"]:
+    """Return a call's samples, as it is received a times as high (`scale`)."""
+    time = np.arange(math.ceil(call.duration * rate - 1e-6)) / rate
+    return call.waveform(time, scale * call.frequency)
+
+
+def band_of(call: Call, rate: float) -> Band:
+    """Return the band of a call that is sampled at a rate [Hz].
+
+    >>> band = band_of(Sweep(60e3, 35e3, 2.8e-3, taper=0.2), 200e3)
+    >>> round(band.low / 1e3), round(band.high / 1e3), round(band.centre / 1e3, 1)
+    (35, 60, 47.5)
+    """
+    sent = replica(call, rate)
+    power = np.abs(np.fft.fft(sent, PADDING * sent.size)) ** 2
+    bins = np.arange(power.size)
+    share = np.cumsum(power) / power.sum()
+    edges = np.searchsorted(share, (0.5 * (1.0 - ENERGY), 0.5 * (1.0 + ENERGY)))
+    low, high = edges.tolist()
+    inside, step = slice(low, high + 1), rate / power.size
+    weight = power[inside] / power[inside].sum()
+    centre = float(np.sum(weight * bins[inside]))
+    spread = 2.0 * np.pi * step * math.sqrt(np.sum(weight * (bins[inside] - centre) ** 2))
+    energy = float(np.sum(np.abs(sent) ** 2))
+    return Band(low * step, high * step, centre * step, spread, energy)
+
+
+def extent_of(call: Call, rate: float) -> tuple[float, float]:
+    """Return the frequencies between which a call lies: of a tone its own, else those of its band.
+
+    A sweep's are those at which it begins and ends, where its samples would alias.
+    """
+    if isinstance(call, ToneBurst):
+        return call.frequency, call.frequency
+    band = band_of(call, rate)
+    ends = (call.start, call.end) if isinstance(call, Sweep) else (call.frequency,)
+    return min(band.low, *ends), max(band.high, *ends)
+
+
+def cross_talk(calls: Sequence[Call], rate: float) -> Float[np.ndarray, "c c"]:
+    """Return how much of a call's power the matched filter of another answers, at the worst lag.
+
+    `rate` [Hz]. Row i is of the filter of call i.
+    """
+    sent = [replica(call, rate) for call in calls]
+    count = 2 * max(one.size for one in sent)
+    spectra = [np.fft.fft(one / np.linalg.norm(one), count) for one in sent]
+    answers = [[np.abs(np.fft.ifft(b * a.conj())).max() ** 2 for b in spectra] for a in spectra]
+    return np.array(answers)
+
+
+def lag_step(calls: Sequence[Call], rate: float) -> int:
+    """Return the samples from one output of the matched filters to the next, at a rate [Hz].
+
+    >>> lag_step([ToneBurst(35e3, 2.8e-3)], 200e3)
+    6
+    """
+    widest = max(band.high - band.low for band in (band_of(call, rate) for call in calls))
+    return max(math.floor(rate / (2.0 * widest)), 1)

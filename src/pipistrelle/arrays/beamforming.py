@@ -1,7 +1,173 @@
-"""Narrowband beamforming with a uniform line array: steering, pattern, scan, accuracy limit."""
+r"""Narrowband beamforming with a uniform line array: steering, pattern, scan, accuracy limit.
+
+Pattern: what a group of microphones can tell of a bearing, and what it cannot.
+
+A beam steered to :math:`\phi_0` answers a wave from :math:`\phi` with the power
+
+.. math:: B(\phi) = \left| \sum_m w_m^2 e^{i k\, p_m \cdot (u(\phi) - u(\phi_0))} \right|^2 ,
+
+one where they agree. Half of it is the beam's width; another lobe that is nearly one is a direction
+that sounds the same. Waves are plane to an array of the aperture D from :math:`2 D^2 / \lambda` on.
+
+Source: van Trees, Optimum Array Processing (2002), ch. 2.
+"""
+
+import math
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Complex, Float
+
+from pipistrelle.arrays.layout import Scattered
+
+STEERED = 360
+"""Directions to which a beam is steered, at most."""
+MOST_WAVES = 4096
+"""Directions of waves for each, at most."""
+PHASE_STEP = 0.1
+"""Distance of two such directions, as a root mean square phase [rad], where that many suffice."""
+ALIKE_DB = -1.0
+"""A lobe as high as this sounds the same [dB]."""
+
+UNKNOWN = math.pi / math.sqrt(3.0)
+"""Deviation of a bearing that is not known at all [rad]."""
+
+
+class Pattern(NamedTuple):
+    """Resolution and ambiguities of a group of microphones at one frequency."""
+
+    microphones: int
+    aperture: float
+    """Largest distance of two microphones [m]."""
+    nearest: float
+    """Largest distance of a microphone from its nearest neighbour [m]."""
+    far_field: float
+    """Distance from which on waves are plane [m]."""
+    width: tuple[float, float]
+    """Half-power width of the narrowest beam and of the widest [rad]."""
+    lobe_db: float
+    """Highest other lobe of any beam [dB]."""
+    worst: tuple[float, float]
+    """The bearing of that beam, and of the lobe [rad]."""
+    alike: float
+    """Share of the bearings for which some other one sounds the same (`ALIKE_DB`)."""
+    std: tuple[float, float]
+    """Cramer-Rao bound of a bearing at 20 dB at each microphone, at best and at worst [rad]."""
+
+
+def pattern_of(layout: Scattered, g: int, *, frequency: float, speed_of_sound: float) -> Pattern:
+    """Work out what a group of microphones can tell at a frequency.
+
+    Bearings are all, or of a line on a face those within 75 degrees of its normal.
+
+    `frequency` [Hz]; `speed_of_sound` [m/s].
+
+    >>> from pipistrelle.arrays.array_file import microphones_of
+    >>> from pipistrelle.arrays.layout import scattered
+    >>> line = scattered(microphones_of([(0, 0.0049 * i, 0, 0, "") for i in range(10)]))
+    >>> found = pattern_of(line, 0, frequency=35e3, speed_of_sound=343.0)
+    >>> round(found.alike, 2), round(found.far_field, 2), round(math.degrees(found.width[0]), 1)
+    (0.94, 0.4, 10.2)
+    """
+    members = layout.group == g
+    place, wave = layout.position[members], 2.0 * np.pi * frequency / speed_of_sound
+    share = layout.amplitude[members] ** 2 / np.sum(layout.amplitude[members] ** 2)
+    bearing, closed = _bearings(layout.normal[g], place, share, wave)
+    spread = wave**2 * spread_towards(bearing, place, np.sqrt(share))
+    answers = np.exp(1j * wave * np.column_stack((np.cos(bearing), np.sin(bearing))) @ place.T)
+    beams = np.linspace(0, len(bearing) - 1, min(STEERED, len(bearing)), dtype=int)
+    widths, lobes = [], []
+    for i in beams:
+        power = np.abs(answers @ (share * answers[i].conj())) ** 2
+        width, lobe, at = _width_and_lobe(power, i, closed)
+        widths.append(width * float(bearing[1] - bearing[0]))
+        lobes.append((lobe, bearing[i], bearing[at]))
+    level, steered, other = max(lobes)
+    apart = np.linalg.norm(place[:, None] - place, axis=-1)
+    aperture = float(apart.max())
+    power = 100.0 * np.sum(layout.amplitude[members] ** 2)
+    stds = np.minimum((2.0 * power * np.maximum(spread, 1e-9)) ** -0.5, UNKNOWN)
+    return Pattern(
+        microphones=len(place),
+        aperture=aperture,
+        nearest=float((apart + np.eye(len(place)) * 1e9).min(axis=1).max()),
+        far_field=2.0 * aperture**2 * frequency / speed_of_sound,
+        width=(min(widths), max(widths)),
+        lobe_db=10.0 * math.log10(max(level, 1e-30)),
+        worst=(float(steered), float(other)),
+        alike=float(np.mean([lobe >= 10.0 ** (ALIKE_DB / 10.0) for lobe, *_ in lobes])),
+        std=(float(stds.min()), float(stds.max())),
+    )
+
+
+def beam_power(
+    layout: Scattered,
+    g: int,
+    steered: float,
+    bearing: Float[np.ndarray, " n"],
+    *,
+    frequency: float,
+    speed_of_sound: float,
+) -> Float[np.ndarray, " n"]:
+    """Return the answer of a group's beam to waves from bearings [rad], 1 where it is steered."""
+    members = layout.group == g
+    share = layout.amplitude[members] ** 2 / np.sum(layout.amplitude[members] ** 2)
+    lead = (layout.lead(bearing) - layout.lead(steered))[:, members]
+    return np.abs(np.exp(2j * np.pi * frequency / speed_of_sound * lead) @ share) ** 2
+
+
+def _bearings(
+    normal: float, place: Float[np.ndarray, "k 2"], share: Float[np.ndarray, " k"], wave: float
+) -> tuple[Float[np.ndarray, " n"], bool]:
+    """Return the bearings that a group may hear from, and whether they close a circle."""
+    around = np.linspace(-np.pi, np.pi, STEERED, endpoint=False)
+    turn = wave * np.sqrt(spread_towards(around, place, np.sqrt(share)).max())
+    count = min(max(math.ceil(2.0 * np.pi * turn / PHASE_STEP), STEERED), MOST_WAVES)
+    if math.isnan(normal):
+        return np.linspace(-np.pi, np.pi, count, endpoint=False), True
+    limit = math.radians(75.0)
+    return normal + np.linspace(-limit, limit, count), False
+
+
+def spread_towards(
+    bearing: Float[np.ndarray, "*n"],
+    position: Float[np.ndarray, "k 2"],
+    weight: Float[np.ndarray, " k"],
+) -> Float[np.ndarray, "*n"]:
+    r"""Return the variance of microphones' places across a direction [m^2].
+
+    Each counts by its weight squared. Times the wavenumber squared it is :math:`\kappa`: how far
+    the phases turn with the bearing, of which the Cramer-Rao bound is made
+    (`pipistrelle.detection.full_circle`).
+
+    >>> pair, equal = np.array([[0.0, 0.1], [0.0, -0.1]]), np.full(2, 0.5**0.5)
+    >>> spread_towards(np.array([0.0, np.pi / 2]), pair, equal).round(9)
+    array([0.01, 0.  ])
+    """
+    across = np.stack((-np.sin(bearing), np.cos(bearing)), axis=-1) @ position.T
+    share = weight * weight
+    return across**2 @ share - (across @ share) ** 2
+
+
+def _width_and_lobe(power: Float[np.ndarray, " n"], i: int, closed: bool) -> tuple[int, float, int]:
+    """Return a beam's width at half power, in steps, its highest other lobe and where that is."""
+    n = len(power)
+    turned = np.roll(power, n // 2 - i) if closed else power
+    i, away = (n // 2, i - n // 2) if closed else (i, 0)
+    low, high = i, i
+    while low > 0 and turned[low - 1] >= 0.5:
+        low -= 1
+    while high < n - 1 and turned[high + 1] >= 0.5:
+        high += 1
+    width = high - low
+    while low > 0 and turned[low - 1] <= turned[low]:
+        low -= 1
+    while high < n - 1 and turned[high + 1] <= turned[high]:
+        high += 1
+    rest = turned.copy()
+    rest[low : high + 1] = 0.0
+    at = int(rest.argmax())
+    return width, float(rest[at]), (at + away) % n
 
 
 def steering_vector(

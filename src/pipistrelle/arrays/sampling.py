@@ -1,4 +1,4 @@
-"""Sampling: the rate, the blocks and the tones of a recording, and how long one is."""
+r"""Sampling: the rate, the blocks and the tones of a recording, and how long one is."""
 
 import math
 from collections.abc import Callable, Sequence
@@ -8,10 +8,9 @@ import numpy as np
 from jaxtyping import Float
 
 from pipistrelle.acoustics.arrivals import Arrivals
-from pipistrelle.acoustics.call import Call, ToneBurst
-from pipistrelle.acoustics.callers import MAX_CALLERS, Caller, check_caller
-from pipistrelle.acoustics.medium import Medium, medium_of
-from pipistrelle.arrays.bands import MAX_CROSS_TALK, cross_talk, extent_of
+from pipistrelle.acoustics.call import MAX_CROSS_TALK, Call, ToneBurst, cross_talk, extent_of
+from pipistrelle.acoustics.paths import MAX_CALLERS, Caller, check_caller
+from pipistrelle.acoustics.propagation import Medium, medium_of
 from pipistrelle.arrays.layout import Layout, Scattered
 from pipistrelle.config import BLOCK, SQUARE, Config, InputError
 
@@ -83,7 +82,7 @@ def sampling(
 
     Examples
     --------
-    >>> from pipistrelle.acoustics.callers import callers_of
+    >>> from pipistrelle.acoustics.paths import callers_of
     >>> settled = sampling(Config(), callers_of(Config(), np.zeros(2)))
     >>> settled.block, settled.pulse, settled.tones
     (40, 14, array([35000., 30000.]))
@@ -123,7 +122,7 @@ def sampling(
 def off_raster(config: Config, callers: Sequence[Caller]) -> str | None:
     """Return what keeps the sums of tones over 0.2 ms from being all that there is; None: nothing.
 
-    >>> from pipistrelle.acoustics.callers import callers_of
+    >>> from pipistrelle.acoustics.paths import callers_of
     >>> from pipistrelle.config import BeaconConfig
     >>> off_raster(Config(), callers_of(Config(), np.zeros(2)))
     >>> odd = Config(beacon=BeaconConfig(frequency=26e3))
@@ -195,7 +194,7 @@ def clear_frequency(config: Config) -> float:
     the grating lobe, :math:`\sin\theta_g = \sin\theta - \lambda / d`: of a longer wave than d times
     :math:`1 + \sin\theta`, with the largest angle that is kept, it lies outside. Half the sampling
     rate is the highest that real samples hold, and the only limit here of an array from a file
-    (`pipistrelle.arrays.pattern` tells its lobes).
+    (`pipistrelle.arrays.beamforming` tells its lobes).
 
     Returns [Hz].
 
@@ -216,7 +215,7 @@ def free_tones(config: Config, callers: Sequence[Caller], near: float) -> str:
 
     `near` [Hz]. Returns for a refusal, in brackets; empty where there is none.
 
-    >>> from pipistrelle.acoustics.callers import callers_of
+    >>> from pipistrelle.acoustics.paths import callers_of
     >>> free_tones(Config(), callers_of(Config(), np.zeros(2)), 31e3)
     ' (the nearest that are free: 20000 and 25000 Hz)'
     """
@@ -277,7 +276,7 @@ def block_shape(
 ) -> tuple[int, int, int, int]:
     """Return the shape of a recording in block sums.
 
-    >>> from pipistrelle.acoustics.callers import callers_of
+    >>> from pipistrelle.acoustics.paths import callers_of
     >>> from pipistrelle.arrays.layout import square_of_four
     >>> config = Config()
     >>> settled = sampling(config, callers_of(config, np.zeros(2)))

@@ -26,7 +26,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Complex, Float, Int
 
-from pipistrelle.detection.onset import reach_of
+from pipistrelle.detection.matched import reach_of
 from pipistrelle.jit import Whole, kernel, no_alloc
 
 MIN_RELATIVE_POWER = 0.1

@@ -32,7 +32,7 @@ deviation that a row states is that about the loudest,
 .. math:: \sigma^2 = \sigma_\phi^2 + \frac{\sum_k o_k (\phi_k - \phi)^2}{1 + \sum_k o_k}, \qquad
           o_k = e^{-(|z|^2 - |z_k|^2) / \eta} ,
 
-with :math:`\eta` the noise (`pipistrelle.detection.certainty`).
+with :math:`\eta` the noise (`pipistrelle.detection.noise`).
 
 Sources: Rice, Bell System Technical Journal 24 (1945), and Davies, Biometrika 74 (1987), for the
 crossings; Van Trees, Optimum Array Processing (2002), Secs. 2.2 and 8.4, for delay and sum and the
@@ -45,13 +45,19 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Complex, Float, Int
 
+from pipistrelle.arrays.beamforming import UNKNOWN, spread_towards
 from pipistrelle.arrays.layout import Scattered
-from pipistrelle.arrays.pattern import UNKNOWN, spread_towards
 from pipistrelle.config import Config
-from pipistrelle.detection.certainty import bearing_std, delay_std, loudest_noise, over_noise
 from pipistrelle.detection.direct import MIN_EDGE_ENERGY_OF_BEAM, Lags, front_edge
-from pipistrelle.detection.loudness import candidates, snapshot
-from pipistrelle.detection.onset import reach_of
+from pipistrelle.detection.matched import reach_of
+from pipistrelle.detection.noise import (
+    bearing_std,
+    candidates,
+    delay_std,
+    loudest_noise,
+    over_noise,
+    snapshot,
+)
 from pipistrelle.geometry import wrap_angle
 from pipistrelle.jit import Whole, kernel, no_alloc
 

@@ -1,13 +1,38 @@
-"""Measurement noise: the standard deviations of a scan's rows, as an estimator is given them.
+r"""Measurement noise: the standard deviations of a scan's rows, as an estimator is given them.
 
 It is stated of the rows that a filter is handed, after those of one landmark were merged.
+
+Certainty: how sure a detection is of its bearing and delay, as the signal itself tells.
+
+**Noise** is what a snapshot holds beside the wave that the beam is steered to: the receiver's own,
+of unit variance, or, where more is left than that explains in all but a thousandth of snapshots,
+what is left, :math:`\eta = (E - P) / (N - 1)`. Echoes that overlap are each other's noise: most
+errors above 20 dB are of that kind. With the power p of the steered beam in units of that noise,
+
+.. math:: \sigma_\theta = \sqrt{\frac{6}{p\,(N^2 - 1)} \left(1 + \frac{1}{p}\right)}
+              \Big/ \left( \frac{2\pi d}{\lambda} \cos\theta \right), \qquad
+          p = P / \eta - 1 ,
+
+the variance that the largest beam of a line array has (its first term is the Cramer-Rao bound,
+`pipistrelle.arrays.beamforming.bearing_bound`). The call of M lags has two edges, of which a lag
+holds parts: the first term of
+
+.. math:: \sigma_\tau^2 = \frac{M}{4 p} + \frac{26}{16} \left(\frac{M}{p}\right)^2
+
+in lags. The second is what the jumps at the edges make: the loudest point of a random walk that
+falls off to both sides, whose variance is 26 in its own units.
+
+Sources: Rife & Boorstyn, IEEE Transactions on Information Theory 20 (1974), for the first;
+Ibragimov & Has'minskii, Statistical Estimation (1981), Sec. VII.2, for the 26.
+
+Loudness: at which lags of a face's tone a snapshot is taken.
 """
 
 import math
 from dataclasses import dataclass, replace
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
 from pipistrelle.config import FilterConfig
 from pipistrelle.detection.scans import (
@@ -19,7 +44,200 @@ from pipistrelle.detection.scans import (
     without,
     without_excess_paths,
 )
-from pipistrelle.jit import kernel
+from pipistrelle.jit import Whole, kernel, no_alloc
+
+NOISE_QUANTILE = 0.999
+"""Share of snapshots whose noise is no louder than what is taken for noise alone."""
+MIN_POWER_OVER_NOISE = 0.1
+"""Least power over the noise for which a deviation is stated."""
+BEARING_FLOOR = (0.002, 0.009)
+"""Error [rad] of a bearing that no level removes, by the vehicle's own call and by another's: what
+echoes that overlap do to each other and leave no trace beside the beam. With these the errors in
+the paper's worlds have the variances that are stated; another's echoes come at all times, and
+overlap more."""
+RANGE_FLOOR = 0.01
+"""Error [m] of a range that no level removes, likewise."""
+EXCESS_PATH_FLOOR = 0.006
+"""Error [m] of an excess path that no level removes, likewise."""
+DIRECT_FLOOR = 0.04
+"""Error [rad] of the bearing of a caller's direct call: while it lasts, echoes begin of what stands
+near the line from the caller."""
+
+EDGE_FLOOR = 0.015
+"""Error [m] of where a caller's direct call begins that no level removes: what stands near the line
+adds to its first edge. It counts where overlaps are resolved, whose rows are sure enough to show
+it; it is the same for all rows of a frame."""
+
+
+def loudest_noise(elements: int) -> float:
+    """Return the 0.999 quantile of the residual power of a steered beam in noise.
+
+    In units of the noise's variance.
+
+    >>> round(loudest_noise(10), 2)
+    2.35
+    """
+    from scipy.special import gammaincinv
+
+    return float(gammaincinv(elements - 1, NOISE_QUANTILE)) / (elements - 1)
+
+
+@kernel
+def over_noise(power: float, energy: float, elements: Whole, loudest: float) -> float:
+    """Return the ratio p of the power of a steered beam to the noise, from the snapshot's energy.
+
+    >>> over_noise(101.0, 110.0, 10, 2.35), round(over_noise(101.0, 191.0, 10, 2.35), 2)
+    (100.0, 9.1)
+    """
+    noise = (energy - power) / (elements - 1)
+    return max(power / (noise if noise > loudest else 1.0) - 1.0, MIN_POWER_OVER_NOISE)
+
+
+@kernel
+def bearing_std(power: float, slope: float, spread: float) -> float:
+    """Return the standard deviation of a bearing [rad].
+
+    `slope`: phase between neighbours per radian; `spread`: twelve times the mean square of the
+    elements' places, in spacings, about their mean: N^2 - 1 of equally spaced ones.
+
+    >>> round(bearing_std(100.0, math.pi, 99.0), 4)
+    0.0079
+    """
+    return math.sqrt(6.0 * (1.0 + 1.0 / power) / (power * spread)) / slope
+
+
+@kernel
+def delay_std(power: float, pulse: Whole) -> float:
+    """Return the standard deviation of a delay, in lags; the call has so many.
+
+    >>> round(delay_std(100.0, 14), 3)
+    0.259
+    """
+    lags = pulse / power
+    return math.sqrt(0.25 * lags + 1.625 * lags * lags)
+
+
+_CHUNK = 256
+
+
+@kernel
+def energy_of(parts: Float[np.ndarray, " i"], elements: Whole) -> Float[np.ndarray, " t"]:
+    """Sum squares over the elements of every output, real and imaginary parts neighbours."""
+    energy = np.empty(parts.size // (2 * elements))
+    square = np.empty(_CHUNK * elements)  # stays in the cache
+    for start in range(0, energy.size, _CHUNK):
+        done = energy[start : start + _CHUNK]
+        part = parts[2 * elements * start :]
+        for i in range(done.size * elements):
+            square[i] = part[2 * i] * part[2 * i] + part[2 * i + 1] * part[2 * i + 1]
+        for g in range(done.size):
+            total = 0.0
+            for e in range(elements):
+                total += square[g * elements + e]
+            done[g] = total
+    return energy
+
+
+@kernel
+def candidates(
+    energy: Float[np.ndarray, " t"], threshold: float, row: Whole
+) -> Int[np.ndarray, " k"]:
+    """Find the tests over the threshold that beat both their neighbours a row away.
+
+    Every test is written and few are kept: a branch on each could not be predicted.
+    """
+    test, count, kept = np.empty(energy.size + 1, dtype=np.int64), 0, 0
+    for t in range(energy.size):
+        test[count] = t
+        count += energy[t] > threshold
+    for k in range(count):
+        t = test[k]
+        before = energy[t - row] if t >= row else -1.0
+        after = energy[t + row] if t + row < energy.size else -1.0
+        test[kept] = t
+        kept += (energy[t] > before) & (energy[t] >= after)
+    return test[:kept]
+
+
+@no_alloc
+def _is_loudest(
+    energy: Float[np.ndarray, " t"], test: Whole, row: Whole, reach: Whole, floor: float
+) -> bool:
+    """Tell whether a lag is the loudest within a reach, or until the energy falls low enough.
+
+    A row of tests is a lag's: its neighbour in time is a row away, its other tones next to it.
+    """
+    level, size = energy[test], energy.size
+    for away in range(row, (reach + 1) * row, row):
+        if test < away or energy[test - away] <= floor:
+            break
+        if energy[test - away] >= level:
+            return False
+    for away in range(row, (reach + 1) * row, row):
+        if test + away >= size or energy[test + away] <= floor:
+            break
+        if energy[test + away] > level:
+            return False
+    return True
+
+
+@no_alloc
+def is_leakage(
+    energy: Float[np.ndarray, " t"],
+    test: Whole,
+    row: Whole,
+    tones: Whole,
+    pulse: Whole,
+    leakage: float,
+) -> bool | np.bool_:
+    """Tell whether the energy of a tone is explained by leakage from another tone nearby."""
+    own, strongest = test % tones, 0.0
+    for p in range(tones):
+        if p != own:
+            other = test - own + p
+            for away in range(-pulse * row, (pulse + 1) * row, row):
+                if 0 <= other + away < energy.size:
+                    strongest = max(strongest, energy[other + away])
+    return energy[test] <= leakage * strongest
+
+
+@no_alloc
+def _run_of(
+    energy: Float[np.ndarray, " t"], test: Whole, row: Whole, floor: float
+) -> tuple[Whole, Whole]:
+    """Return the first lag, and the one after the last, of a test's run above a level."""
+    first = last = test
+    while first >= row and energy[first - row] > floor:
+        first -= row
+    while last + row < energy.size and energy[last + row] > floor:
+        last += row
+    return first // row, last // row + 1
+
+
+@no_alloc
+def snapshot(
+    energy: Float[np.ndarray, " t"],
+    test: Whole,
+    row: Whole,
+    tones: Whole,
+    pulse: Whole,
+    runs: bool,
+    threshold: float,
+    leakage: float,
+) -> tuple[Whole, Whole]:
+    """Return the first lag, and the one after the last, of a test's snapshot; equal if none.
+
+    A run may hold other echoes beside what leaks into it: each of its peaks is asked, at its lag.
+    """
+    if runs:
+        if _is_loudest(energy, test, row, energy.size, threshold):
+            return _run_of(energy, test, row, threshold)
+    elif _is_loudest(energy, test, row, pulse // 2, -1.0) and not is_leakage(
+        energy, test, row, tones, pulse, leakage
+    ):
+        return test // row, test // row + 1
+    return 0, 0
+
 
 STDS = BEARING_STD, RANGE_STD, EXCESS_PATH_STD
 """Where the standard deviations stand among the numbers."""

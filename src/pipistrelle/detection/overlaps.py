@@ -58,8 +58,8 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Complex, Float, Int
 
-from pipistrelle.detection.certainty import MIN_POWER_OVER_NOISE, NOISE_QUANTILE
-from pipistrelle.detection.onset import steering_phases
+from pipistrelle.detection.matched import steering_phases
+from pipistrelle.detection.noise import MIN_POWER_OVER_NOISE, NOISE_QUANTILE
 from pipistrelle.jit import Whole, kernel, no_alloc
 
 MOST = 3

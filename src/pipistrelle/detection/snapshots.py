@@ -28,16 +28,19 @@ from jaxtyping import Bool, Complex, Float, Int, Shaped
 
 from pipistrelle.arrays.layout import Layout
 from pipistrelle.config import Config, InputError
-from pipistrelle.detection.certainty import (
+from pipistrelle.detection.direct import DirectCalls, Lags, direct_calls
+from pipistrelle.detection.matched import arrival_lag, reach_of, steer, steering_phases
+from pipistrelle.detection.noise import (
     MIN_POWER_OVER_NOISE,
     bearing_std,
+    candidates,
     delay_std,
+    energy_of,
+    is_leakage,
     loudest_noise,
     over_noise,
+    snapshot,
 )
-from pipistrelle.detection.direct import DirectCalls, Lags, direct_calls
-from pipistrelle.detection.loudness import candidates, energy_of, is_leakage, snapshot
-from pipistrelle.detection.onset import arrival_lag, reach_of, steer, steering_phases
 from pipistrelle.detection.overlaps import (
     SAME_TIME,
     deviation,

@@ -35,7 +35,7 @@ a transform's brick-wall band spreads over all lags, round its ends too. So wher
 near an end, outputs are taken as far as a call reaches beyond both, of samples between silence;
 peaks there hide what their cut call leaves at most, and make no rows themselves.
 
-**How sure.** With the power over the noise p of the beam (`pipistrelle.detection.certainty`),
+**How sure.** With the power over the noise p of the beam (`pipistrelle.detection.noise`),
 
 .. math:: \sigma_\phi^2 = \frac{1 + 1/p}{2 p \kappa}, \qquad
           \sigma_\tau^2 = \frac{1 + 1/p}{2 p \beta^2} + \left(\delta \, \frac{2 v}{c}\right)^2 / 2 ,
@@ -55,12 +55,10 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Complex, Float, Int
 
-from pipistrelle.acoustics.call import Call, coupling
-from pipistrelle.arrays.bands import Band, band_of, lag_step, replica
+from pipistrelle.acoustics.call import Band, Call, band_of, coupling, lag_step, replica
+from pipistrelle.arrays.beamforming import UNKNOWN, spread_towards
 from pipistrelle.arrays.layout import Layout, Scattered
-from pipistrelle.arrays.pattern import UNKNOWN, spread_towards
 from pipistrelle.config import Config
-from pipistrelle.detection.certainty import bearing_std, loudest_noise, over_noise
 from pipistrelle.detection.direct import Lags
 from pipistrelle.detection.full_circle import (
     BEAM_STEP,
@@ -70,6 +68,7 @@ from pipistrelle.detection.full_circle import (
     margin_of,
     moved,
 )
+from pipistrelle.detection.noise import bearing_std, loudest_noise, over_noise
 from pipistrelle.geometry import wrap, wrap_angle
 from pipistrelle.jit import Whole, kernel, no_alloc
 

@@ -3,7 +3,7 @@ r"""Data association: which landmark each row of a scan is of, between predictio
 An `Association` sees the predicted belief and a scan without labels, and answers with an
 `Assignment`: a label for each row, and landmarks to remove or to merge. It has a memory, handed in
 and out as beliefs are, for what is tentative. Rows of one label are merged, rows without a label
-are left out (`pipistrelle.detection.merging.labelled`), and the filter is corrected with the rest.
+are left out (`pipistrelle.detection.scans.labelled`), and the filter is corrected with the rest.
 
 What a row ought to be, were it of a landmark, and how surely, the belief's joint Gaussian tells
 (`expected`): of several rows at once, since all share the error of the pose.

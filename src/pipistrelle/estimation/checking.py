@@ -21,7 +21,6 @@ from pipistrelle.config import (
     WIDEST,
     InputError,
 )
-from pipistrelle.detection.merging import labelled, settled
 from pipistrelle.detection.scans import (
     BEARING,
     BEARING_STD,
@@ -32,6 +31,8 @@ from pipistrelle.detection.scans import (
     RANGE_STD,
     UNLABELLED,
     Scan,
+    labelled,
+    settled,
 )
 from pipistrelle.estimation.beliefs import Gaussian, Landmarks
 from pipistrelle.estimation.motion import MOVED, Motion

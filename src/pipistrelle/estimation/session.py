@@ -13,9 +13,8 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from pipistrelle.config import InputError
-from pipistrelle.detection.merging import labelled
 from pipistrelle.detection.noise import ConstantNoise
-from pipistrelle.detection.scans import NO_CALLERS, UNLABELLED, Scan
+from pipistrelle.detection.scans import NO_CALLERS, UNLABELLED, Scan, labelled
 from pipistrelle.estimation.association import (
     Assignment,
     Association,

@@ -28,23 +28,23 @@ from pipistrelle.estimation.motion import (
     motion_numbers,
     propagate_pose,
 )
-from pipistrelle.estimation.smoother.calibration import NOTHING
-from pipistrelle.estimation.smoother.elimination import advance, correct
+from pipistrelle.estimation.smoother.elimination import advance, correct, predicted
+from pipistrelle.estimation.smoother.observations import hear
+from pipistrelle.estimation.smoother.preintegration import NOTHING
 from pipistrelle.estimation.smoother.records import (
     CALLER,
     POSE,
     Arrays,
     Front,
-    Noise,
+    NoiseModel,
     Places,
     Rows,
     Work,
     work_of,
+    write,
+    write_identity,
 )
-from pipistrelle.estimation.smoother.rows import hear
-from pipistrelle.estimation.smoother.small_matrices import write, write_identity
 from pipistrelle.estimation.smoother.solution import factor, spread, write_lower
-from pipistrelle.estimation.smoother.transition import predicted
 from pipistrelle.jit import Whole, no_alloc, optimised_once
 
 IN_ONE_WORLD = (
@@ -227,7 +227,7 @@ def _bound(
     (steps, d), n = at.shape, border.size
     places, rows, work = Places(*places), Rows(*rows), work_of(d, n, 0)
     front = Front(np.zeros((d, n)), np.zeros((d, d)), np.zeros((n, n)))
-    noise = Noise(math.inf, PRIOR_STD, wander[0], wander[1], 0.0)
+    noise = NoiseModel(math.inf, PRIOR_STD, wander[0], wander[1], 0.0)
     R, Z = np.zeros((n, n)), np.zeros((d, n))
     for j in range(1, n):
         front.information[j, j] = 1.0 / PRIOR_STD**2

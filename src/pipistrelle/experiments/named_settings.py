@@ -3,13 +3,16 @@
 A named file holds settings as a user's file does, and the estimators that it is meant for. It lies
 beneath all that is given. In any file ``[own.iekf]`` holds what one estimator has alone, for what
 serves one harms another: it goes before what stands beneath, or beside it in the same file.
+
+A case: who is to map a world from what it hears, by its own calls, another's, or both.
 """
 
 from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 from importlib.resources import files
 from pathlib import Path
 
-from pipistrelle.config import Config, InputError
+from pipistrelle.config import Config, InputError, Strategy
 from pipistrelle.estimation.catalogue import SECTIONS, check_name
 from pipistrelle.refusals import meant, refusal, shown
 from pipistrelle.settings import (
@@ -23,6 +26,24 @@ from pipistrelle.settings import (
     read_toml,
     resolve,
 )
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Case:
+    """One combination to try: a sensing strategy and a filter, in one world.
+
+    Attributes
+    ----------
+    strategy : "active", "fused" or "passive"
+    filter : str
+        The name of an estimator (`estimation.catalogue.entry`).
+    iteration : int
+        Number of the world.
+    """
+
+    strategy: Strategy
+    filter: str
+    iteration: int = 0
 
 
 def shipped(room: str) -> tuple[str, ...]:

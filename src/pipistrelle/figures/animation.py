@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
 
-from pipistrelle.acoustics.callers import Caller, moves
+from pipistrelle.acoustics.paths import Caller, moves
 from pipistrelle.config import InputError
 from pipistrelle.detection.scans import UNLABELLED
 from pipistrelle.estimation.beliefs import Landmarks, placed

@@ -6,8 +6,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from pipistrelle.arrays.array_file import Microphones
+from pipistrelle.arrays.beamforming import Pattern, beam_power, spread_towards
 from pipistrelle.arrays.layout import Scattered
-from pipistrelle.arrays.pattern import Pattern, beam_power, spread_towards
 from pipistrelle.figures.style import INK, STRATEGY_COLOURS, STYLE, TRUTH
 
 if TYPE_CHECKING:

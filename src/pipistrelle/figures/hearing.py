@@ -4,7 +4,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from pipistrelle.detection.sounds.overview import Overview
+from pipistrelle.detection.sounds.check import Overview
 from pipistrelle.figures.style import INK, STRATEGY_COLOURS, STYLE
 
 if TYPE_CHECKING:

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from jaxtyping import Float
 
-from pipistrelle.acoustics.callers import Caller, moves
+from pipistrelle.acoustics.paths import Caller, moves
 from pipistrelle.estimation.beliefs import Landmarks, placed
 from pipistrelle.estimation.catalogue import title_of
 from pipistrelle.experiments.drives import LabelledPoints, Truth

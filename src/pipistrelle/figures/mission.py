@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from jaxtyping import Float
 
-from pipistrelle.acoustics.callers import Caller
+from pipistrelle.acoustics.paths import Caller
 from pipistrelle.estimation.beliefs import Landmarks, placed
 from pipistrelle.evaluation.accuracy import heaviest, pose_error, position_error
 from pipistrelle.evaluation.consistency import anees_bounds, track_nees

@@ -16,15 +16,16 @@ from jaxtyping import Bool, Float, Int
 from pipistrelle.acoustics.emitter import beamwidth
 from pipistrelle.config import Config, InputError
 from pipistrelle.experiments.hearing.scenario import Scenario, standing_landmarks, world_of
-from pipistrelle.experiments.studies.beamwidths import MAKERS
-from pipistrelle.experiments.studies.plan import RADIUS, Plan, cases_of, common
+from pipistrelle.experiments.studies.plan import MAKERS, RADIUS, Plan, cases_of, common
 from pipistrelle.experiments.studies.store import load_study
-from pipistrelle.experiments.studies.world import STEPS, heard_settings, world_schemas
-from pipistrelle.experiments.studies.world_files import (
+from pipistrelle.experiments.studies.world import (
+    STEPS,
     check_world,
     damaged,
     done_worlds,
+    heard_settings,
     world_file,
+    world_schemas,
 )
 from pipistrelle.files import read_file
 from pipistrelle.report.studied import (

@@ -30,7 +30,7 @@ from pipistrelle.settings import (
 )
 
 if TYPE_CHECKING:
-    from pipistrelle.experiments.hearing.world import World
+    from pipistrelle.experiments.hearing.scenario import World
 
 Base = Config | Mapping[str, Any] | str | Path | None
 """Settings to start from: as they were resolved, as a table, by name, or the file that holds it."""
@@ -115,7 +115,7 @@ def mission_settings(
 
         layer = with_routes(layer)
     if CALLERS in layer or not layer.keys().isdisjoint(CALL_KEYS):
-        from pipistrelle.acoustics.call_settings import with_calls
+        from pipistrelle.acoustics.call import with_calls
 
         layer = with_calls(layer)
     if ARRAY_KEY in layer:

@@ -8,15 +8,23 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from pipistrelle.config import Config, InputError
-from pipistrelle.detection.logs.heard_rows import RowsHeard
+from pipistrelle.detection.logs.folder import RowsHeard
+from pipistrelle.detection.sounds.check import Overview
 from pipistrelle.detection.sounds.description import FILE as ABOUT
 from pipistrelle.detection.sounds.description import Description, read_description
 from pipistrelle.detection.sounds.hearing import Frame, hear_recording, log_callers
-from pipistrelle.detection.sounds.overview import Overview
 from pipistrelle.experiments.hearing.listening import Progress
 from pipistrelle.experiments.runs.truth_files import read_truth
-from pipistrelle.files import PiecesFile, read_text
-from pipistrelle.own_files import LOG, OwnFiles, claim, drawn_files, make_folder, remove_empty
+from pipistrelle.files import (
+    LOG,
+    OwnFiles,
+    PiecesFile,
+    claim,
+    drawn_files,
+    make_folder,
+    read_text,
+    remove_empty,
+)
 from pipistrelle.refusals import refusal
 from pipistrelle.scripting.arguments import folder_named, frames_named
 from pipistrelle.settings import Key, Layer, from_keywords, resolve

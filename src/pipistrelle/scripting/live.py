@@ -17,11 +17,10 @@ from pipistrelle.detection.logs.vehicle import Vehicle as VehicleKeys
 from pipistrelle.detection.noise import noise_of
 from pipistrelle.estimation.association import KNOWN
 from pipistrelle.estimation.beliefs import Gaussian, Landmarks, answer, no_landmarks
-from pipistrelle.estimation.catalogue import entry
+from pipistrelle.estimation.catalogue import ASSOCIATION, ESTIMATOR, class_of, entry, names_class
 from pipistrelle.estimation.checking import usable_controls
-from pipistrelle.estimation.data_association.methods import association_of
+from pipistrelle.estimation.data_association.sequential import association_of
 from pipistrelle.estimation.fastslam.filter import FastSlamBelief
-from pipistrelle.estimation.outside import ASSOCIATION, ESTIMATOR, class_of, names_class
 from pipistrelle.estimation.session import Session
 from pipistrelle.experiments.drives import NO_TRUTH, at_sensor, carried, vehicle_in
 from pipistrelle.experiments.named_settings import check_own, laid, over_named, own_config
@@ -33,7 +32,7 @@ from pipistrelle.experiments.runs.replay import (
     without_unused,
 )
 from pipistrelle.experiments.runs.trial import with_moving
-from pipistrelle.experiments.runs.validate_filters import check_filters
+from pipistrelle.experiments.runs.validate import check_filters
 from pipistrelle.refusals import refusal, shown
 from pipistrelle.scripting.arguments import Base, base_layer, folder_named, named_filters
 from pipistrelle.scripting.live_rows import (

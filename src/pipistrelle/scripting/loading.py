@@ -4,7 +4,7 @@ import warnings
 from pathlib import Path
 
 from pipistrelle.experiments.results.reading import read_summary
-from pipistrelle.experiments.runs.mission import Mission
+from pipistrelle.experiments.runs.heard_world import Mission
 from pipistrelle.experiments.runs.rerun import rerun
 from pipistrelle.experiments.runs.trial import Watch
 from pipistrelle.scripting.arguments import Filters, folder_named, named_filters

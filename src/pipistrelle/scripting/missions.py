@@ -11,17 +11,17 @@ from pipistrelle.config import Config, InputError, Strategy
 from pipistrelle.detection.logs.readers import Robot
 from pipistrelle.estimation.catalogue import short_name
 from pipistrelle.experiments.hearing.listening import Keep, Progress
-from pipistrelle.experiments.hearing.world import ALL_DRAWN, World
+from pipistrelle.experiments.hearing.scenario import ALL_DRAWN, World
 from pipistrelle.experiments.hearing.world_folder import kept_world
 from pipistrelle.experiments.named_settings import check_own, laid, of_estimators
 from pipistrelle.experiments.results.scores import TrialResult, is_placed
 from pipistrelle.experiments.results.writing import write_results
-from pipistrelle.experiments.runs.mission import Mission
+from pipistrelle.experiments.runs.heard_world import Mission
 from pipistrelle.experiments.runs.replay import load, replay
 from pipistrelle.experiments.runs.rerun import log_entry
 from pipistrelle.experiments.runs.trial import Watch, run_mission
-from pipistrelle.experiments.runs.validate_mission import warnings_of
-from pipistrelle.own_files import OwnFiles
+from pipistrelle.experiments.runs.validate import warnings_of
+from pipistrelle.files import OwnFiles
 from pipistrelle.scripting.arguments import number, short_names
 from pipistrelle.scripting.log_settings import (
     check_bag,

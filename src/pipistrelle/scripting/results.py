@@ -15,11 +15,10 @@ from pipistrelle.experiments.hearing.listening import Progress
 from pipistrelle.experiments.machine import keep_freed_memory
 from pipistrelle.experiments.named_settings import over_named
 from pipistrelle.experiments.results.writing import run_entry, tables_of
-from pipistrelle.experiments.runs.mission import Mission
+from pipistrelle.experiments.runs.heard_world import Mission
 from pipistrelle.experiments.runs.trial import Watch
-from pipistrelle.files import read_file
+from pipistrelle.files import RESULTS, claim, read_file
 from pipistrelle.kernel_clock import announce
-from pipistrelle.own_files import RESULTS, claim
 from pipistrelle.refusals import refusal, shown
 from pipistrelle.scripting.arguments import (
     RUN_NAMES,

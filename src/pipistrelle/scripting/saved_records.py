@@ -14,8 +14,13 @@ from pipistrelle.config import RayConfig
 from pipistrelle.detection.scans import Scan
 from pipistrelle.estimation.beliefs import Gaussian, Innovations, JointGaussian, Landmarks
 from pipistrelle.estimation.data_association.existence import Known
-from pipistrelle.estimation.data_association.memory import Caller, CallerPlace, EarlyScan, Memory
-from pipistrelle.estimation.data_association.rows import ScanRows
+from pipistrelle.estimation.data_association.rows import (
+    Caller,
+    CallerPlace,
+    EarlyScan,
+    Memory,
+    ScanRows,
+)
 from pipistrelle.estimation.data_association.tracks import Tracks
 from pipistrelle.estimation.ekf.filter import EkfBelief
 from pipistrelle.estimation.ekf.gaussian import INVARIANT, LINEAR
@@ -23,11 +28,9 @@ from pipistrelle.estimation.fastslam.block import LANES
 from pipistrelle.estimation.fastslam.filter import FastSlamBelief
 from pipistrelle.estimation.session import MOST_STEPS, SessionState, _Heard
 from pipistrelle.estimation.smoother.belief import SmootherBelief
-from pipistrelle.estimation.smoother.calibration import Calibration
 from pipistrelle.estimation.smoother.history import NEVER, STRETCH, History
-from pipistrelle.estimation.smoother.preintegration import Odometry
-from pipistrelle.estimation.smoother.records import CALLER, POSE
-from pipistrelle.estimation.smoother.stack import Stack
+from pipistrelle.estimation.smoother.preintegration import Calibration, Odometry
+from pipistrelle.estimation.smoother.records import CALLER, POSE, Stack
 from pipistrelle.estimation.smoother.sweep import Points, Solution, Stretch
 
 LARGEST = np.sqrt(np.finfo(np.float64).max)

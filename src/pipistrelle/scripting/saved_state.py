@@ -26,9 +26,8 @@ from jaxtyping import Float, jaxtyped
 
 from pipistrelle.config import InputError, Section
 from pipistrelle.estimation.association import KNOWN
-from pipistrelle.estimation.catalogue import CATALOGUE
-from pipistrelle.estimation.data_association.methods import METHODS
-from pipistrelle.estimation.outside import names_class
+from pipistrelle.estimation.catalogue import CATALOGUE, names_class
+from pipistrelle.estimation.data_association.sequential import METHODS
 from pipistrelle.estimation.session import SessionState
 from pipistrelle.files import printable, read_file, read_named, write_whole
 from pipistrelle.refusals import refusal, shown

@@ -14,7 +14,7 @@ from pipistrelle.verbs.options import NamedSettings, layers
 from pipistrelle.verbs.view import check_place, write_file
 
 if TYPE_CHECKING:
-    from pipistrelle.arrays.pattern import Pattern
+    from pipistrelle.arrays.beamforming import Pattern
 
 
 def array(
@@ -43,8 +43,8 @@ def array(
     if output is not None:
         check_place(output, None, ".png", "-o", overwrite)
     from pipistrelle.arrays.array_file import read_array
+    from pipistrelle.arrays.beamforming import pattern_of
     from pipistrelle.arrays.layout import scattered, square_microphones
-    from pipistrelle.arrays.pattern import pattern_of
     from pipistrelle.settings import resolve
     from pipistrelle.verbs.streams import put
 

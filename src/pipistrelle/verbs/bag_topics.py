@@ -14,7 +14,7 @@ HEADS = ("topic", "type", "messages", "from [s]", "to [s]", "rate [Hz]", "taken 
 def list_topics(path: Path, layer: Layer) -> int:
     """Print the topics of a bag, and what each is taken for; times are those of reception."""
     from pipistrelle.detection.logs.bag import Topic, opened
-    from pipistrelle.detection.logs.bag_topics import roles
+    from pipistrelle.detection.logs.bag_log import roles
 
     settings = resolve(layer).bag
     if not ROS_BAG.recognises(path):

@@ -73,7 +73,7 @@ def _keep(
     from pipistrelle.experiments.comparing.writing import write_comparison
     from pipistrelle.figures.comparison import draw_comparison
     from pipistrelle.figures.style import save_figure
-    from pipistrelle.own_files import COMPARISON, claim
+    from pipistrelle.files import COMPARISON, claim
     from pipistrelle.verbs.delivery import command_line
 
     own = claim(output, COMPARISON, overwrite=overwrite)

@@ -12,7 +12,7 @@ def show(*, mission: Annotated[MissionOptions | None, Parameter(name="*")] = Non
     """Print the settings as TOML, file, environment and flags applied."""
     import numpy as np
 
-    from pipistrelle.acoustics.callers import callers_of
+    from pipistrelle.acoustics.paths import callers_of
     from pipistrelle.arrays.sampling import sampling
     from pipistrelle.settings import to_toml
 

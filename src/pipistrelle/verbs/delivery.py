@@ -9,10 +9,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from pipistrelle.detection.logs.bag import need_rosbags
-from pipistrelle.experiments.results import folder
-from pipistrelle.experiments.runs.mission import Mission
-from pipistrelle.files import spelt
-from pipistrelle.own_files import OwnFiles
+from pipistrelle.experiments.results import writing as folder
+from pipistrelle.experiments.runs.heard_world import Mission
+from pipistrelle.files import OwnFiles, spelt
 from pipistrelle.scripting.log_settings import distance_driven
 from pipistrelle.scripting.missions import Conduct, failures, filmed, keep, strategy_names
 from pipistrelle.verbs.console import announced, closing_table, progress

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 from cyclopts import Parameter
 
 from pipistrelle.config import InputError
-from pipistrelle.own_files import LOG, claim
+from pipistrelle.files import LOG, claim
 from pipistrelle.scripting.hearing import described, faults_of, heard_into, heard_settings, is_heard
 from pipistrelle.settings import from_flags
 from pipistrelle.verbs.console import progress

@@ -51,7 +51,7 @@ _METAVARS = {CALLERS: "TABLES", OWN: "TABLES", ARRAY_KEY: "FILE"}
 """Settings that are given as a file has them, and what stands for them in the help."""
 
 if TYPE_CHECKING:
-    from pipistrelle.experiments.hearing.world import World
+    from pipistrelle.experiments.hearing.scenario import World
 
     ChosenFilter = str
 else:  # the help names those that are listed

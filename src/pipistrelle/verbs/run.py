@@ -9,8 +9,7 @@ from cyclopts import Parameter
 
 from pipistrelle.config import InputError
 from pipistrelle.experiments.named_settings import own_config
-from pipistrelle.files import without_links
-from pipistrelle.own_files import LOG, SOUND, WORLD, Kind, OwnFiles, claim
+from pipistrelle.files import LOG, SOUND, WORLD, Kind, OwnFiles, claim, without_links
 from pipistrelle.scripting.arguments import named_strategies
 from pipistrelle.verbs.options import (
     Chosen,
@@ -27,7 +26,7 @@ if TYPE_CHECKING:
     from pipistrelle.detection.scans import Scan
     from pipistrelle.experiments.hearing.sound_recorder import SoundRecorder
     from pipistrelle.experiments.results.scores import TrialResult
-    from pipistrelle.experiments.runs.mission import Mission
+    from pipistrelle.experiments.runs.heard_world import Mission
 
 
 def run(
@@ -169,8 +168,8 @@ def _recorded(
     """Do a mission whose sound is written down."""
     from dataclasses import replace
 
-    from pipistrelle.experiments.hearing.world import ALL_DRAWN
-    from pipistrelle.experiments.runs.validate_mission import checked_scenario
+    from pipistrelle.experiments.hearing.scenario import ALL_DRAWN
+    from pipistrelle.experiments.runs.validate import checked_scenario
 
     config, _, _, own_world = asked
     sound.begin(checked_scenario(config, world=own_world or ALL_DRAWN))
@@ -259,7 +258,7 @@ def _log(mission: "Mission", trial: "TrialResult", scans: "Sequence[Scan]") -> "
 
 def _log_callers(mission: "Mission") -> "tuple[LogCaller, ...]":
     """Return the callers besides the vehicle, as a log lists them."""
-    from pipistrelle.acoustics.callers import moves
+    from pipistrelle.acoustics.paths import moves
     from pipistrelle.detection.logs.recording import LogCaller
     from pipistrelle.experiments.hearing.scenario import caller_labels
 

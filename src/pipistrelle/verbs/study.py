@@ -83,8 +83,7 @@ def study(
     settings: Annotated[SettingFlags | None, Parameter(name="*")] = None,
 ) -> int:
     """Try all cases of a plan in many worlds; continue where an earlier run stopped."""
-    from pipistrelle.experiments.studies.plan import MOST_WORLDS
-    from pipistrelle.experiments.studies.plan_file import find_plan, read_plan
+    from pipistrelle.experiments.studies.plan import MOST_WORLDS, find_plan, read_plan
 
     for flag, number in (("--iterations", iterations), ("--workers", workers)):
         if number is not None and not 1 <= number <= MOST_WORLDS:

@@ -9,8 +9,15 @@ from typing import TYPE_CHECKING, Annotated
 from cyclopts import Parameter
 
 from pipistrelle.config import InputError
-from pipistrelle.files import partial_of, without_links, write_whole
-from pipistrelle.own_files import RESULTS, OwnFiles, make_folder, remove_empty
+from pipistrelle.files import (
+    RESULTS,
+    OwnFiles,
+    make_folder,
+    partial_of,
+    remove_empty,
+    without_links,
+    write_whole,
+)
 
 if TYPE_CHECKING:
     from pipistrelle.figures.player.playback import Playback

@@ -11,8 +11,7 @@ import pytest
 
 from pipistrelle.__main__ import main
 from pipistrelle.config import BagConfig, Config, InputError
-from pipistrelle.detection.logs.bag import opened
-from pipistrelle.detection.logs.bag_unpacking import bounded_unpacking
+from pipistrelle.detection.logs.bag import bounded_unpacking, opened
 from pipistrelle.detection.logs.folder import read_log
 from pipistrelle.detection.logs.poses import poses_along
 from pipistrelle.experiments.drives import Truth
@@ -720,8 +719,8 @@ def test_compressed_parts_that_unpack_to_too_much_are_refused(tmp_path, monkeypa
     told = sorted([*drive(), seen(0.2)], key=lambda one: one[2])
     path = write_bag(tmp_path / name, told, compression=how)
     with monkeypatch.context() as patch:
-        patch.setattr("pipistrelle.detection.logs.bag_unpacking.MOST_UNPACKED", 90)
-        patch.setattr("pipistrelle.detection.logs.bag_unpacking.ROOM", 0.0)
+        patch.setattr("pipistrelle.detection.logs.bag.MOST_UNPACKED", 90)
+        patch.setattr("pipistrelle.detection.logs.bag.ROOM", 0.0)
         words = "of the room in" if how == "FILE" else "that unpack to more than 90"
         refused(path, words)
     assert only(load(path)[0]).landmark[0] == 7

@@ -11,14 +11,16 @@ from rosbags.rosbag1 import Writer
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from pipistrelle.config import BagConfig, InputError
-from pipistrelle.detection.logs.bag_definitions import (
+from pipistrelle.detection.logs.bag_messages import (
     DEEPEST,
+    DEFINITIONS,
+    ECHOES,
     LONGEST,
     MOST_PARTS,
+    POSES,
     read_definition,
     types_of,
 )
-from pipistrelle.detection.logs.bag_messages import DEFINITIONS, ECHOES, POSES
 from pipistrelle.experiments.runs.replay import load
 from reference.bags import (
     DETECTIONS,

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from pipistrelle.config import BagConfig, InputError
-from pipistrelle.detection.logs.bag_frames import Frames
+from pipistrelle.detection.logs.bag_log import Frames
 from pipistrelle.detection.logs.live_messages import (
     clock_began,
     learn_transforms,

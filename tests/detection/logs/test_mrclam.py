@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from pipistrelle.config import InputError
-from pipistrelle.detection.logs.mrclam import LANDMARKS, read_mrclam
+from pipistrelle.detection.logs.folder import LANDMARKS, read_mrclam
 
 MADE_UP = Path(__file__).parents[2] / "data" / "mrclam_made_up"
 

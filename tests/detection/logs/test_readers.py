@@ -5,8 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from pipistrelle.detection.logs.folder import read_log
-from pipistrelle.detection.logs.mrclam import read_mrclam
+from pipistrelle.detection.logs.folder import read_log, read_mrclam
 from pipistrelle.detection.logs.readers import LOG_FOLDER, MRCLAM, READERS, Reader, reader_of
 
 DATA = Path(__file__).parents[2] / "data"

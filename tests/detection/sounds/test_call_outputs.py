@@ -10,7 +10,7 @@ import soundfile
 import pipistrelle
 from pipistrelle.acoustics.call import Sweep
 from pipistrelle.config import Config, InputError
-from pipistrelle.detection.logs.heard_rows import RowsHeard
+from pipistrelle.detection.logs.folder import RowsHeard
 from pipistrelle.detection.sounds.description import read_description
 from pipistrelle.detection.sounds.hearing import hear_recording, log_callers
 from pipistrelle.experiments.hearing.listening import listen

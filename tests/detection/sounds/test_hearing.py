@@ -12,8 +12,7 @@ import soundfile
 
 import pipistrelle
 from pipistrelle.config import Config, DetectionConfig, InputError
-from pipistrelle.detection.logs.folder import read_log
-from pipistrelle.detection.logs.heard_rows import RowsHeard
+from pipistrelle.detection.logs.folder import RowsHeard, read_log
 from pipistrelle.detection.sounds.calls import _loudest_around, calls_of
 from pipistrelle.detection.sounds.check import check_recording
 from pipistrelle.detection.sounds.description import read_description

@@ -11,8 +11,8 @@ from pipistrelle.estimation.data_association.caller_search import (
     misfit,
     searched,
 )
-from pipistrelle.estimation.data_association.memory import Caller, CallerPlace
 from pipistrelle.estimation.data_association.pairs import Rows
+from pipistrelle.estimation.data_association.rows import Caller, CallerPlace
 from pipistrelle.estimation.data_association.tracks import Tracks, followed, in_window
 from pipistrelle.estimation.measurement import excess_path_slopes
 

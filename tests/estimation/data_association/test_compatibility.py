@@ -9,12 +9,14 @@ import pytest
 from pipistrelle.detection.scans import make_scan
 from pipistrelle.estimation.association import expected
 from pipistrelle.estimation.beliefs import JointGaussian
-from pipistrelle.estimation.data_association.compatibility import (
+from pipistrelle.estimation.data_association.pairs import (
     MOST_ROWS,
+    OWN_CALL,
     gates,
     jointly_compatible,
+    pair_costs,
+    pair_innovations,
 )
-from pipistrelle.estimation.data_association.pairs import OWN_CALL, pair_costs, pair_innovations
 
 CHANCES = (25.0, 0.06, 1.3, 0.8, 0.06)
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from pipistrelle.estimation.beliefs import JointGaussian
-from pipistrelle.estimation.data_association.doubles import doubles
+from pipistrelle.estimation.data_association.existence import doubles
 
 OLD = np.array([[4.0, 1.0], [6.0, -2.0], [9.0, 3.0], [3.0, -4.0]])
 

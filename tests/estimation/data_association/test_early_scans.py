@@ -8,15 +8,14 @@ import pytest
 from pipistrelle.config import AssociationConfig, Config
 from pipistrelle.detection.scans import RANGE, UNLABELLED, make_scan
 from pipistrelle.estimation.beliefs import Gaussian, JointGaussian
-from pipistrelle.estimation.data_association.early_scans import (
+from pipistrelle.estimation.data_association.caller_search import (
     RANGE_SHARE,
     _turn,
     labelled_by_map,
 )
-from pipistrelle.estimation.data_association.memory import EarlyScan
-from pipistrelle.estimation.data_association.methods import association_of
 from pipistrelle.estimation.data_association.pairs import UNPLACED
-from pipistrelle.estimation.data_association.rows import rows_of_scan
+from pipistrelle.estimation.data_association.rows import EarlyScan, rows_of_scan
+from pipistrelle.estimation.data_association.sequential import association_of
 from pipistrelle.experiments.runs.trial import run_mission
 
 HEADING_STD, CALLER = 0.06, 40

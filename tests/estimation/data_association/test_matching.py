@@ -5,7 +5,7 @@ from itertools import product
 import numpy as np
 import pytest
 
-from pipistrelle.estimation.data_association.matching import (
+from pipistrelle.estimation.data_association.pairs import (
     NOTHING,
     marginal,
     nearest,

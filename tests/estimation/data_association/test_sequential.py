@@ -11,9 +11,8 @@ from pipistrelle.detection.scans import UNLABELLED, make_scan
 from pipistrelle.estimation.beliefs import Gaussian, JointGaussian, placed
 from pipistrelle.estimation.catalogue import entry
 from pipistrelle.estimation.data_association.existence import LASTING, PATIENCE
-from pipistrelle.estimation.data_association.memory import Caller, CallerPlace, Memory
-from pipistrelle.estimation.data_association.methods import association_of
-from pipistrelle.estimation.data_association.sequential import PLACE_SHARE
+from pipistrelle.estimation.data_association.rows import Caller, CallerPlace, Memory
+from pipistrelle.estimation.data_association.sequential import PLACE_SHARE, association_of
 from pipistrelle.estimation.motion import Motion
 from pipistrelle.estimation.session import Session
 from pipistrelle.experiments.runs.trial import run_mission

@@ -9,11 +9,11 @@ import pytest
 from pipistrelle.config import AssociationConfig, Config
 from pipistrelle.detection.scans import UNLABELLED, make_scan
 from pipistrelle.estimation.beliefs import JointGaussian
+from pipistrelle.estimation.data_association.caller_search import turned
 from pipistrelle.estimation.data_association.existence import nobody, with_new
-from pipistrelle.estimation.data_association.memory import Caller, CallerPlace, Memory
-from pipistrelle.estimation.data_association.methods import association_of
 from pipistrelle.estimation.data_association.pairs import pair_costs
-from pipistrelle.estimation.data_association.turns import turned
+from pipistrelle.estimation.data_association.rows import Caller, CallerPlace, Memory
+from pipistrelle.estimation.data_association.sequential import association_of
 from pipistrelle.estimation.measurement import excess_path_slopes
 
 CHANCES = (25.0, 0.06, 1.2, 0.8, 0.06)

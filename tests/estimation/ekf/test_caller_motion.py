@@ -5,9 +5,13 @@ import pytest
 
 from pipistrelle.config import CallerConfig, Config, FilterConfig, ListeningConfig, ScenarioConfig
 from pipistrelle.estimation.beliefs import Gaussian
-from pipistrelle.estimation.ekf.caller_motion import is_velocity, propagate_callers, velocity_of
-from pipistrelle.estimation.ekf.filter import EkfSlam
-from pipistrelle.estimation.ekf.invariant import InvariantEkfSlam
+from pipistrelle.estimation.ekf.filter import (
+    EkfSlam,
+    InvariantEkfSlam,
+    is_velocity,
+    propagate_callers,
+    velocity_of,
+)
 from pipistrelle.estimation.motion import Motion
 from pipistrelle.experiments.runs.trial import run_mission
 from reference.missions import (

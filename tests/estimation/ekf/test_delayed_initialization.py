@@ -5,11 +5,10 @@ import pytest
 
 from pipistrelle.config import Config, RayConfig
 from pipistrelle.estimation.beliefs import Gaussian, placed
-from pipistrelle.estimation.ekf.filter import EkfSlam
-from pipistrelle.estimation.ekf.invariant import InvariantEkfSlam
+from pipistrelle.estimation.ekf.filter import EkfSlam, InvariantEkfSlam
 from pipistrelle.estimation.motion import motion_step
 from pipistrelle.evaluation.accuracy import alignment, moved, position_error, rmse
-from pipistrelle.experiments.runs.filtering import run_filter
+from pipistrelle.experiments.runs.trial import run_filter
 from pipistrelle.settings import from_flags, resolve
 from reference.drives import turn_and_drive
 from reference.ekf_slam import SlowEkfSlam

@@ -7,10 +7,9 @@ import pytest
 
 from pipistrelle.config import RayConfig
 from pipistrelle.estimation.beliefs import Gaussian
-from pipistrelle.estimation.ekf.filter import EkfSlam
-from pipistrelle.estimation.ekf.invariant import InvariantEkfSlam
+from pipistrelle.estimation.ekf.filter import EkfSlam, InvariantEkfSlam
 from pipistrelle.evaluation.accuracy import alignment, moved, position_error, rmse
-from pipistrelle.experiments.runs.filtering import run_filter
+from pipistrelle.experiments.runs.trial import run_filter
 from reference.drives import turn_and_drive
 from reference.ekf_slam import SlowEkfSlam
 from reference.invariant_ekf import SlowInvariantEkfSlam

@@ -7,8 +7,7 @@ import numpy as np
 import pytest
 
 from pipistrelle.estimation.beliefs import Gaussian
-from pipistrelle.estimation.ekf.filter import EkfSlam
-from pipistrelle.estimation.ekf.invariant import InvariantEkfSlam
+from pipistrelle.estimation.ekf.filter import EkfSlam, InvariantEkfSlam
 from pipistrelle.estimation.motion import Motion
 from pipistrelle.geometry import wrap
 from reference.invariant_ekf import SlowInvariantEkfSlam

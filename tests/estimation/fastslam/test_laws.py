@@ -7,7 +7,7 @@ import pytest
 
 from pipistrelle.estimation.beliefs import Gaussian
 from pipistrelle.estimation.fastslam.filter import SMALLEST_STD
-from pipistrelle.estimation.fastslam.resampling import normalised
+from pipistrelle.estimation.fastslam.poses import normalised
 from pipistrelle.geometry import wrap
 from reference.missions import START, STEP, scan_of
 from reference.swarms import (

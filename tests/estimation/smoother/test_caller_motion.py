@@ -10,7 +10,7 @@ from pipistrelle.detection.scans import NO_CALLERS, rows_of
 from pipistrelle.estimation.beliefs import placed
 from pipistrelle.estimation.smoother.filter import Smoother
 from pipistrelle.experiments.drives import Drive
-from pipistrelle.experiments.runs.filtering import run_filter
+from pipistrelle.experiments.runs.trial import run_filter
 from reference.missions import followed, ray_config
 from reference.walking import CALLER, roaming_mission, scaled
 

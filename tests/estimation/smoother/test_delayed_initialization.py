@@ -8,14 +8,14 @@ import pytest
 
 from pipistrelle.estimation.beliefs import Gaussian, placed
 from pipistrelle.estimation.motion import Motion
-from pipistrelle.estimation.smoother.delayed_initialization import (
+from pipistrelle.estimation.smoother.elimination import Places, Rows
+from pipistrelle.estimation.smoother.filter import Smoother
+from pipistrelle.estimation.smoother.initialization import (
     MIN_CROSSING_ANGLE,
     range_by_crossing,
 )
-from pipistrelle.estimation.smoother.elimination import Places, Rows
-from pipistrelle.estimation.smoother.filter import Smoother
 from pipistrelle.experiments.drives import Drive
-from pipistrelle.experiments.runs.filtering import run_filter
+from pipistrelle.experiments.runs.trial import run_filter
 from reference.missions import ray_config, scan_with
 
 UNICYCLE = Motion(model="unicycle", control_std=(0.05, 0.02), noise_at_rest=False)

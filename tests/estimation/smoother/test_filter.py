@@ -12,7 +12,7 @@ from pipistrelle.estimation.motion import Motion
 from pipistrelle.estimation.smoother.filter import Smoother
 from pipistrelle.evaluation.accuracy import alignment, moved
 from pipistrelle.experiments.drives import Drive
-from pipistrelle.experiments.runs.filtering import run_filter
+from pipistrelle.experiments.runs.trial import run_filter
 from pipistrelle.geometry import wrap
 from reference.everything import Everything
 from reference.missions import (

@@ -6,7 +6,7 @@ import pytest
 from pipistrelle.config import RayConfig
 from pipistrelle.estimation.smoother.filter import Smoother
 from pipistrelle.evaluation.accuracy import alignment, moved, position_error, rmse
-from pipistrelle.experiments.runs.filtering import run_filter
+from pipistrelle.experiments.runs.trial import run_filter
 from reference.drives import turn_and_drive
 from reference.optimum import from_the_truth, poses_of
 

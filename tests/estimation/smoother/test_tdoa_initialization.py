@@ -10,7 +10,7 @@ from pipistrelle.estimation.beliefs import Gaussian, placed
 from pipistrelle.estimation.measurement import excess_path_of
 from pipistrelle.estimation.motion import Motion
 from pipistrelle.estimation.smoother.filter import Smoother
-from pipistrelle.estimation.smoother.tdoa_initialization import (
+from pipistrelle.estimation.smoother.initialization import (
     MAX_RELATIVE_RANGE_STD,
     unscented_range,
 )

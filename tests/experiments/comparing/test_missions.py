@@ -10,8 +10,8 @@ from pipistrelle.evaluation.accuracy import rmse
 from pipistrelle.experiments.comparing.folders import kind_of
 from pipistrelle.experiments.comparing.missions import compare_missions, notes_of, path_view
 from pipistrelle.experiments.drives import NO_TRUTH, Truth
-from pipistrelle.experiments.results.stored import StoredPath
-from pipistrelle.own_files import RESULTS, OwnFiles
+from pipistrelle.experiments.results.reading import StoredPath
+from pipistrelle.files import RESULTS, OwnFiles
 from reference.results import PLACES, STEPS, TIME, TRUTH, loop, mission_folder, turned
 
 OFF = turned(loop(), 0.1, (0.5, -0.2))

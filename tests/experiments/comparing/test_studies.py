@@ -11,7 +11,7 @@ from pipistrelle.config import Config, InputError, MotionConfig, RayConfig, Scen
 from pipistrelle.evaluation.comparison import Statement, judge
 from pipistrelle.experiments.comparing.studies import SCORES, compare_studies, notes_of, same_worlds
 from pipistrelle.experiments.studies.plan import Plan
-from pipistrelle.experiments.studies.world_files import TABLES, world_file
+from pipistrelle.experiments.studies.world import TABLES, world_file
 from reference.results import mission_folder, study_folder  # noqa: F401
 
 RADII = {"emitter.radius": (0.0025, 0.025)}

@@ -18,8 +18,7 @@ from pipistrelle.experiments.comparing.writing import (
     write_comparison,
 )
 from pipistrelle.experiments.studies.plan import Plan
-from pipistrelle.files import spelt
-from pipistrelle.own_files import COMPARISON, SUMS, OwnFiles
+from pipistrelle.files import COMPARISON, SUMS, OwnFiles, spelt
 from reference.results import loop, mission_folder, study_folder, turned
 
 OFF = turned(loop(), 0.1, (0.5, -0.2))

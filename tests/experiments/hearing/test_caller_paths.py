@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from pipistrelle.acoustics.arrivals import arrivals_of_emissions, through_piston, through_pistons
-from pipistrelle.acoustics.callers import callers_at, moves
 from pipistrelle.acoustics.emitter import piston_directivity
+from pipistrelle.acoustics.paths import callers_at, moves
 from pipistrelle.arithmetic.random_stream import stream_key
 from pipistrelle.config import (
     CallerConfig,

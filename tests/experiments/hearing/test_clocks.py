@@ -7,10 +7,8 @@ import pytest
 
 from pipistrelle.config import Config, InputError, ListeningConfig, ScenarioConfig
 from pipistrelle.detection.scans import OWN
-from pipistrelle.experiments.hearing.clocks import calls_heard, with_times
-from pipistrelle.experiments.hearing.frames import frames_of
-from pipistrelle.experiments.hearing.listening import listen
-from pipistrelle.experiments.hearing.scenario import world_of
+from pipistrelle.experiments.hearing.listening import frames_of, listen
+from pipistrelle.experiments.hearing.scenario import calls_heard, with_times, world_of
 from pipistrelle.experiments.runs.heard_world import drive_of, scans_of
 from pipistrelle.geometry import path_at, wrap
 from pipistrelle.settings import from_flags, resolve

@@ -11,8 +11,8 @@ from pipistrelle.acoustics.arrivals import (
     arrivals_of_emission,
     through_piston,
 )
-from pipistrelle.acoustics.callers import VEHICLE, Caller, callers_of
-from pipistrelle.acoustics.target import Bodies
+from pipistrelle.acoustics.emitter import Bodies
+from pipistrelle.acoustics.paths import VEHICLE, Caller, callers_of
 from pipistrelle.arithmetic.random_stream import stream_key
 from pipistrelle.arrays.layout import square_of_four
 from pipistrelle.arrays.receiver import add_echo_blocks, noise_blocks

@@ -7,9 +7,9 @@ import pytest
 
 from pipistrelle.acoustics.arrivals import Arrivals, arrivals_of_emissions
 from pipistrelle.acoustics.call import ToneBurst
-from pipistrelle.acoustics.callers import VEHICLE, callers_of
-from pipistrelle.acoustics.medium import Medium, medium_of
-from pipistrelle.acoustics.target import SHAPES, Bodies, Shape
+from pipistrelle.acoustics.emitter import SHAPES, Bodies, Shape
+from pipistrelle.acoustics.paths import VEHICLE, callers_of
+from pipistrelle.acoustics.propagation import Medium, medium_of
 from pipistrelle.arrays.layout import Layout, layout_of
 from pipistrelle.arrays.receiver import add_echo_blocks, noise_blocks, record_samples
 from pipistrelle.arrays.sampling import sampling

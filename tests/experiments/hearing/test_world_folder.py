@@ -5,8 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from pipistrelle.acoustics.callers import Caller
-from pipistrelle.acoustics.target import Bodies
+from pipistrelle.acoustics.emitter import Bodies
+from pipistrelle.acoustics.paths import Caller
 from pipistrelle.config import (
     CallerConfig,
     Config,
@@ -15,9 +15,8 @@ from pipistrelle.config import (
     ScenarioConfig,
     caller_names,
 )
-from pipistrelle.experiments.hearing.scenario import Scenario, world_of
+from pipistrelle.experiments.hearing.scenario import ALL_DRAWN, Scenario, World, world_of
 from pipistrelle.experiments.hearing.trajectories import Commands, Poses, Waypoints
-from pipistrelle.experiments.hearing.world import ALL_DRAWN, World
 from pipistrelle.experiments.hearing.world_folder import (
     laid_over,
     named_world,
@@ -25,8 +24,8 @@ from pipistrelle.experiments.hearing.world_folder import (
     settled,
     world_files,
 )
-from pipistrelle.experiments.runs.validate_mission import checked_scenario
-from pipistrelle.own_files import WORLD, OwnFiles
+from pipistrelle.experiments.runs.validate import checked_scenario
+from pipistrelle.files import WORLD, OwnFiles
 from pipistrelle.settings import from_flags, resolve
 
 LANDMARKS = "landmark,x,y\n1,2.5,0\n2,-1,4\n"

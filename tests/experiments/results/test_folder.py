@@ -5,8 +5,8 @@ from pathlib import Path
 import pytest
 
 from pipistrelle.config import InputError
-from pipistrelle.experiments.results.folder import result_folder
-from pipistrelle.own_files import RESULTS, SUMS, OwnFiles, claim
+from pipistrelle.experiments.results.writing import result_folder
+from pipistrelle.files import RESULTS, SUMS, OwnFiles, claim
 
 
 @pytest.fixture

@@ -6,7 +6,7 @@ import pytest
 
 from pipistrelle.config import InputError
 from pipistrelle.experiments.results.reading import read_summary
-from pipistrelle.own_files import COMPARISON, WORLD, OwnFiles
+from pipistrelle.files import COMPARISON, WORLD, OwnFiles
 
 SOUND = {
     "format": 1,

@@ -20,7 +20,7 @@ from pipistrelle.evaluation.accuracy import alignment, moved, position_error, rm
 from pipistrelle.experiments.drives import NO_TRUTH, Truth
 from pipistrelle.experiments.results.scores import Scores, TrialResult, score
 from pipistrelle.experiments.results.writing import config_hash, write_results
-from pipistrelle.own_files import RESULTS, OwnFiles
+from pipistrelle.files import RESULTS, OwnFiles
 from reference.missions import map_with, scan_with
 
 STEPS = 400

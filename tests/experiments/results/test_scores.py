@@ -8,9 +8,9 @@ import pytest
 from pipistrelle.config import Config, ScenarioConfig
 from pipistrelle.detection.scans import BEARING_STD, RANGE_STD
 from pipistrelle.evaluation.accuracy import alignment, moved, rmse
-from pipistrelle.experiments.cases import Case
 from pipistrelle.experiments.drives import NO_TRUTH, Truth
 from pipistrelle.experiments.hearing.scenario import world_of
+from pipistrelle.experiments.named_settings import Case
 from pipistrelle.experiments.results.scores import drive_bound, position_floor, with_bound
 from pipistrelle.experiments.runs.heard_world import drive_of
 from pipistrelle.experiments.runs.trial import run_trial

@@ -9,9 +9,9 @@ import pytest
 
 from pipistrelle.config import Config, InputError
 from pipistrelle.experiments.drives import NO_TRUTH
-from pipistrelle.experiments.results.stored import read_mission
+from pipistrelle.experiments.results.reading import read_mission
+from pipistrelle.files import LOG, SUMS, OwnFiles
 from pipistrelle.geometry import wrap
-from pipistrelle.own_files import LOG, SUMS, OwnFiles
 from reference.results import PLACES, TIME, TRUTH, loop, mission_folder, turned
 
 PATHS = {("fused", "ekf"): loop(), ("active", "mine:Own"): turned(loop(), 0.2)}

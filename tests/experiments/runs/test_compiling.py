@@ -13,7 +13,8 @@ from numba.core.event import install_timer
 from pipistrelle import kernel_clock
 from pipistrelle.config import Config, InputError, ScenarioConfig
 from pipistrelle.estimation.catalogue import CATALOGUE
-from pipistrelle.experiments.runs import compiling, trial, validate_mission
+from pipistrelle.experiments.runs import compiling, trial
+from pipistrelle.experiments.runs import validate as validate_mission
 
 TINY = Config(scenario=ScenarioConfig(steps=8, landmarks=4, radius=10.0))
 COLD = """

@@ -3,7 +3,7 @@ from dataclasses import asdict, dataclass, fields, is_dataclass, replace
 import numpy as np
 import pytest
 
-from pipistrelle.acoustics.callers import Caller
+from pipistrelle.acoustics.paths import Caller
 from pipistrelle.config import (
     STRATEGIES,
     Config,
@@ -13,22 +13,20 @@ from pipistrelle.config import (
     ReceiverConfig,
     ScenarioConfig,
 )
-from pipistrelle.detection.merging import scan_of
 from pipistrelle.detection.noise import without_hidden
-from pipistrelle.detection.scans import without_labels
+from pipistrelle.detection.scans import scan_of, without_labels
 from pipistrelle.estimation.association import Assignment
 from pipistrelle.estimation.beliefs import Gaussian
 from pipistrelle.estimation.catalogue import entry
 from pipistrelle.estimation.motion import Motion
-from pipistrelle.experiments.cases import Case
 from pipistrelle.experiments.drives import Drive
 from pipistrelle.experiments.hearing.listening import listen
 from pipistrelle.experiments.hearing.scenario import draw_scenario
 from pipistrelle.experiments.hearing.trajectories import motion_of
+from pipistrelle.experiments.named_settings import Case
 from pipistrelle.experiments.results.scores import score_path
-from pipistrelle.experiments.runs.filtering import run_filter
 from pipistrelle.experiments.runs.heard_world import drive_of, scans_of
-from pipistrelle.experiments.runs.trial import run_mission, run_trial
+from pipistrelle.experiments.runs.trial import run_filter, run_mission, run_trial
 from reference.missions import map_with, scan_with
 
 SHORT = Config(scenario=ScenarioConfig(steps=80))

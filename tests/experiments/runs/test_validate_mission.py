@@ -19,9 +19,9 @@ from pipistrelle.config import (
     WaterConfig,
 )
 from pipistrelle.experiments import machine
-from pipistrelle.experiments.runs import validate_mission
+from pipistrelle.experiments.runs import validate as validate_mission
 from pipistrelle.experiments.runs.trial import run_mission
-from pipistrelle.experiments.runs.validate_mission import checked_scenario, warnings_of
+from pipistrelle.experiments.runs.validate import checked_scenario, warnings_of
 from pipistrelle.settings import from_flags, resolve
 
 

@@ -8,9 +8,11 @@ import pytest
 
 from pipistrelle.config import Config, EmitterConfig, InputError, RayConfig
 from pipistrelle.estimation.catalogue import SECTIONS
-from pipistrelle.experiments.studies.plan import Plan, cases_of, common
-from pipistrelle.experiments.studies.plan_file import (
+from pipistrelle.experiments.studies.plan import (
+    Plan,
+    cases_of,
     changed_settings,
+    common,
     find_plan,
     plan_settings,
     plan_text,

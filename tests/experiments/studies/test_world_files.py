@@ -9,16 +9,17 @@ import polars as pl
 import pytest
 
 from pipistrelle.config import InputError
-from pipistrelle.experiments.studies import world_files
+from pipistrelle.experiments.studies import world as world_files
 from pipistrelle.experiments.studies.store import load_study, open_store
 from pipistrelle.experiments.studies.study import run_study
-from pipistrelle.experiments.studies.world import failed_records, run_world
-from pipistrelle.experiments.studies.world_files import (
+from pipistrelle.experiments.studies.world import (
     TABLES,
     check_world,
     done_worlds,
+    failed_records,
     read_ended_trials,
     refuse_strange,
+    run_world,
     sweep,
     world_file,
     write_world,

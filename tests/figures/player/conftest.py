@@ -10,7 +10,7 @@ from pipistrelle.experiments.runs.rerun import rerun
 from pipistrelle.experiments.runs.trial import run_mission
 from pipistrelle.figures.player.playback import playback
 from pipistrelle.figures.recorder import MissionRecorder
-from pipistrelle.own_files import RESULTS, OwnFiles
+from pipistrelle.files import RESULTS, OwnFiles
 
 FRAMES = 40
 

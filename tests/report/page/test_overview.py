@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from pipistrelle.evaluation.consistency import anees_bounds
-from pipistrelle.experiments.studies.plan_file import find_plan, read_plan
+from pipistrelle.experiments.studies.plan import find_plan, read_plan
 from pipistrelle.report.claims.contrasts import select
 from pipistrelle.report.page.overview import (
     by_strategy,

@@ -13,10 +13,9 @@ import pytest
 
 from pipistrelle.__main__ import main
 from pipistrelle.config import InputError
-from pipistrelle.experiments.studies.plan import cases_of
-from pipistrelle.experiments.studies.plan_file import find_plan, read_plan
-from pipistrelle.experiments.studies.world_files import TABLES, done_worlds, with_sums, world_file
-from pipistrelle.own_files import LOG, REPORT, RESULTS, OwnFiles
+from pipistrelle.experiments.studies.plan import cases_of, find_plan, read_plan
+from pipistrelle.experiments.studies.world import TABLES, done_worlds, with_sums, world_file
+from pipistrelle.files import LOG, REPORT, RESULTS, OwnFiles
 from pipistrelle.report.claims.published import TABLE_II
 from pipistrelle.report.page.page import write_report
 from pipistrelle.report.reading import read_study

@@ -10,7 +10,7 @@ import pytest
 
 from pipistrelle.__main__ import main
 from pipistrelle.evaluation.comparison import INTERVALS
-from pipistrelle.experiments.studies.plan_file import read_plan
+from pipistrelle.experiments.studies.plan import read_plan
 from pipistrelle.experiments.studies.study import run_study
 from pipistrelle.report.claims.statements import CLAIMS
 from pipistrelle.report.numbers import three_digits

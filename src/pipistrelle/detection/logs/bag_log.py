@@ -2,11 +2,17 @@
 
 Memory holds the rows, never the bag: messages of the chosen topics are read one at a time. What was
 chosen and what was converted is told in the log's `notes`.
+
+Which topics of a bag are the odometry, the echoes and the truth.
+
+Where a sensor is on the vehicle: static transforms of a bag, followed from frame to frame.
+
+A transform takes points of its child's frame to its parent's (tf2_msgs); frames form a tree.
 """
 
 import math
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -15,23 +21,170 @@ import numpy as np
 from jaxtyping import Float
 
 from pipistrelle.config import AssociationConfig, BagConfig, InputError
-from pipistrelle.detection.logs.bag import Message, faults_named, opened
-from pipistrelle.detection.logs.bag_frames import TRANSFORMS, Frames, along_axis, bare, planar
+from pipistrelle.detection.logs.bag import Bag, Message, Topic, faults_named, opened
 from pipistrelle.detection.logs.bag_messages import (
     ANGLES,
     CONES,
     ECHOES,
+    ODOMETRY,
     POSES,
     Echoes,
     Pose,
     TurnError,
+    pose_of,
 )
-from pipistrelle.detection.logs.bag_topics import echoes_of, odometry_of, transforms_of, truth_of
 from pipistrelle.detection.logs.poses import MOTION_COVARIANCE, POSE
 from pipistrelle.detection.logs.recording import Log, assemble
 from pipistrelle.detection.logs.text_tables import Table, check_columns, place_of
 from pipistrelle.detection.scans import WIDEST
 from pipistrelle.refusals import refusal
+
+TRANSFORMS = "/tf_static"
+TRANSFORMS_TYPE = "tf2_msgs/msg/TFMessage"
+"""The topic of the static transforms, and the type of its messages."""
+
+
+class Frames:
+    """The frames of a bag, and how they stand to each other."""
+
+    def __init__(self) -> None:
+        self._beside: dict[str, dict[str, Pose]] = {}
+
+    def add(self, message: Any) -> list[str]:
+        """Learn the transforms of a message; say which are left out as no turns."""
+        odd = []
+        for one in message.transforms:
+            parent, child = bare(one.header.frame_id), bare(one.child_frame_id)
+            try:
+                pose = pose_of(one.transform.translation, one.transform.rotation)
+            except TurnError as error:
+                odd.append(f"from {parent!r} to {child!r}: {error}")
+                continue
+            if not np.isfinite(pose[1]).all():
+                raise ValueError(f"the translation {pose[1].tolist()}")
+            self._beside.setdefault(parent, {})[child] = pose
+            self._beside.setdefault(child, {})[parent] = inverse(pose)
+        return odd
+
+    def __bool__(self) -> bool:
+        """Return whether any transform is known."""
+        return bool(self._beside)
+
+    def pose(self, frame: str, base: str) -> Pose | None:
+        """Return what takes points of a frame to another; None where nothing ties them."""
+        found = {base: planar(0.0, 0.0, 0.0)}
+        waiting = [base]
+        while waiting and frame not in found:
+            here = waiting.pop()
+            for there, step in self._beside.get(here, {}).items():
+                if there not in found:
+                    found[there] = after(found[here], step)
+                    waiting.append(there)
+        return found.get(frame)
+
+
+def bare(frame: str) -> str:
+    """Return a frame's name without the slash that ROS 1 may begin it with."""
+    return frame.removeprefix("/")
+
+
+def after(outer: Pose, inner: Pose) -> Pose:
+    """Return the inner pose followed by the outer one."""
+    return outer[0] @ inner[0], outer[0] @ inner[1] + outer[1]
+
+
+def inverse(pose: Pose) -> Pose:
+    """Return the way back."""
+    return pose[0].T, -pose[0].T @ pose[1]
+
+
+def planar(x: float, y: float, heading: float) -> Pose:
+    """Return a pose in the plane.
+
+    >>> planar(1.0, 2.0, 0.0)[1]
+    array([1., 2., 0.])
+    """
+    c, s = np.cos(heading), np.sin(heading)
+    return np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]]), np.array([x, y, 0.0])
+
+
+def along_axis(points: Float[np.ndarray, "n 3"], mount: Pose) -> Float[np.ndarray, "n 3"]:
+    """Return points about a sensor's axis in its frame's axes, whose x or z is that axis.
+
+    Profiling sonars have their frame's z along the axis and y to starboard, as ProjectedSonarImage
+    of marine_acoustic_msgs says; others have x ahead. The one that lies flatter is meant.
+    """
+    (_, _, x), (_, _, z) = mount[0][:, 0], mount[0][:, 2]
+    return points if abs(x) <= abs(z) else points[:, ::-1] * [1.0, -1.0, 1.0]
+
+
+def odometry_of(bag: Bag, settings: BagConfig) -> str:
+    """Return the topic of the odometry: the one that is named, or the only one."""
+    if settings.odometry is not None:
+        return bag.checked(settings.odometry, [ODOMETRY], "--bag.odometry")
+    there = _odometries(bag.topics.values(), settings)
+    if len(there) == 1:
+        return there[0]
+    found = f"several topics of odometry: {', '.join(there)}" if there else "no odometry"
+    fix = "name one: --bag.odometry TOPIC" if there else "--topics lists what there is"
+    raise refusal(bag.path, found, f"one topic of {ODOMETRY}", fix)
+
+
+def echoes_of(bag: Bag, settings: BagConfig) -> list[str]:
+    """Return the topics of the echoes: those that are named, or all of a known type."""
+    if settings.echoes:
+        names = dict.fromkeys(settings.echoes)
+        return [bag.checked(name, ECHOES, "--bag.echoes") for name in names]
+    names = [topic.name for topic in bag.topics.values() if topic.type in ECHOES]
+    if not names:
+        expected = f"a topic of {', '.join(ECHOES)}"
+        raise refusal(bag.path, "no echoes", expected, "--topics lists what there is")
+    return names
+
+
+def transforms_of(bag: Bag) -> list[str]:
+    """Return the topic of the static transforms, if the bag has it."""
+    there = bag.topics.get(TRANSFORMS)
+    if there is not None and there.type != TRANSFORMS_TYPE:
+        where, fix = f"{bag.path}, topic {TRANSFORMS}", "leave the topic out of the bag"
+        raise refusal(where, f"the type {there.type}", TRANSFORMS_TYPE, fix)
+    return [] if there is None else [TRANSFORMS]
+
+
+def truth_of(bag: Bag, settings: BagConfig) -> str | None:
+    """Return the topic of the truth, if one is named."""
+    return None if settings.truth is None else bag.checked(settings.truth, POSES, "--truth")
+
+
+def roles(topics: Iterable[Topic], settings: BagConfig) -> dict[str, str]:
+    """Say what each topic would be taken for; empty where for nothing.
+
+    >>> odometry = Topic(name="/odom", type=ODOMETRY, count=3)
+    >>> roles([odometry], BagConfig()), roles([odometry], BagConfig(truth="/odom"))
+    ({'/odom': 'odometry'}, {'/odom': 'truth'})
+    """
+    topics = list(topics)
+    odometries = [settings.odometry] if settings.odometry else _odometries(topics, settings)
+    echoes = settings.echoes or [topic.name for topic in topics if topic.type in ECHOES]
+
+    def role(topic: Topic) -> str:
+        if topic.name == settings.truth:
+            return "truth"
+        if topic.name in odometries:
+            return "odometry" if len(odometries) == 1 else "odometry, if --bag.odometry names it"
+        if topic.name in echoes:
+            return "echoes"
+        if topic.name == TRANSFORMS:
+            return "transforms"
+        return "truth, if --truth names it" if topic.type in POSES else ""
+
+    return {topic.name: role(topic) for topic in topics}
+
+
+def _odometries(topics: Iterable[Topic], settings: BagConfig) -> list[str]:
+    """List the topics that may be the odometry."""
+    return [one.name for one in topics if one.type == ODOMETRY and one.name != settings.truth]
+
 
 _TWIST = ("velocity", "angular_rate")
 _UPPER = (0, 1, 5, 7, 11, 35)

@@ -2,14 +2,25 @@
 
 Whatever is wrong with a file is refused by line or key. `recording` says how rows become steps and
 measurements scans.
+
+A robot's log of the UTIAS multi-robot cooperative localization and mapping data sets (MRCLAM).
+
+Leung, Halpern, Barfoot and Liu, "The UTIAS multi-robot cooperative localization and mapping
+dataset", IJRR 30(8), 2011: five robots with a camera among fifteen barcoded posts. A folder is
+read as it is; its noise, which the sets do not state, is chosen here. The spread of the start is
+the paper's (Table I). Ranges lie between 0.9 m and 8.6 m; the bounds for rays are the paper's too.
+
+A log whose rows are written as they are heard, scan by scan, beside odometry that is there.
 """
 
+import math
 from collections.abc import Iterable
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from jaxtyping import Int
 
 from pipistrelle.config import STEEPEST
 from pipistrelle.detection.logs.poses import MOTION_COVARIANCE, POSE, poses_along
@@ -20,17 +31,92 @@ from pipistrelle.detection.logs.recording import (
     Log,
     assemble,
 )
-from pipistrelle.detection.logs.text_tables import Table, read_table, table_text
+from pipistrelle.detection.logs.text_tables import (
+    Table,
+    check_unique,
+    place_of,
+    read_table,
+    rows_kept,
+    table_text,
+)
 from pipistrelle.detection.logs.vehicle import (
     KINDS,
     NOISY,
     ODOMETRY,
     SHARED,
     read_vehicle,
+    vehicle_of,
 )
 from pipistrelle.detection.scans import UNLABELLED, Scan
-from pipistrelle.own_files import LOG, OwnFiles
+from pipistrelle.files import LOG, OwnFiles, read_text
 from pipistrelle.refusals import refusal
+
+ROBOTS = range(1, 6)
+LANDMARKS = range(6, 21)
+
+_UNKNOWN_MAX = 0.05
+
+
+def read_mrclam(folder: Path, robot: int, span: tuple[float, float] = (-math.inf, math.inf)) -> Log:
+    """Read what one robot drove and saw; the labels of landmarks are their subjects, 6 to 20.
+
+    Odometry is merged into steps of 0.1 s. Rows that show another robot (subjects 1 to 5) or a
+    barcode that no subject wears are dropped and counted.
+
+    `span` [s]: the log is cut to it: where the truth begins and ends. Returns it
+    starts at the origin: these files do not say where the robot stood.
+
+    Format and robots: Leung et al., IJRR 30(8), 2011.
+    """
+    columns = ("time", "velocity", "angular_rate")
+    odometry = read_table(folder / f"Robot{robot}_Odometry.dat", columns, separator=None)
+    measurements, ignored = _seen_landmarks(folder, robot)
+    return assemble(
+        odometry,
+        measurements,
+        step=0.1,
+        span=span,
+        ignored_rows=ignored,
+        name=f"{folder.resolve().name}_robot{robot}",
+        motion="unicycle",
+        control_std=(0.10, 0.15),
+        noise_at_rest=False,
+        initial_pose=(0.0, 0.0, 0.0),
+        initial_pose_std=(0.05, 0.05, 0.0436),
+        range_std=0.2,
+        bearing_std=0.06,
+        range_bounds=(0.5, 20.0),
+    )
+
+
+def _seen_landmarks(folder: Path, robot: int) -> tuple[Table, dict[str, int]]:
+    """Return the measurements of landmarks, labelled by their subjects, and the rows dropped."""
+    columns = ("time", "barcode", "range", "bearing")
+    table = read_table(folder / f"Robot{robot}_Measurement.dat", columns, separator=None)
+    subject = _subjects(folder / "Barcodes.dat", table.column["barcode"])
+    landmark, seen = np.isin(subject, LANDMARKS), np.isin(subject, ROBOTS)
+    unknown = ~(landmark | seen)
+    if unknown.mean() > _UNKNOWN_MAX:
+        first = int(np.argmax(unknown))
+        raise refusal(
+            place_of(table, first),
+            f"barcode {table.column['barcode'][first]}, and {unknown.sum()} unknown barcodes "
+            f"in {len(unknown)} rows",
+            f"at most {_UNKNOWN_MAX:.0%} that Barcodes.dat does not know",
+            "use the Barcodes.dat of this set",
+        )
+    ignored = {"unknown_barcode": int(unknown.sum()), "robot_seen": int(seen.sum())}
+    named = replace(table, column=table.column | {"landmark": subject})
+    return rows_kept(named, landmark), ignored
+
+
+def _subjects(path: Path, barcode: Int[np.ndarray, " n"]) -> Int[np.ndarray, " n"]:
+    """Return the subjects that wear the barcodes, 0 for an unknown one."""
+    table = read_table(path, ("subject", "barcode"), separator=None)
+    check_unique(table, "barcode")
+    subject = dict(zip(table.column["barcode"].tolist(), table.column["subject"], strict=True))
+    return np.array([subject.get(worn, 0) for worn in barcode.tolist()])
+
 
 _README = """A recorded log of Pipistrelle. Replay it with: pipistrelle slam FOLDER
 
@@ -256,3 +342,64 @@ def _measurement_columns(log: Log) -> dict[str, np.ndarray]:
     if log.callers and whose.any():
         column[CALLER] = np.array(["", *(caller.name for caller in log.callers)])[whose]
     return column
+
+
+class RowsHeard:
+    """A log of scans without labels.
+
+    Parameters
+    ----------
+    folder : Path
+        Holds ``odometry.csv``, and a ``recording.toml`` that was read.
+    about : dict
+        Its table ``log``: keys of ``log.toml``.
+    callers : list of dict
+        As ``log.toml`` lists them.
+
+    Raises
+    ------
+    InputError
+        Where the table or the odometry are not as those of a log.
+    """
+
+    columns = ("time", *MEASUREMENT[1:], *STATED, CALLER)
+    """Of ``measurements.csv``."""
+
+    def __init__(self, folder: Path, about: dict[str, Any], callers: list[dict[str, Any]]) -> None:
+        table = about | {"format": 1, "callers": callers}
+        self._vehicle = vehicle_of(table, f"{folder / 'recording.toml'}, table 'log'")
+        self._names = np.array(["", *(caller.name for caller in self._vehicle.callers)])
+        self._odometry = folder / "odometry.csv"
+        odometry = read_odometry(folder, self._vehicle.motion)
+        begin = {"time": odometry.column["time"][:1], "landmark": np.array([UNLABELLED])}
+        nothing = dict.fromkeys(("range", *STATED, CALLER), np.full(1, np.nan))
+        column = begin | {"bearing": np.zeros(1)} | nothing
+        one = Table(path=self._odometry, line=np.ones(1, dtype=np.int64), column=column)
+        step, told = self._vehicle.step, self._vehicle.told()
+        log = assemble(odometry, one, step=step, name="", former_names=(), **told)  # may refuse
+        self.time = log.time
+        self.rows = self.inside = 0
+        """Rows that were heard, and those of them that the odometry's times hold."""
+
+    def text(self, scan: Scan) -> str:
+        """Return the rows of a scan, as ``measurements.csv`` has them, without the header."""
+        time = np.full(len(scan.bearing), scan.time)
+        column = [as_logged(scan, name) for name in self.columns[1:-1]]
+        self.rows += time.size
+        self.inside += time.size * bool(self.time[0] <= scan.time <= self.time[-1])
+        text = table_text(self.columns, time, *column, self._names[scan.caller])
+        return text.split("\n", 1)[1]
+
+    def files(self) -> dict[str, str]:
+        """Return the log's other files; refuse a log of which no row can be used."""
+        if not self.inside:
+            begin, end = self.time[[0, -1]].tolist()
+            found = f"{self.rows} echoes, none between {begin!r} s and {end!r} s"
+            fix = "use the odometry's clock ('start' of recording.toml), or a lower threshold"
+            raise refusal(self._odometry, found, "echoes while it drives", fix)
+        motion = self._vehicle.motion
+        return {
+            "odometry.csv": read_text(self._odometry),
+            "README.md": log_readme(("time", *ODOMETRY[motion]), self.columns, motion),
+            "log.toml": self._vehicle.text(),
+        }

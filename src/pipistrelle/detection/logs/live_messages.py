@@ -13,11 +13,13 @@ from jaxtyping import Float
 
 from pipistrelle.config import BagConfig, InputError
 from pipistrelle.detection.logs.bag import Message, faults_named
-from pipistrelle.detection.logs.bag_frames import TRANSFORMS, Frames, bare
 from pipistrelle.detection.logs.bag_log import (
     BEGUN,
+    TRANSFORMS,
+    Frames,
     Remarks,
     TopicEchoes,
+    bare,
     mounts_of,
     odometry_table,
     rows_of,

@@ -19,8 +19,6 @@ _OTHERS = {
     "no log; make a log folder of it with `pipistrelle hear` (docs/sound.md)",
 }
 """Recordings that have no reader, by the endings of their files."""
-BAGS = (".bag", ".mcap", ".db3")
-"""Endings of ROS bags: of ROS 1, and of ROS 2."""
 Robot = int | str
 """Whose log of several: by number or by name, as the format has it."""
 
@@ -87,14 +85,11 @@ def _read_log_folder(folder: Path) -> "Log":
 
 def _is_bag(path: Path) -> bool:
     """Tell whether a path is named as a ROS bag, or is a folder of ROS 2."""
+    from pipistrelle.detection.logs.bag import BAGS, storages
+
     if not path.is_dir():
         return path.suffix in BAGS
     return (path / "metadata.yaml").exists() or bool(storages(path))
-
-
-def storages(folder: Path) -> list[Path]:
-    """List the files of a bag of ROS 2 in its folder."""
-    return sorted(path for path in folder.iterdir() if path.suffix in BAGS[1:])
 
 
 def _read_bag(path: Path, settings: Any, **framed: Any) -> "Log":
@@ -119,7 +114,7 @@ def _mrclam_robots(folder: Path) -> list[Robot]:
 
 def _read_mrclam(folder: Path, robot: int, **framed: Any) -> "Log":
     """Read one robot's log of a MRCLAM set."""
-    from pipistrelle.detection.logs.mrclam import read_mrclam
+    from pipistrelle.detection.logs.folder import read_mrclam
 
     return read_mrclam(folder, robot, **framed)
 

@@ -1,22 +1,283 @@
-"""Mistakes that everybody makes: what is odd about a recording, and what would explain it."""
+"""Mistakes that everybody makes: what is odd about a recording, and what would explain it.
 
+The array, checked by the loudest sound: orders, signs and mirror images that would fit better.
+
+What of the energy of a loud echo the best beam of a face, or of all microphones without a face,
+misses is their *misfit*; two channels that are swapped, or one whose sign is, raise it. A line
+that is counted from the wrong end fits as well, but says the mirror image of each angle: then two
+faces that hear one echo disagree, as they do where faces are swapped.
+
+What was heard of some calls, for a figure: the matched filter's output and the echoes.
+"""
+
+import math
 from collections.abc import Iterator
+from dataclasses import dataclass, field
+from itertools import combinations, permutations
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Int
+from jaxtyping import Complex, Float, Int
 
-from pipistrelle.acoustics.call import Call, ToneBurst
-from pipistrelle.arrays.bands import extent_of, replica
+from pipistrelle.acoustics.call import Call, ToneBurst, extent_of, replica
 from pipistrelle.config import Config
-from pipistrelle.detection.sounds.calls import Calls, calls_of
-from pipistrelle.detection.sounds.check_array import BETTER, array_faults
-from pipistrelle.detection.sounds.copied_channels import copied_channels
-from pipistrelle.detection.sounds.description import Description
-from pipistrelle.detection.sounds.hearing import Hearing, sums_of
-from pipistrelle.detection.sounds.recorded_array import RecordedArray, recorded_array
+from pipistrelle.detection.noise import energy_of
+from pipistrelle.detection.scans import OWN, Scan
+from pipistrelle.detection.snapshots import Detections
+from pipistrelle.detection.sounds.calls import Blocks, Calls, calls_of
+from pipistrelle.detection.sounds.description import Description, RecordedArray, recorded_array
+from pipistrelle.detection.sounds.hearing import Frame, Hearing, copied_channels, sums_of
 from pipistrelle.detection.sounds.sound_file import Sound, open_sound
-from pipistrelle.detection.sounds.tone_sums import Blocks
+from pipistrelle.geometry import wrap
+
+CALLS, SNAPSHOTS = 64, 60
+"""Most calls that are listened to, and snapshots of a face that are kept."""
+MIN_SNAPSHOTS, MIN_PAIRS = 5, 10
+MOST_FACES = 4
+"""Most faces of which all orders are tried."""
+LOUD = 300.0
+"""Least power of an echo over the noise of a steered beam."""
+WIDEST = 0.2
+"""Widest group whose order a tone tells, in lengths of the call."""
+AROUND, AT_ONCE = 16, 1 << 21
+"""Outputs to both sides of an echo that is no tone; numbers that are in memory at a time."""
+MISFIT, BETTER = 0.02, 0.5
+"""Least misfit that asks for another order, and the share of it that one leaves which is named."""
+DISAGREE = 0.15
+"""Least median difference between the bearings of two faces that asks for other faces [rad]."""
+
+
+class _Echo(NamedTuple):
+    """A loud echo, as a group of microphones heard it at the time of its middle."""
+
+    frequency: Float[np.ndarray, " k"]
+    """Frequency of a tone, or frequencies of the parts of a band [Hz]."""
+    output: Complex[np.ndarray, "k e"]
+    """The matched filters' outputs, by frequency."""
+
+
+def array_faults(hearing: Hearing) -> Iterator[str]:
+    """Say which other order of the channels would explain the loudest sounds better."""
+    heard: list[list[_Echo]] = [[] for _ in hearing.array.face]
+    pairs: list[tuple[int, float, int, float]] = []
+    last = hearing.calls.sample.size - 1
+    for frame in hearing.frames(np.unique(np.linspace(0, last, CALLS).astype(np.int64)).tolist()):
+        _collect(frame, hearing, heard)
+        pairs += _pairs(frame, hearing)
+    for g, echoes in enumerate(heard):
+        if len(echoes) >= MIN_SNAPSHOTS:
+            yield from _order(hearing, g, echoes)
+    if len(pairs) >= MIN_PAIRS:
+        yield from _faces(hearing, np.array(pairs))
+
+
+def _collect(frame: Frame, hearing: Hearing, heard: list[list[_Echo]]) -> None:
+    """Keep the loudest echo of each group and caller, if it is loud."""
+    found = frame.detections
+    for g, echoes in enumerate(heard):
+        for caller in np.unique(found.caller):
+            rows = np.flatnonzero((found.face == g) & (found.caller == caller))
+            if rows.size == 0 or len(echoes) >= SNAPSHOTS:
+                continue
+            d = int(rows[found.power[rows].argmax()])
+            echo = _echo(frame, hearing, d) if found.power[d] >= LOUD else None
+            if echo is not None:
+                echoes.append(echo)
+
+
+def _echo(frame: Frame, hearing: Hearing, d: int) -> _Echo | None:
+    """Return what a group heard of a detection; None of one at the record's ends.
+
+    What is no tone is parted into frequencies, for its microphones hear it one by one.
+    """
+    found, caller = frame.detections, int(frame.detections.caller[d])
+    row, members = hearing.array.layout.members(int(found.face[d]))
+    outputs = frame.matched[:, row, caller][:, members]
+    at = (found.delay[d] - frame.start) / frame.interval
+    wide = hearing.wide(caller, int(found.face[d]))
+    if wide is None:
+        if not 0 <= round(at) < len(outputs):
+            return None
+        return _Echo(hearing.blocks.tones[[caller]], outputs[[round(at)]])
+    c, far = wide.speed_of_sound, np.linalg.norm(wide.position, axis=1).max()
+    toward = np.array([np.cos(found.bearing[d]), np.sin(found.bearing[d])])
+    at -= wide.middle @ toward / c / frame.interval
+    reach = AROUND + math.ceil(far / c / frame.interval)
+    first, length = round(at) - reach, 2 * reach * frame.interval
+    if not 0 <= first <= len(outputs) - 2 * reach:
+        return None
+    bins = np.arange(math.ceil(wide.band.low * length), math.floor(wide.band.high * length) + 1)
+    spectrum = np.fft.fft(outputs[first : first + 2 * reach], axis=0)[bins % (2 * reach)]
+    turn = np.exp(2j * np.pi * bins / length * (at - first) * frame.interval)
+    return _Echo(bins / length, spectrum * turn[:, np.newaxis])
+
+
+def _pairs(frame: Frame, hearing: Hearing) -> list[tuple[int, float, int, float]]:
+    """Pair detections of one echo by two faces: the loudest of each within a quarter of a call."""
+    found, pairs = frame.detections, []
+    late = 0.25 * hearing.about.call.duration
+    for one, other in combinations(np.flatnonzero(found.power >= LOUD).tolist(), 2):
+        same = found.caller[one] == found.caller[other] and found.face[one] != found.face[other]
+        face, angle = found.face[[one, other]], found.angle[[one, other]].tolist()
+        lines = not np.isnan(hearing.array.layout.normal[face]).any()
+        if same and lines and abs(found.delay[one] - found.delay[other]) < late:
+            pairs.append((int(face[0]), angle[0], int(face[1]), angle[1]))
+    return pairs
+
+
+def _order(hearing: Hearing, g: int, echoes: list[_Echo]) -> Iterator[str]:
+    """Try to swap two channels of a group, or the sign of one."""
+    lead, gain = _directions(hearing, g)
+    if np.ptp(lead, axis=1).max() > WIDEST * hearing.about.call.duration:  # one by one
+        echoes = [echo for echo in echoes if echo.frequency.size > 1]
+    if not echoes:
+        return
+    row, members = hearing.array.layout.members(g)
+    channel = hearing.array.channel[row, members] + 1
+    shares = [_shares(echo, lead, gain) for echo in echoes]
+    now = 1.0 - float(np.median([share for share, _ in shares]))
+    if now < MISFIT:
+        return
+    changed = 1.0 - np.median([share for _, share in shares], axis=0)
+    i, j = divmod(int(changed.argmin()), members.size)
+    what = f"swap channels {channel[i]} and {channel[j]}"
+    what = what if i != j else f"turn the sign of channel {channel[i]} round"
+    misses = f"{_named(hearing, g)}: the best beam misses {now:.1%} of the loudest echoes' energy"
+    if changed[i, j] <= BETTER * now:
+        yield f"{misses}, {changed[i, j]:.1%} if you {what} in array.csv"
+    else:
+        yield f"{misses}, and no swap of two channels would help: are places and tone right?"
+
+
+def _shares(
+    echo: _Echo, lead: Float[np.ndarray, "b e"], gain: Float[np.ndarray, " e"]
+) -> tuple[float, Float[np.ndarray, "e e"]]:
+    """Return the share of an echo's energy that the best beam has, as the microphones are.
+
+    And with two of them swapped, or on the diagonal, with the sign of one turned round.
+    """
+    now, changed = 0.0, np.zeros((gain.size, gain.size))
+    for some in np.array_split(lead, math.ceil(lead.size * gain.size / AT_ONCE)):
+        # of each direction, for each place what each channel would add to a beam
+        heard = np.exp(-2j * np.pi * some[..., np.newaxis] * echo.frequency) @ echo.output
+        energy, added = np.abs(heard) ** 2, gain[:, np.newaxis] * heard
+        own, own_energy = (np.einsum("bii->bi", each) for each in (added, energy))
+        total, whole = own.sum(axis=1), own_energy.sum(axis=1)
+        more, louder = added - own[..., np.newaxis], energy - own_energy[..., np.newaxis]
+        more[:, range(gain.size), range(gain.size)] = -own
+        power = np.abs(total[:, None, None] + more + more.swapaxes(1, 2)) ** 2
+        share = power / (whole[:, None, None] + louder + louder.swapaxes(1, 2))
+        now = max(now, float((np.abs(total) ** 2 / whole).max()))
+        changed = np.maximum(changed, share.max(axis=0))
+    return now / np.sum(gain**2), changed / np.sum(gain**2)
+
+
+def _directions(
+    hearing: Hearing, g: int
+) -> tuple[Float[np.ndarray, "b e"], Float[np.ndarray, " e"]]:
+    """Return how much earlier a group's microphones hear sound of many directions [s], and gains.
+
+    Directions are so dense that between two the phase turns by some 0.2 rad.
+    """
+    layout, speed = hearing.array.layout, hearing.config.assumed_sound_speed
+    (place, gain), normal = layout.places(g), float(layout.normal[g])
+    place = place - gain**2 @ place / np.sum(gain**2)
+    reach = np.linalg.norm(place, axis=1).max() * hearing.blocks.tones.max() / speed
+    half = math.pi if math.isnan(normal) else 0.5 * math.pi
+    bearing = 0.0 if math.isnan(normal) else normal
+    bearing += np.linspace(-half, half, 201 + math.ceil(20.0 * math.pi * reach * half))
+    toward = np.stack((np.cos(bearing), np.sin(bearing)), axis=-1)
+    return toward @ place.T / speed, gain
+
+
+def _named(hearing: Hearing, g: int) -> str:
+    """Return what a group of microphones is called."""
+    name = hearing.array.face[g]
+    return name if " " in name else f"face {name}"
+
+
+def _faces(hearing: Hearing, pairs: Float[np.ndarray, "n 4"]) -> Iterator[str]:
+    """Try other orders of the faces, and lines that are counted from the other end."""
+    normal, names = hearing.array.layout.normal, hearing.array.face
+    count = len(names)
+    face, angle = pairs[:, [0, 2]].astype(np.int64), pairs[:, [1, 3]]
+
+    def differ(order: tuple[int, ...], side: float) -> float:
+        bearing = normal[np.array(order)][face] + side * angle
+        return float(np.median(np.abs(wrap(bearing[:, 0] - bearing[:, 1]))))
+
+    as_it_is = tuple(range(count))
+    now = differ(as_it_is, 1.0)
+    if now < DISAGREE:
+        return
+    moved = sorted(permutations(as_it_is), key=lambda o: sum(map(int.__ne__, o, as_it_is)))
+    orders = moved if count <= MOST_FACES else [as_it_is]
+    tried = {(order, side): differ(order, side) for side in (-1.0, 1.0) for order in orders}
+    said, best = f"two faces that hear one echo differ by {now:.2f} rad", min(tried.values())
+    if best > BETTER * now:
+        yield f"{said}, and no order of the faces would help"
+        return
+    fits = [change for change, left in tried.items() if left <= best + 0.02]
+    firsts = [next((f for f in fits if f[1] == side), None) for side in (-1.0, 1.0)]
+    words = " or ".join(_change(names, *first) for first in firsts if first is not None)
+    yield f"{said}, by {best:.2f} rad if in array.csv you {words}"
+
+
+def _change(names: tuple[str, ...], order: tuple[int, ...], side: float) -> str:
+    """Say what makes the faces stand in an order, and their lines turn round."""
+    changes = ["count each face's channels from its other end"] if side < 0 else []
+    moved = [(f, o) for f, o in enumerate(order) if f != o]
+    changes += [f"let face {names[f]} be where face {names[o]} is" for f, o in moved]
+    return " and ".join(changes)
+
+
+SHOWN_CALLS = 60
+"""Most calls that are kept."""
+BINS = 400
+"""Most delays at which the output is kept, the loudest of each."""
+
+
+@dataclass(kw_only=True)
+class Overview:
+    """The first calls that were heard."""
+
+    names: tuple[str, ...]
+    """Who calls, the vehicle first."""
+    time: list[float] = field(default_factory=list)
+    """Of the calls [s]."""
+    delay: list[Float[np.ndarray, " n"]] = field(default_factory=list)
+    """Since the vehicle's call, of each bin [s]."""
+    level_db: list[Float[np.ndarray, "n c"]] = field(default_factory=list)
+    """Of the loudest face over the noise of its elements, in each bin [dB]."""
+    detections: list[Detections] = field(default_factory=list)
+    scans: list[Scan] = field(default_factory=list)
+
+    def look(self, frame: Frame) -> None:
+        """Keep what was heard after a call, if it is one of the first."""
+        if len(self.time) == SHOWN_CALLS:
+            return
+        lags, faces, tones, elements = frame.matched.shape
+        energy = (
+            energy_of(frame.matched.reshape(-1).view(frame.matched.real.dtype), elements) / elements
+        )
+        loudest = energy.reshape(lags, faces, tones).max(axis=1, initial=0.0)
+        edges = np.unique(np.linspace(0, lags, BINS + 1).astype(np.int64))[:-1]
+        if edges.size:
+            loudest = np.maximum.reduceat(loudest, edges, axis=0)
+        self.time.append(frame.time)
+        self.delay.append(frame.start + edges * frame.interval)
+        self.level_db.append(10.0 * np.log10(np.maximum(loudest, 1e-3)))
+        self.detections.append(frame.detections)
+        self.scans.append(frame.scan)
+
+    def direct(self, number: int) -> Float[np.ndarray, " k"]:
+        """Return when a caller's direct call began after each call of the vehicle, or NaN [s]."""
+        if number == OWN:
+            return np.full(len(self.time), np.nan)
+        calls = (found.direct for found in self.detections)
+        return np.array([np.nan if one is None else one.delay[number] for one in calls])
+
 
 GAPS = 16
 """Most gaps that are looked at, spread over the recording."""

@@ -1,12 +1,18 @@
-"""``recording.toml``: what a sound recording says of itself, and how it was made."""
+"""``recording.toml``: what a sound recording says of itself, and how it was made.
+
+The array of a recording, and which channel of the sound each of its microphones is.
+"""
 
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, NamedTuple
 
+import numpy as np
+from jaxtyping import Int
 from pydantic import ConfigDict, Field, ValidationError, field_validator, model_validator
 
-from pipistrelle.acoustics.call import Call, ToneBurst
-from pipistrelle.acoustics.call_settings import sound_of
+from pipistrelle.acoustics.call import Call, ToneBurst, sound_of
+from pipistrelle.arrays.array_file import read_array
+from pipistrelle.arrays.layout import Layout, Scattered, at_one_centre, scattered
 from pipistrelle.config import (
     MAX_OTHERS,
     SWEEP,
@@ -21,6 +27,43 @@ from pipistrelle.config import (
 from pipistrelle.files import read_text
 from pipistrelle.refusals import expectation, meant, refusal, shown
 from pipistrelle.settings import parse_toml
+
+ARRAY_FILE = "array.csv"
+
+
+class RecordedArray(NamedTuple):
+    """Microphones, and where they are in a sound file."""
+
+    layout: Layout | Scattered
+    channel: Int[np.ndarray, "f e"]
+    """Numbers of the channels in a sound file, from 0 on."""
+    face: tuple[str, ...]
+    """Names of the groups of microphones that are scanned together."""
+
+    @property
+    def used(self) -> Int[np.ndarray, " m"]:
+        """The channels that are microphones, in order."""
+        return np.unique(self.channel)
+
+
+def recorded_array(folder: Path, channels: int, *, one_centre: bool) -> RecordedArray:
+    """Read ``array.csv`` of a recording that has some channels.
+
+    `one_centre`: whether faces are heard as if all stood at the vehicle's point.
+    """
+    path = folder / ARRAY_FILE
+    microphones = read_array(path, some=True)
+    if (most := int(microphones.channel.max())) > channels:
+        found, expected = f"channel {most}, of sound that has {channels}", f"1 to {channels}"
+        raise refusal(path, found, expected, "correct the channels")
+    if one_centre:
+        layout, which = at_one_centre(microphones, str(path))
+        names = tuple(microphones.face[first] for first in which[:, 0])
+        return RecordedArray(layout, microphones.channel[which] - 1, names)
+    free = scattered(microphones, str(path))
+    names = tuple(name or "those without a face" for name in free.name)
+    return RecordedArray(free, microphones.channel[np.newaxis] - 1, names)
+
 
 FILE = "recording.toml"
 _Name = Annotated[str, Field(pattern=r"^\w[\w-]*$", max_length=40)]

@@ -1,4 +1,27 @@
-"""Sound in: a recording is heard call by call, by the front end of the simulation, into a log."""
+r"""Sound in: a recording is heard call by call, by the front end of the simulation, into a log.
+
+The noise of each channel at each frequency, as a recording itself tells.
+
+Echoes fill much of the time after a call. So the gap from call to call is parted into stretches,
+and those count which are as quiet as the quietest, over all channels. Of their block sums :math:`S`
+each channel's level is that of the median: the power of noise is exponentially distributed,
+
+.. math:: \sigma^2 = \operatorname{median}(|S|^2) / \ln 2 ,
+
+and nearly half of the sums may be anything. Where channels, or frequencies too, differ by no more
+than chance, they have one level, their mean: to weigh them by their chance would move bearings.
+
+Channels that hold one microphone's sound, as a wrong route or list of channels makes them.
+
+Two microphones have noise of their own, so no channel is a multiple of another. Of a copy, scaled
+by a and perhaps some samples late, nothing is left but what rounding to a file's quantum q adds,
+
+.. math:: \sum_t (x_j[t] - a x_i[t - d])^2 \le \frac{q^2}{12} (1 + a^2) n
+          \left(1 + 5 \sqrt{2 / n}\right) ,
+
+five standard deviations over its mean for n samples. Where all sound is below that, nothing can be
+told of it.
+"""
 
 import math
 from collections.abc import Callable, Iterator, Sequence
@@ -8,27 +31,194 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-from jaxtyping import Bool, Complex, Float
+from jaxtyping import Bool, Complex, Float, Int
 
-from pipistrelle.acoustics.call import Call, Sweep, ToneBurst
-from pipistrelle.arrays.bands import extent_of
+from pipistrelle.acoustics.call import Call, Sweep, ToneBurst, extent_of
 from pipistrelle.config import Config
-from pipistrelle.detection.echoes import unlabelled_scan, with_edge_floor
-from pipistrelle.detection.front_end import FrontEnd, Mixed, find_calls, front_end
+from pipistrelle.detection.front_end import (
+    FrontEnd,
+    Mixed,
+    find_calls,
+    front_end,
+    unlabelled_scan,
+    with_edge_floor,
+)
 from pipistrelle.detection.matched import Workspace, filter_blocks
 from pipistrelle.detection.scans import Scan
 from pipistrelle.detection.snapshots import Detections, detections_at
-from pipistrelle.detection.sounds.call_outputs import CallOutputs
-from pipistrelle.detection.sounds.calls import Calls, calls_of
-from pipistrelle.detection.sounds.copied_channels import copied_channels
-from pipistrelle.detection.sounds.description import FILE, Description
-from pipistrelle.detection.sounds.noise_level import set_noise
-from pipistrelle.detection.sounds.recorded_array import FILE as ARRAY
-from pipistrelle.detection.sounds.recorded_array import RecordedArray, recorded_array
+from pipistrelle.detection.sounds.calls import (
+    Blocks,
+    CallOutputs,
+    Calls,
+    ToneSums,
+    blocks_of,
+    calls_of,
+)
+from pipistrelle.detection.sounds.description import ARRAY_FILE as ARRAY
+from pipistrelle.detection.sounds.description import (
+    FILE,
+    Description,
+    RecordedArray,
+    recorded_array,
+)
 from pipistrelle.detection.sounds.sound_file import Sound, open_sound
-from pipistrelle.detection.sounds.tone_sums import Blocks, ToneSums, blocks_of
 from pipistrelle.detection.wideband import Wide
 from pipistrelle.refusals import refusal
+
+GROUP, FIRST_GAPS = 64, 8
+"""How many gaps are listened to at a time; and how many to find which parts are quiet."""
+STRETCHES, QUIET = 8, 3
+"""Into how many stretches a gap is parted, and how many count at most."""
+MIN_SUMS = 50
+"""Fewest block sums of a channel."""
+CHANCE = 5.0
+"""Channels whose levels differ by fewer standard deviations have one."""
+
+
+def set_noise(sums: ToneSums | CallOutputs, sound: Sound, calls: Calls, folder: Path) -> None:
+    """Measure noise and mean of each channel, and have the sums scaled to unit noise."""
+    last = calls.sample.size - 1
+    first, gaps = (
+        np.unique(np.linspace(0, last, most).round().astype(np.int64))
+        for most in (FIRST_GAPS, sums.gaps)
+    )
+    means, constant = [], np.ones(sound.channels, dtype=bool)
+    for samples in _gaps(sound, calls, first):
+        heard = samples[sums.blocks.blank :]
+        means.append(heard.mean(axis=0, dtype=np.float64))
+        constant &= (heard == heard[0]).all(axis=0)
+    sums.mean = np.mean(means, axis=0)
+    quiet = _quiet(_powers(sums, sound, calls, first, range(STRETCHES)))
+    groups = np.array_split(gaps, math.ceil(gaps.size / GROUP))
+    level, count = np.zeros(sums.gain.shape), 0
+    for group in groups:
+        power = np.concatenate(_powers(sums, sound, calls, group, quiet))
+        count += len(power)
+        if len(power):
+            middle = np.median(power, axis=0, overwrite_input=True)
+            level += middle.astype(np.float64) / math.log(2.0) / len(groups)
+    if count < MIN_SUMS * len(groups):
+        found = f"{count} blocks in the quietest part of the gaps between calls"
+        raise refusal(folder, found, f"{MIN_SUMS} or more", "record for longer")
+    silent = (level == 0.0) | constant[sums.channel][:, np.newaxis]
+    if silent.any():
+        f, _, e = (int(one[0]) for one in np.nonzero(silent))
+        where = f"{folder}, channel {sums.channel[f, e] + 1}"
+        raise refusal(where, "no noise at all", "a microphone", "take it out of array.csv")
+    sums.gain /= np.sqrt(_alike(level, count))
+
+
+def _gaps(
+    sound: Sound, calls: Calls, numbers: Int[np.ndarray, " g"]
+) -> Iterator[Float[np.ndarray, "t m"]]:
+    """Yield the samples of some gaps, from a call on."""
+    for k in numbers:
+        samples = sound.read(int(calls.sample[k]), int(calls.length[k]))
+        sound.refuse_odd(int(calls.sample[k]), samples)
+        yield samples
+
+
+def _powers(
+    sums: ToneSums | CallOutputs,
+    sound: Sound,
+    calls: Calls,
+    numbers: Int[np.ndarray, " g"],
+    stretches: Sequence[int],
+) -> list[Float[np.ndarray, "b f c e"]]:
+    """Return the powers in each of some stretches of some gaps."""
+    power: list[list[np.ndarray]] = [[] for _ in stretches]
+    for samples in _gaps(sound, calls, numbers):
+        heard = sums(samples)[:: sums.apart]
+        edges = np.linspace(0, len(heard), STRETCHES + 1).astype(np.int64)
+        for stretch, part in zip(stretches, power, strict=True):
+            some = heard[edges[stretch] : edges[stretch + 1]]
+            part.append((some.real**2 + some.imag**2).astype(np.float32))
+    return [np.concatenate(part) for part in power]
+
+
+def _quiet(power: Sequence[Float[np.ndarray, "b f c e"]]) -> list[int]:
+    """Return which stretches are as quiet as the quietest, but for chance: three at most."""
+    level = np.array([np.median(part) if part.size else np.inf for part in power])
+    order = level.argsort()[:QUIET]
+    count = power[int(order[0])].size
+    quiet = level[order] <= level.min() * (1.0 + 3.0 / math.sqrt(max(count, 1)))
+    return np.sort(order[quiet]).tolist()
+
+
+def _alike(power: Float[np.ndarray, "f c e"], count: int) -> Float[np.ndarray, "f c e"]:
+    """Return the mean over all, or by frequency over channels, where chance explains the rest."""
+    chance = CHANCE / (math.log(2.0) * math.sqrt(count))
+    for axes in ((0, 1, 2), (0, 2)):
+        mean = power.mean(axis=axes, keepdims=True)
+        if np.abs(power / mean - 1.0).max() < chance:
+            return np.broadcast_to(mean, power.shape)
+    return power
+
+
+GAPS, SAMPLES = 16, 8192
+"""Most gaps that are looked at, spread over the recording, and most samples of each."""
+LATEST = 2
+"""Most samples by which a copy is earlier or later."""
+ROUNDING = 1e-12
+"""Share of a channel's power that floating-point numbers may add."""
+
+
+def copied_channels(
+    sound: Sound, calls: Calls, blank: int, used: Int[np.ndarray, " m"]
+) -> Iterator[str]:
+    """Say which of the channels that are used (numbered from 0) are copies of others.
+
+    `blank`: samples from the beginning of a call to those that are looked at.
+    """
+    product, source, power, count = _sums(sound, calls, blank, used)
+    audible = (source > 0.0)[:, :, np.newaxis] & (power > 0.0)
+    scale = product / np.where(source > 0.0, source, 1.0)[:, :, np.newaxis]
+    explained = scale * product
+    chance = count * (1.0 + 5.0 * math.sqrt(2.0 / max(count, 1)))
+    limit = sound.quantum**2 / 12.0 * (1.0 + scale**2) * chance + ROUNDING * power
+    copied = audible & (power - explained <= limit) & (explained > limit)
+    for j in range(1, used.size):
+        if copied[:, :j, j].any():
+            late, i = np.argwhere(copied[:, :j, j])[0]
+            times, late = scale[late, i, j], int(late) - LATEST
+            words = f", times {times:.3g}" if abs(times - 1.0) > 1e-3 else ""
+            words += f", {abs(late)} samples {'late' if late > 0 else 'early'}" if late else ""
+            yield (
+                f"channel {used[j] + 1} is a copy of channel {used[i] + 1}{words}: of one "
+                "microphone two are made, and bearings are wrong; mend the route, or take one out "
+                "of array.csv"
+            )
+
+
+def _sums(
+    sound: Sound, calls: Calls, blank: int, used: Int[np.ndarray, " m"]
+) -> tuple[Float[np.ndarray, "d m m"], Float[np.ndarray, "d m"], Float[np.ndarray, " m"], int]:
+    """Return the sums of products of channels, the first so many samples earlier, and of squares.
+
+    And of how many samples they are.
+    """
+    lates = range(-LATEST, LATEST + 1)
+    product, count = np.zeros((len(lates), used.size, used.size)), 0
+    source, power = np.zeros((len(lates), used.size)), np.zeros(used.size)
+    last = calls.sample.size - 1
+    for k in np.unique(np.linspace(0, last, GAPS).round().astype(np.int64)):
+        first = int(calls.sample[k]) + blank
+        samples = sound.read(first, min(int(calls.length[k]) - blank, SAMPLES))
+        sound.refuse_odd(first, samples)
+        heard = samples[:, used].astype(np.float64)
+        if len(heard) <= 2 * LATEST:
+            continue
+        there = heard[LATEST : len(heard) - LATEST]
+        there = there - there.mean(axis=0)
+        for row, late in enumerate(lates):
+            before = heard[LATEST - late : len(heard) - LATEST - late]
+            before = before - before.mean(axis=0)
+            product[row] += before.T @ there
+            source[row] += (before**2).sum(axis=0)
+        power += (there**2).sum(axis=0)
+        count += len(there)
+    return product, source, power, count
+
 
 Progress = Callable[[str, int, int], None]
 """Called with a stage's name, the calls heard and their number."""

@@ -1,19 +1,171 @@
-"""Sound files, read in pieces by the package soundfile: a long recording is never in memory."""
+"""Sound files, read in pieces by the package soundfile: a long recording is never in memory.
+
+Headers of sound files: whether the bytes that they announce are there, and fit their fields.
+
+Libraries read a file that was cut as a shorter one. WAV (RIFF, RIFX, RF64), W64, AIFF and CAF are
+chunks of a name and a size, of which one holds the sound; AU has one header. FLAC and ALAC announce
+no size but a number of samples. They spend a bit or more on each sample that is not predicted
+exactly: a file of fewer bits than samples is mostly digital silence, or holds fewer than it says.
+"""
 
 import os
+import struct
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, BinaryIO, NamedTuple
 
 import numpy as np
 from jaxtyping import Float
 
 from pipistrelle.config import InputError
 from pipistrelle.detection.sounds.description import FILE, Description
-from pipistrelle.detection.sounds.sound_header import check_header, header_of
 from pipistrelle.files import check_ordinary
 from pipistrelle.refusals import refusal
+
+if TYPE_CHECKING:
+    from soundfile import SoundFile
+
+WIDTHS = {"PCM_S8": 1, "PCM_U8": 1, "ULAW": 1, "ALAW": 1, "PCM_16": 2, "PCM_24": 3, "PCM_32": 4,
+          "FLOAT": 4, "DOUBLE": 8}  # fmt: skip
+"""Bytes of a sample, where each has as many."""
+UNFILLED = (0, 0x7FFFF000, 0x7FFFFFFF, 0xFFFFFFFF)
+"""Sizes that programs write before they know the true one, which a pipe cannot take back."""
+UNTIL_THE_END = {b"caff": 2**64 - 1, b".snd": 0xFFFFFFFF}
+"""Sizes that mean all that follows."""
+MOST_CHUNKS = 10_000
+"""Most chunks that are looked at."""
+PACKED = ("FLAC", "ALAC_16", "ALAC_20", "ALAC_24", "ALAC_32")
+"""Formats and subtypes that pack samples without loss, by prediction and Rice's code."""
+
+
+class _Kind(NamedTuple):
+    """How a kind of file has its chunks."""
+
+    first: int
+    """Where the first begins [byte]."""
+    head: struct.Struct
+    """Name and size."""
+    own: int
+    """Bytes of the head that the size counts."""
+    even: int
+    """Chunks begin at multiples of it, but for `first`."""
+    data: bytes
+    """Name of the chunk that holds the sound."""
+
+
+_KINDS = {
+    b"RIFF": _Kind(12, struct.Struct("<4sI"), 0, 2, b"data"),
+    b"RF64": _Kind(12, struct.Struct("<4sI"), 0, 2, b"data"),
+    b"RIFX": _Kind(12, struct.Struct(">4sI"), 0, 2, b"data"),
+    b"FORM": _Kind(12, struct.Struct(">4sI"), 0, 2, b"SSND"),
+    b"caff": _Kind(8, struct.Struct(">4sQ"), 0, 1, b"data"),
+    b"riff": _Kind(
+        40, struct.Struct("<16sQ"), 24, 8, bytes.fromhex("64617461f3acd3118cd100c04f8edb8a")
+    ),
+}
+
+
+class _Announced(NamedTuple):
+    """What a header says of the sound."""
+
+    size: int
+    """Bytes of it."""
+    there: int
+    """Bytes from its beginning to the end of the file."""
+    rate: int | None = None
+    """Bytes a second, where that is said."""
+
+
+class Header(NamedTuple):
+    """The beginning of a file."""
+
+    magic: bytes
+    """Its first four bytes."""
+    length: int
+    """Of the file [bytes]."""
+    sound: _Announced | None
+    """None of a kind that does not say how many bytes its sound has."""
+
+
+def header_of(path: Path) -> Header:
+    """Read what a file's header announces."""
+    length = path.stat().st_size
+    with path.open("rb") as raw:
+        magic = raw.read(4)
+        return Header(magic, length, _announced(raw, magic, length))
+
+
+def check_header(path: Path, file: "SoundFile", header: Header) -> None:
+    """Refuse a file whose header announces other sound than is there."""
+    magic, length, said = header
+    if said is not None:
+        _check_size(path, file, said, magic)
+    if not 1 <= file.frames < 2**50:
+        found = "no samples, or a number of them that was never filled in, as in a pipe"
+        raise refusal(path, found, "a whole sound file", "convert it to WAV")
+    samples = file.frames * file.channels
+    if {file.format, file.subtype} & {*PACKED} and samples > 8 * length:
+        found = f"a header of {samples} samples in {length} bytes"
+        expected = "a bit or more for each: the noise of microphones takes several"
+        raise refusal(path, found, expected, "copy it again, or cut digital silence out")
+
+
+def _check_size(path: Path, file: "SoundFile", said: _Announced, magic: bytes) -> None:
+    """Refuse a size that was not filled in, that is not there, or that other fields contradict."""
+    if said.size in UNFILLED and said.size != said.there:
+        raise InputError(
+            f"{path}: found a header in which the size of its sound was never filled in "
+            f"({said.size:#x}), as where a recorder writes into a pipe, expected the size; fill it "
+            "in by 'sox --ignore-length OLD.wav NEW.wav' or 'ffmpeg -i OLD.wav -c copy NEW.wav'"
+        )
+    if said.size > said.there:
+        found = (
+            f"a header of {said.size} bytes of sound, of which {said.size - said.there} are missing"
+        )
+        raise refusal(path, found, "a whole sound file", "copy it again")
+    width = WIDTHS.get(file.subtype)
+    if width is None or magic not in (b"RIFF", b"RIFX", b"RF64", b"riff"):
+        return
+    block = file.channels * width
+    for found, expected, unit in (
+        (said.rate, block * file.samplerate, "bytes a second"),
+        (said.size // block, file.frames, "samples"),
+    ):
+        if found not in (None, expected):
+            raise refusal(path, f"a header of {found} {unit}", f"{expected} by its other fields",
+                          "mend its header, or convert it anew")  # fmt: skip
+
+
+def _announced(raw: BinaryIO, magic: bytes, length: int) -> _Announced | None:
+    """Return what a header says of the sound; None of a kind that says nothing, or has none."""
+    if magic == b".snd" and length >= 12:
+        begin, size = struct.unpack(">II", raw.read(8))
+        there = max(length - begin, 0)
+        return _Announced(there if size == UNTIL_THE_END[magic] else size, there)
+    if magic not in _KINDS:
+        return None
+    kind, rate, long = _KINDS[magic], None, None
+    at = kind.first
+    for _ in range(MOST_CHUNKS):
+        raw.seek(at)
+        head = raw.read(kind.head.size + 16)
+        if len(head) < kind.head.size:
+            return None
+        name, size = kind.head.unpack_from(head)
+        after = head[kind.head.size :]
+        if name == b"ds64" and len(after) == 16:
+            long = struct.unpack("<8xQ", after)[0]
+        if name[:4] == b"fmt " and len(after) == 16:
+            rate = struct.unpack(f"{kind.head.format[0]}8xI4x", after)[0]
+        if name == kind.data:
+            there = length - at - kind.head.size
+            size = long if size == 0xFFFFFFFF and long is not None else size - kind.own
+            return _Announced(there if size == UNTIL_THE_END.get(magic) else size, there, rate)
+        at += max(size - kind.own, 0) + kind.head.size
+        at += -at % kind.even
+    return None
+
 
 if TYPE_CHECKING:
     from soundfile import SoundFile

@@ -13,17 +13,53 @@ Of a caller that moves the places at the begin, in the middle and at the end of 
 looked for, which a parabola joins. A landmark that stands is told by its bearings alone, as the
 vehicle goes by, and its excess path then tells of the caller at each scan: velocity and
 acceleration can be observed, too.
+
+Callers that turn: where one is whose rows do not fit where it was expected to be.
+
+An estimator takes velocities for random walks; of a caller that turns at once it knows too late,
+and its rows, held against where it was expected, are of no landmark. So where few of them fit, the
+places about its direct call are tried: on the map its rows fit together at one place alone.
+
+Scans from before there was a map, labelled by the map that came of them.
+
+Excess paths say where landmarks are once their caller is on the map, and that it is from the scan
+after the one in which its range is stated. Until then a vehicle that only listens has no landmark,
+and one whose beam is narrow has few; but at the start the heading is known best, and what was heard
+there says how the map lies. So these rows are held against the map when that has settled. Before,
+map and vehicle are turned against each other as all rows fit best (`_turn`): their headings are
+off by more than bearings are. A bearing alone places no landmark: with it comes the range that the
+map has for it, stated so unsurely that little is said twice.
+
+**The turn.** With the mean bearing of all landmarks :math:`\beta = a^T x` of the variance
+:math:`a^T P a`, a turn by :math:`\delta` moves the mean to
+
+.. math:: x + \frac{P a}{a^T P a}\, \delta, \qquad
+          P - \frac{P a a^T P}{a^T P a}
+
+being the covariance of what is left.
 """
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import replace
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 
-from pipistrelle.estimation.data_association.memory import Caller, CallerPlace
+from pipistrelle.detection.scans import RANGE, RANGE_STD, UNLABELLED, Scan
+from pipistrelle.estimation.association import is_among
+from pipistrelle.estimation.beliefs import JointGaussian
+from pipistrelle.estimation.data_association.pairs import (
+    NOTHING,
+    UNPLACED,
+    Match,
+    PlainChances,
+    pair_costs,
+    pair_innovations,
+)
+from pipistrelle.estimation.data_association.rows import Caller, CallerPlace, EarlyScan, part_of
 from pipistrelle.estimation.data_association.tracks import TURN, Tracks, in_window
 from pipistrelle.geometry import wrap_angle
 from pipistrelle.jit import kernel, no_alloc
@@ -378,3 +414,139 @@ def _correct_headings(off: Float[np.ndarray, "t k"], turn: Float[np.ndarray, " k
             medians[k] = np.median(seen)
     for k in range(scans):
         turn[k] -= min(max(medians[k] - medians[scans - 1], -0.1), 0.1)
+
+
+FITTING_SHARE, LEAST_ROWS = 0.5, 6
+"""A caller may have turned if less than this share of its rows fits, of so many."""
+BETTER = 30.0
+"""By how much all rows together must fit better elsewhere."""
+LEAST_REACH, REACH, LEAST_RANGE = 4.0, 3.0, 0.5
+"""Ranges are tried that are off the expected one by so much [m], or by so many deviations of the
+place, and none nearer than the last [m]."""
+SHARES, TURN_BEARINGS = np.linspace(-1.0, 1.0, 21), np.linspace(-0.06, 0.06, 7)
+"""Parts of that, and bearings off the direct call [rad]."""
+
+Costs = Callable[[Float[np.ndarray, " d"]], Float[np.ndarray, "r n"]]
+"""Costs of rows and landmarks (`pairs.pair_costs`) by the joint mean."""
+
+
+def may_have_turned(fitting: int, rows: int) -> bool:
+    """Tell whether too few of a caller's rows fit where it was expected."""
+    return rows >= LEAST_ROWS and fitting < FITTING_SHARE * rows
+
+
+def turned(joint: JointGaussian, at: int, bearing: float, costs: Costs) -> JointGaussian:
+    """Return a joint Gaussian in which a caller is where its rows fit.
+
+    ``at``: where the caller stands in the mean; ``bearing``: of its direct call.
+    """
+    mean, spread = joint.mean, np.diag(joint.covariance)[at : at + 2].sum()
+    least, fitting = fit(costs(mean))
+    if not may_have_turned(int(fitting.sum()), fitting.size):
+        return joint
+    towards, least, best = mean[2] + bearing, least - BETTER, mean
+    expected = math.hypot(*(mean[at : at + 2] - mean[:2]))
+    reach = max(LEAST_REACH, REACH * math.sqrt(spread))
+    for far in np.maximum(expected + reach * SHARES, LEAST_RANGE):
+        for angle in towards + TURN_BEARINGS:
+            other = mean.copy()
+            other[at : at + 2] = seen_from(mean[:3], far, angle)
+            cost, _ = fit(costs(other))
+            if cost < least:
+                best, least = other, cost
+    return replace(joint, mean=best)
+
+
+def fit(costs: Float[np.ndarray, "r n"]) -> tuple[float, Bool[np.ndarray, " r"]]:
+    """Return what rows cost together, each as clutter at most, and which are none."""
+    least = costs.min(axis=1, initial=0.0)
+    return float(least.sum()), least < 0.0
+
+
+FEW = 3
+"""A scan is early if fewer landmarks are known at its end, and no caller was on the map before."""
+MOST, SETTLED = 16, 12
+"""How many early scans are remembered, and after how many more the map is taken to have settled."""
+TURNS = np.linspace(-3.5, 3.5, 141)
+"""Turns that are tried, in standard deviations."""
+SEPARATION, CLEARER = 0.04, 10.0
+"""All turns that are so far from the best [rad] must cost so much more."""
+RANGE_SHARE = 0.2
+"""Deviation of a range that is taken from the map, as a share of it."""
+
+
+def direct_row(direct: Int[np.ndarray, " c"], number: int) -> int:
+    """Return the row of a caller's direct call, or -1, of the rows of all direct calls."""
+    return int(direct[number]) if number < direct.size else -1
+
+
+def labelled_by_map(
+    early: EarlyScan,
+    joint: JointGaussian,
+    sure: Int[np.ndarray, " s"],
+    callers: Mapping[int, int],
+    match: Match,
+    chances: PlainChances,
+) -> Scan:
+    """Return an early scan, its callers' rows with labels by a map that is known now.
+
+    In place of the pose of ``joint`` comes that of the early scan, as if the errors of map and
+    pose had nothing in common. ``sure``: labels of landmarks that are some; ``callers``: where
+    callers stand in the mean, by number, or UNPLACED of those that were elsewhere.
+    """
+    mean, covariance = joint.mean.copy(), joint.covariance.copy()
+    mean[:3], covariance[:3], covariance[:, :3] = early.pose.mean, 0.0, 0.0
+    covariance[:3, :3] = early.pose.covariance
+    kept = np.flatnonzero(is_among(joint.landmark, sure))
+    there, names = 3 + 2 * kept, np.append(joint.landmark[kept], UNLABELLED)
+    label, numbers = np.full(early.scan.caller.size, UNLABELLED), early.scan.numbers.copy()
+    for number, place in callers.items():
+        direct = direct_row(early.direct, number)
+        at, rows = place if direct >= 0 else UNPLACED, early.rows
+        heard = rows.usable if at == UNPLACED else rows.with_way
+        used = np.flatnonzero(heard & (rows.caller == number))
+        used = used[used != direct]
+        found = _matched(part_of(rows, used, 0.0), (mean, covariance), there, at, match, chances)
+        label[used] = names[found]
+        if at == UNPLACED:
+            used, i = used[found != NOTHING], there[found[found != NOTHING]]
+            far = np.hypot(mean[i] - mean[0], mean[i + 1] - mean[1])
+            numbers[RANGE, used], numbers[RANGE_STD, used] = far, RANGE_SHARE * far
+    return replace(early.scan, landmark=label, numbers=numbers)
+
+
+def _matched(
+    rows: tuple[np.ndarray, ...],
+    gaussian: tuple[Float[np.ndarray, " d"], Float[np.ndarray, "d d"]],
+    there: Int[np.ndarray, " n"],
+    at: int,
+    match: Match,
+    chances: PlainChances,
+) -> Int[np.ndarray, " r"]:
+    """Return which landmark each row is of, NOTHING of all if they fit at more than one turn."""
+    (mean, _), (spread, variance, left) = gaussian, _turn(*gaussian, there)
+    turns = math.sqrt(variance) * TURNS
+    means = [mean + spread * (turn / variance) for turn in turns]
+    costs = [pair_costs(rows, turned, left, there, at, chances) for turned in means]
+    total = np.array([fit(cost)[0] for cost in costs]) + TURNS * TURNS
+    best = int(total.argmin())
+    others = total[np.abs(turns - turns[best]) > SEPARATION]
+    if others.min(initial=0.0) < total[best] + CLEARER:
+        return np.full(rows[0].size, NOTHING)
+    return match(costs[best], partial(pair_innovations, rows, means[best], left, there, at))
+
+
+def _turn(
+    mean: Float[np.ndarray, " d"],
+    covariance: Float[np.ndarray, "d d"],
+    there: Int[np.ndarray, " n"],
+) -> tuple[Float[np.ndarray, " d"], float, Float[np.ndarray, "d d"]]:
+    """Return P a, a^T P a, and the covariance without the turn."""
+    dx, dy = mean[there] - mean[0], mean[there + 1] - mean[1]
+    squared = there.size * (dx * dx + dy * dy)
+    slope = np.zeros(mean.size)
+    slope[there], slope[there + 1] = -dy / squared, dx / squared
+    slope[:3] = -slope[there].sum(), -slope[there + 1].sum(), -1.0
+    spread = covariance @ slope
+    variance = float(slope @ spread)
+    return spread, variance, covariance - np.outer(spread, spread) / variance

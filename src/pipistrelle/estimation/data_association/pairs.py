@@ -15,9 +15,41 @@ A pair of a cost below 0 is likelier than clutter. After a long way among other 
 landmark may be so unsure of each other that a row of the vehicle's own call tells nothing of the
 pair, however well it fits (`Chances.vague`): such a row is of something new, until it is seen to be
 one with what is known (`doubles`).
+
+Joint compatibility: the largest set of pairs of rows and landmarks that fits as a whole.
+
+All rows of a scan share the error of the pose, so pairs that are each within the gate may
+contradict each other. Of a set of pairs with the joint innovation :math:`\nu` and its covariance
+S = L L^T
+
+.. math:: d^2 = |y|^2, \qquad L y = \nu,
+
+and the set is compatible while :math:`d^2` is within the quantile of :math:`\chi^2` for its
+numbers. A pair more adds two rows to L and two numbers to y. The search goes row by row, each row's
+likeliest landmark first and no landmark last. It leaves a branch that cannot have more pairs than
+the best set so far, or as many that fit better, and it ends after `MOST_NODES`: then the best set
+so far is taken.
+
+Neira & Tardos, IEEE Transactions on Robotics and Automation 17 (2001).
+
+From costs of pairs to decisions: which row is of which landmark.
+
+`nearest` takes the assignment that costs least, each landmark once. `marginal` takes what is sure
+over all assignments: the probability that a row is of a landmark, by message passing. With
+:math:`w_{ij} = e^{-c_{ij} / 2}` messages between rows i and landmarks j are
+
+.. math:: \mu_{ij} = \frac{w_{ij}}{1 + \sum_{k \ne j} w_{ik} \nu_{ki}}, \qquad
+          \nu_{ji} = \frac{1}{1 + \sum_{k \ne i} \mu_{kj}}
+
+until they stay, and the probability is
+:math:`w_{ij} \nu_{ji} / (1 + \sum_k w_{ik} \nu_{ki})`.
+
+Williams & Lau, IEEE Transactions on Aerospace and Electronic Systems 50 (2014).
 """
 
 import math
+from collections.abc import Callable
+from functools import cache
 from typing import NamedTuple
 
 import numpy as np
@@ -27,6 +59,270 @@ from pipistrelle.estimation.beliefs import JointGaussian
 from pipistrelle.estimation.measurement import excess_path_slopes, observe
 from pipistrelle.geometry import wrap_angle
 from pipistrelle.jit import Whole, kernel, no_alloc
+
+NOTHING = -1
+"""A row of no landmark."""
+Innovations = tuple[Float[np.ndarray, " e"], Float[np.ndarray, "e e"], Int[np.ndarray, " p"]]
+"""Of pairs, two numbers each: their innovation, its covariance, and how many of the two count."""
+Innovate = Callable[[tuple[Int[np.ndarray, " p"], Int[np.ndarray, " p"]]], Innovations]
+"""From rows and landmarks of pairs to their innovations together (`pairs.pair_innovations`)."""
+Match = Callable[[Float[np.ndarray, "m n"], Innovate | None], Int[np.ndarray, " m"]]
+"""From costs of rows and landmarks to the landmark of each row, or NOTHING."""
+LIKELY, SURE = 0.9, 0.99
+"""Probabilities from which on a row is taken to be of a landmark, and, if it is, of which."""
+MESSAGES, STAY = 50, 1e-6
+"""How often messages are passed, at most, and by how much they may still change."""
+LARGEST = 30.0
+"""Largest logarithm of a weight: beyond it a pair is as sure, and sums would lose digits."""
+FARTHEST = 1e6
+"""In place of an infinite cost."""
+
+
+def nearest(
+    costs: Float[np.ndarray, "m n"], innovate: Innovate | None = None
+) -> Int[np.ndarray, " m"]:
+    """Return the landmark of each row by the assignment that costs least, or NOTHING.
+
+    ``innovate``: what all methods are given, and only joint compatibility needs.
+
+    >>> nearest(np.array([[-5.0, -4.0], [-4.5, np.inf], [3.0, np.inf]]))
+    array([ 1,  0, -1])
+    """
+    from scipy.optimize import linear_sum_assignment  # a quarter of a second, if not needed
+
+    rows, landmarks = costs.shape
+    bare = np.full((rows, rows), FARTHEST)
+    np.fill_diagonal(bare, 0.0)
+    taken, chosen = linear_sum_assignment(np.hstack([np.minimum(costs, FARTHEST), bare]))
+    found = np.full(rows, NOTHING)
+    found[taken] = np.where(chosen < landmarks, chosen, NOTHING)
+    return found
+
+
+def marginal(
+    costs: Float[np.ndarray, "m n"], innovate: Innovate | None = None
+) -> Int[np.ndarray, " m"]:
+    """Return the landmark of each row where that is sure, or NOTHING.
+
+    Here the first row is of either (`LIKELY`), but neither is sure (`SURE`).
+
+    >>> marginal(np.array([[-9.0, -9.0], [np.inf, np.inf]]))
+    array([-1, -1])
+    >>> marginal(np.array([[-9.0, -9.0], [np.inf, -20.0]]))
+    array([0, 1])
+    """
+    return _what_is_sure(costs)
+
+
+@kernel
+def _what_is_sure(costs: Float[np.ndarray, "m n"]) -> Int[np.ndarray, " m"]:
+    """Return the landmark of each row where that is sure, or NOTHING."""
+    rows, landmarks, shares = _shares(costs)
+    found, first = np.full(costs.shape[0], NOTHING), 0
+    while first < rows.size:
+        last, best, of_any = first, first, 0.0
+        while last < rows.size and rows[last] == rows[first]:
+            of_any += shares[last]
+            if shares[last] > shares[best]:
+                best = last
+            last += 1
+        if of_any > LIKELY and shares[best] >= SURE * of_any:
+            found[rows[first]] = landmarks[best]
+        first = last
+    return found
+
+
+@kernel
+def probabilities(costs: Float[np.ndarray, "m n"]) -> Float[np.ndarray, "m n"]:
+    """Return the probability of each pair, of clutter what is left to 1.
+
+    >>> probabilities(np.array([[0.0]]))
+    array([[0.5]])
+    """
+    (rows, landmarks, values), shares = _shares(costs), np.zeros(costs.shape)
+    for p in range(rows.size):
+        shares[rows[p], landmarks[p]] = values[p]
+    return shares
+
+
+@kernel
+def _shares(
+    costs: Float[np.ndarray, "m n"],
+) -> tuple[Int[np.ndarray, " p"], Int[np.ndarray, " p"], Float[np.ndarray, " p"]]:
+    """Return the pairs that are within the gate, row by row, and the probability of each."""
+    (m, n), (rows, landmarks) = costs.shape, np.nonzero(costs < np.inf)
+    size, beyond = rows.size, np.full(n, m)
+    weight, to_row, to_landmark = np.empty(size), np.ones(size), np.empty(size)
+    for p in range(size):
+        weight[p] = math.exp(min(-0.5 * costs[rows[p], landmarks[p]], LARGEST))
+        beyond[landmarks[p]] -= 1
+    sums, total, to_others = np.empty(m), np.empty(n), np.ones(n)
+    for _ in range(MESSAGES):
+        moved = 0.0
+        _sum_up(sums, rows, weight, to_row)
+        total[:] = 1.0
+        for p in range(size):
+            others = max(sums[rows[p]] - weight[p] * to_row[p], 1.0)
+            to_landmark[p] = weight[p] / others
+            total[landmarks[p]] += to_landmark[p]
+        for p in range(size):
+            message = 1.0 / max(total[landmarks[p]] - to_landmark[p], 1.0)
+            moved = max(moved, abs(message - to_row[p]))
+            to_row[p] = message
+        for j in range(n):
+            if beyond[j] > 0:  # rows of which this landmark is beyond the gate
+                moved = max(moved, abs(1.0 / total[j] - to_others[j]))
+                to_others[j] = 1.0 / total[j]
+        if moved < STAY:
+            break
+    _sum_up(sums, rows, weight, to_row)
+    return rows, landmarks, weight * to_row / sums[rows]
+
+
+@kernel
+def _sum_up(
+    sums: Float[np.ndarray, " m"],
+    rows: Int[np.ndarray, " p"],
+    weight: Float[np.ndarray, " p"],
+    to_row: Float[np.ndarray, " p"],
+) -> None:
+    """Write one and the weighted messages to each row."""
+    sums[:] = 1.0
+    for p in range(rows.size):
+        sums[rows[p]] += weight[p] * to_row[p]
+
+
+CONFIDENCE = 0.999
+"""Share of right sets that are within the gate."""
+MOST_NODES, MOST_ROWS = 3000, 100
+"""How many pairs are tried at most, and how many rows are tested together: the work grows with the
+cube of their number. Of each row only so many landmarks take part as can be tried."""
+
+
+@cache
+def gates(numbers: int) -> Float[np.ndarray, " g"]:
+    """Return the largest squared distance of 0, 1, ... numbers.
+
+    >>> gates(2).round(2)
+    array([ 0.  , 10.83, 13.82])
+    """
+    from scipy.special import gammaincinv
+
+    return 2.0 * gammaincinv(np.maximum(np.arange(numbers + 1), 1e-9) / 2.0, CONFIDENCE)
+
+
+def jointly_compatible(
+    costs: Float[np.ndarray, "m n"], innovate: Innovate | None
+) -> Int[np.ndarray, " m"]:
+    """Return the landmark of each row by the largest compatible set of pairs, or NOTHING.
+
+    Pairs that are likelier than clutter take part.
+    """
+    found = np.full(len(costs), NOTHING)
+    row, landmark = np.nonzero(costs < 0.0)
+    if not row.size or innovate is None:
+        return found
+    order = np.lexsort((costs[row, landmark], row))
+    row, landmark = row[order], landmark[order]
+    rows, begins, counts = np.unique(row, return_index=True, return_counts=True)
+    likely = np.arange(row.size) - np.repeat(begins, counts) < MOST_NODES // min(
+        rows.size, MOST_ROWS
+    )
+    row, landmark = row[likely], landmark[likely]
+    for first in range(0, rows.size, MOST_ROWS):
+        part = (row >= rows[first]) & (row <= rows[first : first + MOST_ROWS][-1])
+        part &= ~np.isin(landmark, found)  # what rows before have taken
+        _match_together(found, row[part], landmark[part], innovate)
+    return found
+
+
+def _match_together(
+    found: Int[np.ndarray, " m"],
+    row: Int[np.ndarray, " p"],
+    landmark: Int[np.ndarray, " p"],
+    innovate: Innovate,
+) -> None:
+    """Write the landmarks of rows by the largest compatible set of some pairs, row by row."""
+    options = np.append(np.flatnonzero(np.diff(row, prepend=-1)), row.size)
+    pairs = _search(options, landmark, innovate((row, landmark)), gates(2 * (options.size - 1)))
+    found[row[pairs]] = landmark[pairs]
+
+
+@kernel
+def _search(
+    options: Int[np.ndarray, " o"],
+    landmark: Int[np.ndarray, " p"],
+    innovations: Innovations,
+    gate: Float[np.ndarray, " g"],
+) -> Int[np.ndarray, " c"]:
+    """Return the pairs of the largest compatible set; options: where each row's pairs begin."""
+    levels, numbers = options.size - 1, innovations[2]
+    L, y = np.zeros((2 * levels, 2 * levels)), np.zeros(2 * levels)
+    chosen, best = np.empty(levels, np.int64), np.empty(levels, np.int64)
+    count, used, squared = (
+        np.zeros(levels + 1, np.int64), np.zeros(levels + 1, np.int64), np.zeros(levels + 1)
+    )  # fmt: skip
+    following, level, most, least, nodes = options.copy(), 0, 0, math.inf, 0
+    while level >= 0:
+        k, option = count[level], following[level]
+        if level == levels or option > options[level + 1] or nodes >= MOST_NODES:
+            if level == levels and (k > most or (k == most and squared[level] < least)):
+                most, least = k, squared[level]
+                best[:k] = chosen[:k]
+            level -= 1
+            continue
+        following[level] += 1
+        here = level + 1
+        count[here], used[here], squared[here] = k, used[level], squared[level]
+        if option < options[here]:
+            nodes += 1
+            if _is_taken(landmark, chosen, k, option):
+                continue
+            chosen[k] = option
+            squared[here] += _extended(L, y, chosen, k, innovations)
+            count[here], used[here] = k + 1, used[level] + numbers[option]
+            if squared[here] > gate[used[here]]:
+                continue
+        hoped = count[here] + levels - here
+        if hoped > most or (hoped == most and squared[here] < least):
+            level = here
+            following[level] = options[level]
+    return best[:most].copy()
+
+
+@no_alloc
+def _is_taken(
+    landmark: Int[np.ndarray, " p"], chosen: Int[np.ndarray, " c"], k: Whole, option: Whole
+) -> bool:
+    """Tell whether one of the first k chosen pairs has the landmark of a pair."""
+    taken = False
+    for n in range(k):
+        taken |= landmark[chosen[n]] == landmark[option]
+    return taken
+
+
+@no_alloc
+def _extended(
+    L: Float[np.ndarray, "d d"],
+    y: Float[np.ndarray, " d"],
+    chosen: Int[np.ndarray, " c"],
+    k: Whole,
+    innovations: Innovations,
+) -> float:
+    """Write the rows of the k-th chosen pair; return by how much the squared distance grows."""
+    nu, S, _ = innovations
+    for a in (2 * k, 2 * k + 1):
+        whole = 2 * chosen[k] + a - 2 * k
+        rest = nu[whole]
+        for b in range(a + 1):
+            value = S[whole, 2 * chosen[b // 2] + b % 2]
+            for c in range(b):
+                value -= L[a, c] * L[b, c]
+            L[a, b] = math.sqrt(max(value, 1e-300)) if b == a else value / L[b, b]
+            if b < a:
+                rest -= L[a, b] * y[b]
+        y[a] = rest / L[a, a]
+    return y[2 * k] ** 2 + y[2 * k + 1] ** 2
 
 
 class Rows(NamedTuple):

@@ -10,16 +10,19 @@ none is removed, and its rows are taken back; what turns out to be on the map tw
 A caller is known by its direct call, and its place is found by the excess paths themselves
 (`caller_search`). Until then its rows are followed, and not used; then the session hears again all
 that it remembers. What came before there was a map is labelled by the map (`early_scans`).
+
+The methods of association by name.
 """
 
 import math
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 from functools import partial
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from pipistrelle.config import Config, InputError
 from pipistrelle.detection.scans import (
     OWN,
     RANGE,
@@ -28,38 +31,50 @@ from pipistrelle.detection.scans import (
     Scan,
     with_callers,
 )
-from pipistrelle.estimation.association import Assignment, is_among
+from pipistrelle.estimation.association import KNOWN, Assignment, Association, is_among
 from pipistrelle.estimation.beliefs import Belief, Gaussian, JointGaussian, Landmarks
-from pipistrelle.estimation.data_association.caller_search import searched
-from pipistrelle.estimation.data_association.doubles import asked_of, doubles
-from pipistrelle.estimation.data_association.early_scans import (
+from pipistrelle.estimation.catalogue import ASSOCIATION, build, class_of, names_class
+from pipistrelle.estimation.data_association.caller_search import (
     FEW,
     MOST,
     SETTLED,
     direct_row,
     labelled_by_map,
+    may_have_turned,
+    searched,
+    turned,
 )
 from pipistrelle.estimation.data_association.existence import (
     GONE,
     Known,
+    asked_of,
+    doubles,
     judged,
     merged,
     some,
     with_new,
 )
-from pipistrelle.estimation.data_association.matching import Match
-from pipistrelle.estimation.data_association.memory import Caller, CallerPlace, EarlyScan, Memory
 from pipistrelle.estimation.data_association.pairs import (
+    BARELY,
     OWN_CALL,
     UNPLACED,
+    Chances,
+    Match,
     PlainChances,
     Rows,
+    jointly_compatible,
+    marginal,
+    nearest,
     pair_costs,
     pair_innovations,
     with_points,
 )
 from pipistrelle.estimation.data_association.rows import (
+    Caller,
+    CallerPlace,
+    EarlyScan,
     Joint,
+    Memory,
     bearing_fits,
     compared,
     part_of,
@@ -69,7 +84,6 @@ from pipistrelle.estimation.data_association.rows import (
     settled,
 )
 from pipistrelle.estimation.data_association.tracks import Tracks, followed
-from pipistrelle.estimation.data_association.turns import may_have_turned, turned
 
 PLACE_SHARE, MOVING_SHARE = 0.12, 0.2
 """Deviation of the range at which a caller that stands was found, and one that moves, as a share of
@@ -111,7 +125,7 @@ class Sequential:
     >>> from pipistrelle.detection.scans import make_scan
     >>> from pipistrelle.estimation.beliefs import Gaussian
     >>> from pipistrelle.estimation.catalogue import entry
-    >>> from pipistrelle.estimation.data_association.matching import nearest
+    >>> from pipistrelle.estimation.data_association.pairs import nearest
     >>> from pipistrelle.estimation.motion import Motion
     >>> from pipistrelle.estimation.session import Session
     >>> motion = Motion(model="unicycle", control_std=(0.1, 0.1))
@@ -441,3 +455,73 @@ class _Work:
                 lost += [caller.label, *known.label[alone].tolist()]
                 del self.callers[number]
         return lost
+
+
+METHODS = {"nearest": nearest, "joint": jointly_compatible, "marginal": marginal}
+"""How rows of a scan are matched with landmarks, by ``association.method``."""
+GATE = 25.0
+"""Largest squared distance of a row from its landmark: 0.5 to 1 % of right rows are beyond."""
+
+VAGUE = 0.0012
+"""The clutter that a pair may cover: `Chances.vague` times the clutter per radian and metre."""
+
+
+def left_out(config: Config, scans: Iterable[Scan]) -> dict[str, Float[np.ndarray, " n"]]:
+    """Return the deviations of rows that an association leaves out as too unsure.
+
+    By the setting that decides it, ``bearing_std`` [rad] or ``way_std`` [m]; no entry where no row
+    is left out. `scans` have the deviations that the estimator is given where none is stated.
+    """
+    if config.association.method not in METHODS:
+        return {}
+    settings, found = config.association, {"bearing_std": [], "way_std": []}
+    for scan in scans:
+        for name, limits in (
+            ("bearing_std", (settings.bearing_std, math.inf, math.inf)),
+            ("way_std", (math.inf, settings.way_std, math.inf)),
+        ):
+            rows = rows_of_scan(scan, limits, _assumed(config))
+            found[name].append(getattr(rows, name)[~rows.usable])
+    joined = {name: np.concatenate([np.empty(0), *parts]) for name, parts in found.items()}
+    return {name: stds for name, stds in joined.items() if stds.size}
+
+
+def _assumed(config: Config) -> tuple[float, float, float]:
+    """Return the deviations that are assumed of rows which state none."""
+    told = config.filter
+    return told.bearing_std, told.range_std, told.excess_path_std
+
+
+def association_of(config: Config) -> Association | None:
+    """Return the association that ``association.method`` names; None for known labels.
+
+    A class from outside, ``module:Class``, is built by its ``from_config(config)`` where it has
+    one; else it is a dataclass, and may have a field ``config``, all settings.
+
+    It raises InputError for a class that is not there, is no `Association` or cannot be built.
+    """
+    name, settings = config.association.method, config.association
+    if name == KNOWN:
+        return None
+    if name in METHODS:
+        told, vague = config.filter, VAGUE / settings.clutter
+        if told.noise == "constant":  # the estimator knows no more of what was heard once
+            vague = max(vague, BARELY * told.bearing_std * told.range_std)
+        chances = Chances(
+            gate=GATE,
+            clutter=settings.clutter,
+            bearing_clutter=20.0 * settings.clutter,
+            detection=settings.detection,
+            vague=vague,
+        )
+        limits = Limits(
+            bearing_std=settings.bearing_std,
+            way_std=settings.way_std,
+            assumed=_assumed(config),
+            sight=(settings.max_range or 0.0, settings.field_of_view),
+        )
+        return Sequential(match=METHODS[name], chances=tuple(chances), limits=limits)
+    if not names_class(name):
+        expected = ", ".join(map(repr, [KNOWN, *METHODS]))
+        raise InputError(f"association.method: found {name!r}, expected {expected} or module:Class")
+    return build(ASSOCIATION, name, class_of(ASSOCIATION, name), (config,), {"config": config})

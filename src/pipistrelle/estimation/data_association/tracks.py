@@ -10,8 +10,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from jaxtyping import Float
 
-from pipistrelle.estimation.data_association.matching import NOTHING, nearest
-from pipistrelle.estimation.data_association.pairs import Rows
+from pipistrelle.estimation.data_association.pairs import NOTHING, Rows, nearest
 from pipistrelle.geometry import wrap
 
 SIGHTINGS = 3

@@ -21,14 +21,57 @@ the vehicle, along and across the line of sight. To second order its bearing is 
 :math:`-P_{ac}/r^2`, with the additional variance :math:`(P_{aa} P_{cc} + P_{ac}^2)/r^4`
 (Bar-Shalom, Li & Kirubarajan 2001, Sec. 10.3.2). A precise bearing is corrected by the first, and
 its R is increased by the second.
+
+The members of one landmark: their place in the state, and arrays to work on them.
 """
 
 import math
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
 
 from pipistrelle.estimation.ekf.gaussian import Joint, State, flush, initialise, relative_covariance
 from pipistrelle.estimation.measurement import NEAREST, Row, observe
 from pipistrelle.estimation.rays import FITTED, UpdateParams
-from pipistrelle.jit import Whole, no_alloc
+from pipistrelle.jit import Whole, kernel, no_alloc
+
+
+class Scratch(NamedTuple):
+    """Arrays to work on the members of one landmark, and on the order of the state's numbers."""
+
+    likelihood: Float[np.ndarray, " m"]
+    share: Float[np.ndarray, " m"]
+    keep: Bool[np.ndarray, " m"]
+    source: Int[np.ndarray, " n"]
+    innovations: Float[np.ndarray, "2"]  # adds up the two numbers of `beliefs.Innovations`
+
+
+@kernel
+def scratch_for(members: Whole) -> Scratch:
+    """Allocate arrays for so many members."""
+    return Scratch(
+        np.empty(members),
+        np.empty(members),
+        np.empty(members, np.bool_),
+        np.empty(3 + 2 * members, np.int64),
+        np.zeros(2),
+    )
+
+
+@no_alloc
+def members_of(
+    landmark: Int[np.ndarray, " h"], members: Whole, label: Whole
+) -> tuple[Whole, Whole]:
+    """Return the index of a landmark's first member, and how many it has (0: not in the map)."""
+    for first in range(members):
+        if landmark[first] == label:
+            last = first + 1
+            while last < members and landmark[last] == label:
+                last += 1
+            return first, last - first
+    return members, 0
+
 
 WAITING_WEIGHT = -1.0
 """Weight of the two points of a bearing that waits."""

@@ -9,16 +9,53 @@ The state is the pose and, two numbers each, the members of all landmarks,
 (Eq. (8); the correspondence is constant and known, and no part of it). `correction` corrects it
 with a scan. A moving caller has its velocity there, too (`caller_motion`). The covariance is that
 of the linear or of the right-invariant error (`invariant_error`).
+
+Landmarks that are taken out of an EKF's state, and two that become one.
+
+Two placed landmarks that are one are a measurement: their difference :math:`d = l_k - l_g` is 0, up
+to `MERGED_STD`. With :math:`H = (\dots, I, \dots, -I, \dots)` and S = H P H^T + R = L L^T,
+
+.. math:: W = P H^T L^{-T}, \qquad \hat X \leftarrow \hat X - W L^{-1} d, \qquad
+          P \leftarrow P - W W^T ,
+
+and then the second is dropped. The invariant error has the same H: that d is 0 is true of the map
+however it is turned, so it says nothing of the heading, and the mean moves by the exponential.
+Where d is beyond what S admits (`FARTHEST`), wrong rows have placed one of the two: their
+difference then tells nothing of the rest, and the second is dropped alone.
+
+Right-invariant EKF-SLAM: EKF-SLAM that keeps another error (`ekf.invariant_error`).
+
+Callers that move, in the state of an EKF: a place, or a ray of them, and a velocity.
+
+How a caller drives is not known. Its velocity is taken for a random walk of spectral density
+:math:`q = \sigma^2`, along each axis alike: in a time T
+
+.. math:: \begin{bmatrix} b \\ v \end{bmatrix} \leftarrow
+          \begin{bmatrix} I & T I \\ 0 & I \end{bmatrix}
+          \begin{bmatrix} b \\ v \end{bmatrix} + w, \qquad
+          \operatorname{cov} w = q \begin{bmatrix} \tfrac13 T^3 I & \tfrac12 T^2 I \\
+          \tfrac12 T^2 I & T I \end{bmatrix}
+
+(Bar-Shalom, Li & Kirubarajan 2001, Sec. 6.2.2: white noise acceleration). The velocity stands in
+the state as two numbers more, like a point, under a label of its own (`velocity_of`); all members
+of a caller's ray have it in common. It is never measured: what is heard of the caller's place
+tells it. So it begins as nothing but its spread.
+
+The right-invariant error treats it as it treats a point, and means the same: of
+:math:`v = R(\xi_\theta)\,\hat v + V(\xi_\theta)\,\xi_v` and the like for b follows
+:math:`\xi_b \leftarrow \xi_b + T \xi_v`, whatever the heading, and noise that is alike along both
+axes stays so when it is turned. Both EKFs share what is here.
 """
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from pipistrelle.config import RayConfig
-from pipistrelle.detection.scans import Scan
+from pipistrelle.config import InputError, RayConfig
+from pipistrelle.detection.scans import UNLABELLED, Scan
 from pipistrelle.estimation import recovery
 from pipistrelle.estimation.beliefs import (
     NO_INNOVATIONS,
@@ -35,17 +72,9 @@ from pipistrelle.estimation.checking import (
     usable_pose,
     usable_scan,
 )
-from pipistrelle.estimation.ekf.caller_motion import (
-    has_velocities,
-    is_standing,
-    is_velocity,
-    missing_velocities,
-    propagate_callers,
-)
 from pipistrelle.estimation.ekf.correction import corrected
 from pipistrelle.estimation.ekf.delayed_initialization import WAITING_WEIGHT
-from pipistrelle.estimation.ekf.editing import is_placed, merged, removed
-from pipistrelle.estimation.ekf.gaussian import INVARIANT, LINEAR, propagate
+from pipistrelle.estimation.ekf.gaussian import INVARIANT, LINEAR, propagate, retract
 from pipistrelle.estimation.ekf.invariant_error import (
     linear_part,
     propagate_invariant,
@@ -55,6 +84,205 @@ from pipistrelle.estimation.ekf.invariant_error import (
 from pipistrelle.estimation.measurement import columns_of, timings_of
 from pipistrelle.estimation.motion import Motion, motion_numbers
 from pipistrelle.estimation.rays import update_params
+from pipistrelle.jit import Flag, Whole, kernel
+
+_NOBODY, _SUM = UNLABELLED, UNLABELLED - 1
+"""Labels are from 0 on; those of a caller and of its velocity add up to ``_SUM``."""
+
+
+@kernel
+def velocity_of(label: Whole) -> Whole:
+    """Label of the velocity of a caller; of a velocity's label, the caller's.
+
+    >>> velocity_of(51), velocity_of(velocity_of(51))
+    (-53, 51)
+    """
+    return _SUM - label
+
+
+def is_velocity(landmark: Int[np.ndarray, " h"]) -> Bool[np.ndarray, " h"]:
+    """Return a mask of the rows of a state that are velocities, not places."""
+    return landmark < _NOBODY
+
+
+@kernel
+def has_velocities(landmark: Int[np.ndarray, " h"]) -> Flag:
+    """Tell whether any row of a state is a velocity."""
+    least = 0
+    for label in landmark:
+        least = min(least, label)
+    return least < _NOBODY
+
+
+def is_standing(landmark: Int[np.ndarray, " h"]) -> Bool[np.ndarray, " h"]:
+    """Return a mask of the rows that are neither callers that move nor their velocities.
+
+    >>> is_standing(np.array([4, 51, -53]))
+    array([ True, False, False])
+    """
+    velocity = is_velocity(landmark)
+    if not velocity.any():
+        return ~velocity
+    return ~velocity & ~np.isin(landmark, _SUM - landmark[velocity])
+
+
+def missing_velocities(
+    landmark: Int[np.ndarray, " h"], moving: Int[np.ndarray, " v"]
+) -> Int[np.ndarray, " n"]:
+    """Return the labels of the velocities that the moving callers of a state still lack.
+
+    >>> missing_velocities(np.array([51, 52, -53]), np.array([52]))
+    array([-54])
+    """
+    velocity = _SUM - moving
+    return velocity[np.isin(moving, landmark) & ~np.isin(velocity, landmark)]
+
+
+@kernel
+def propagate_callers(
+    mean: Float[np.ndarray, " d"],
+    covariance: Float[np.ndarray, "d room"],
+    landmark: Int[np.ndarray, " h"],
+    seconds: float,
+    walk_std: float,
+) -> None:
+    """Move all callers through a time [s], in place; ``walk_std``: of a velocity after 1 s."""
+    q, size = walk_std * walk_std, mean.size
+    for velocity in range(landmark.size):
+        if landmark[velocity] >= _NOBODY:
+            continue
+        label, iv = velocity_of(landmark[velocity]), 3 + 2 * velocity
+        members = np.flatnonzero(landmark == label)
+        for member in members:
+            i = 3 + 2 * member
+            for axis in range(2):
+                mean[i + axis] += seconds * mean[iv + axis]
+                for b in range(size):
+                    covariance[i + axis, b] += seconds * covariance[iv + axis, b]
+        for member in members:
+            i = 3 + 2 * member
+            for axis in range(2):
+                for b in range(size):
+                    covariance[b, i + axis] += seconds * covariance[b, iv + axis]
+        for axis in range(2):
+            covariance[iv + axis, iv + axis] += q * seconds
+            for member in members:
+                i = 3 + 2 * member + axis
+                covariance[i, iv + axis] += 0.5 * q * seconds**2
+                covariance[iv + axis, i] = covariance[i, iv + axis]
+                for other in members:
+                    covariance[i, 3 + 2 * other + axis] += q * seconds**3 / 3.0
+
+
+MERGED_STD = 1e-3
+"""Standard deviation of the difference of two landmarks that are one, along each axis [m]."""
+FARTHEST = 100.0
+"""Largest squared distance of two that are one to be a measurement."""
+
+State = tuple[
+    Float[np.ndarray, " d"],
+    Float[np.ndarray, "d d"],
+    Int[np.ndarray, " h"],
+    Float[np.ndarray, " h"],
+]
+"""Mean, covariance, and of each member its landmark's label and its weight, as `EkfBelief` has
+them."""
+
+
+@kernel
+def is_placed(landmark: Int[np.ndarray, " h"]) -> Bool[np.ndarray, " h"]:
+    """Return a mask of the members that are a landmark's or a caller's only one.
+
+    >>> is_placed(np.array([4, 7, 7, 51, -53]))
+    array([ True, False, False,  True, False])
+    """
+    placed = landmark >= 0
+    for n in range(1, landmark.size):
+        if landmark[n] == landmark[n - 1]:  # the members of a landmark are neighbours
+            placed[n - 1] = placed[n] = False
+    return placed
+
+
+def removed(state: State, label: int) -> State:
+    """Return a state without the members of a landmark, and without its velocity if it moves."""
+    return _left(*state, _present(state[2], label))
+
+
+@kernel
+def _left(
+    mean: Float[np.ndarray, " d"],
+    covariance: Float[np.ndarray, "d d"],
+    landmark: Int[np.ndarray, " h"],
+    weight: Float[np.ndarray, " h"],
+    label: Whole,
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Return what is left of a state without a landmark."""
+    kept = np.flatnonzero((landmark != label) & (landmark != velocity_of(label)))
+    left, P = np.empty(3 + 2 * kept.size), np.empty((3 + 2 * kept.size, 3 + 2 * kept.size))
+    at = np.arange(left.size)
+    for n in range(kept.size):
+        at[3 + 2 * n], at[4 + 2 * n] = 3 + 2 * kept[n], 4 + 2 * kept[n]
+    for i in range(at.size):
+        left[i] = mean[at[i]]
+        for j in range(at.size):
+            P[i, j] = covariance[at[i], at[j]]
+    return left, P, landmark[kept], weight[kept]
+
+
+def merged(state: State, kept: int, gone: int, error: float) -> State:
+    """Return a state in which two landmarks that stand are one, under the label of the first.
+
+    Of a placed one and a ray the placed one stays, of two rays the first. `error`: as in
+    `EkfBelief`.
+    """
+    landmark = state[2]
+    standing = is_standing(landmark)
+    first, second = (landmark == _present(landmark, label) for label in (kept, gone))
+    if kept == gone or not standing[first | second].all():
+        raise InputError(
+            f"association: found the landmarks {kept} and {gone} to merge; expected two that stand"
+        )
+    placed = is_placed(landmark)
+    if placed[first].all() and placed[second].all():
+        k, g = 3 + 2 * int(first.argmax()), 3 + 2 * int(second.argmax())
+        state = *_equated(*state[:2], k, g, error), *state[2:]
+    elif placed[second].all():
+        mean, covariance, landmark, weight = removed(state, kept)
+        return mean, covariance, np.where(landmark == gone, kept, landmark), weight
+    return removed(state, gone)
+
+
+@kernel
+def _equated(
+    mean: Float[np.ndarray, " d"], P: Float[np.ndarray, "d d"], k: Whole, g: Whole, error: float
+) -> tuple[Float[np.ndarray, " d"], Float[np.ndarray, "d d"]]:
+    """Correct mean and covariance by the measurement that the points at two indices are one."""
+    w0, w1 = P[:, k] - P[:, g], P[:, k + 1] - P[:, g + 1]
+    a = math.sqrt(w0[k] - w0[g] + MERGED_STD * MERGED_STD)
+    b = (w0[k + 1] - w0[g + 1]) / a
+    c = math.sqrt(w1[k + 1] - w1[g + 1] + MERGED_STD * MERGED_STD - b * b)
+    e0 = -(mean[k] - mean[g]) / a
+    e1 = (-(mean[k + 1] - mean[g + 1]) - b * e0) / c
+    if e0 * e0 + e1 * e1 > FARTHEST:
+        return mean.copy(), P.copy()
+    moved, left = mean.copy(), np.empty_like(P)
+    w0 = w0 / a
+    w1 = (w1 - b * w0) / c
+    if error == LINEAR:
+        moved += e0 * w0 + e1 * w1
+    else:
+        retract(moved, mean.size, w0, e0, w1, e1)
+    for i in range(mean.size):
+        for j in range(mean.size):
+            left[i, j] = P[i, j] - w0[i] * w0[j] - w1[i] * w1[j]
+    return moved, left
+
+
+def _present(landmark: Int[np.ndarray, " h"], label: int) -> int:
+    """Return a label that is on the map; refuse any other."""
+    if label < 0 or label not in landmark:
+        raise InputError(f"association: found landmark {label} to change, which is not on the map")
+    return label
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -397,3 +625,30 @@ class EkfSlam:
             innovations=belief.innovations.plus(squared, degrees),
         )
         return _with_velocities(after, scan.moving, self.speed_std)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class InvariantEkfSlam(EkfSlam):
+    """EKF-SLAM with the right-invariant error; its fields and methods are those of `EkfSlam`.
+
+    Examples
+    --------
+    A vehicle that stands, unsure of its heading, learns nothing of it from what it hears.
+
+    >>> import numpy as np
+    >>> from pipistrelle.config import RayConfig
+    >>> from pipistrelle.detection.scans import make_scan
+    >>> from pipistrelle.estimation.beliefs import Gaussian
+    >>> from pipistrelle.estimation.motion import Motion
+    >>> motion = Motion(model="bicycle", control_std=(0.1, 0.03), wheelbase=0.2)
+    >>> slam = InvariantEkfSlam(motion=motion, rays=RayConfig())
+    >>> belief = slam.init(Gaussian(mean=np.zeros(3), covariance=np.eye(3) * 1e-2))
+    >>> known = {"range": np.array([2.0, 9.0]), "range_std": 0.2, "bearing_std": 0.15}
+    >>> scan = make_scan(0.0, np.array([4, 9]), np.array([0.1, 0.7]), **known)
+    >>> for _ in range(100):
+    ...     belief = slam.update(belief, scan)
+    >>> belief.pose().covariance[2, 2]
+    np.float64(0.01)
+    """
+
+    error: float = INVARIANT

@@ -13,17 +13,16 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from pipistrelle.estimation.smoother.history import STRETCH, History, in_hindsight
-from pipistrelle.estimation.smoother.linearity import nonlinearity
-from pipistrelle.estimation.smoother.records import Arrays
-from pipistrelle.estimation.smoother.smoothing import (
+from pipistrelle.estimation.smoother.observations import nonlinearity
+from pipistrelle.estimation.smoother.records import Arrays, Stack
+from pipistrelle.estimation.smoother.solution import (
+    border_covariance,
     places_left,
     spread_back,
     spread_left,
     spread_with_border,
     trace_back,
 )
-from pipistrelle.estimation.smoother.solution import border_covariance
-from pipistrelle.estimation.smoother.stack import Stack
 from pipistrelle.estimation.smoother.sweep import Noise, Points, Solution, Stretch, Sweep
 from pipistrelle.jit import optimised_once
 

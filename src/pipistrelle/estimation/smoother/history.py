@@ -16,10 +16,14 @@ from jaxtyping import Bool, Float, Int
 from pipistrelle.detection.scans import BEARING, NUMBERS, RANGE, Scan
 from pipistrelle.estimation.beliefs import Gaussian
 from pipistrelle.estimation.measurement import columns_of, excess_paths, timings_of
-from pipistrelle.estimation.smoother.calibration import NOTHING, Calibration
-from pipistrelle.estimation.smoother.preintegration import SMALLEST_STD, Led, Odometry
-from pipistrelle.estimation.smoother.records import CALLER, POSE, Arrays
-from pipistrelle.estimation.smoother.stack import Stack
+from pipistrelle.estimation.smoother.preintegration import (
+    NOTHING,
+    SMALLEST_STD,
+    Calibration,
+    Led,
+    Odometry,
+)
+from pipistrelle.estimation.smoother.records import CALLER, POSE, Arrays, Stack
 from pipistrelle.jit import Whole, optimised_once
 
 STRETCH = 64

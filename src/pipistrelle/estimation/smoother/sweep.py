@@ -12,10 +12,8 @@ from jaxtyping import Float, Int
 
 from pipistrelle.estimation.smoother.elimination import begin, eliminate, enter, leave, step_to
 from pipistrelle.estimation.smoother.history import STRETCH, History
-from pipistrelle.estimation.smoother.records import CALLER, POSE, Arrays
-from pipistrelle.estimation.smoother.smoothing import Left
-from pipistrelle.estimation.smoother.solution import solve
-from pipistrelle.estimation.smoother.stack import Stack
+from pipistrelle.estimation.smoother.records import CALLER, POSE, Arrays, Stack
+from pipistrelle.estimation.smoother.solution import Left, solve
 
 Noise = tuple[float, ...]
 """As `records.Noise`."""

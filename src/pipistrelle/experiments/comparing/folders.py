@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import Literal
 
 from pipistrelle.config import InputError
-from pipistrelle.experiments.results.stored import results_in
+from pipistrelle.experiments.results.reading import results_in
 from pipistrelle.files import without_links
 
 LETTERS = "ABCDEFGHIJKLMNOPQRSTUVWXYZ"

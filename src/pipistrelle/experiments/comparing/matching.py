@@ -4,7 +4,7 @@ from collections.abc import Hashable, Mapping, Sequence
 from typing import Any, TypeVar
 
 from pipistrelle.estimation.catalogue import short_name
-from pipistrelle.experiments.results.stored import Estimate
+from pipistrelle.experiments.results.reading import Estimate
 
 K = TypeVar("K", bound=Hashable)
 

@@ -25,7 +25,7 @@ from pipistrelle.experiments.comparing.matching import (
     section,
     worded,
 )
-from pipistrelle.experiments.results.stored import (
+from pipistrelle.experiments.results.reading import (
     Estimate,
     StoredMission,
     StoredPath,

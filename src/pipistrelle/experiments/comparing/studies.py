@@ -28,10 +28,9 @@ from pipistrelle.experiments.comparing.matching import (
     named,
     worded,
 )
-from pipistrelle.experiments.studies.plan import RADIUS, Plan, PlannedCase, cases_of
-from pipistrelle.experiments.studies.plan_file import plan_settings
+from pipistrelle.experiments.studies.plan import RADIUS, Plan, PlannedCase, cases_of, plan_settings
 from pipistrelle.experiments.studies.store import load_study
-from pipistrelle.experiments.studies.world_files import check_world, done_worlds
+from pipistrelle.experiments.studies.world import check_world, done_worlds
 from pipistrelle.files import read_file
 
 if TYPE_CHECKING:

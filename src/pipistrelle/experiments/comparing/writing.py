@@ -13,8 +13,7 @@ from pipistrelle.estimation.catalogue import short_name
 from pipistrelle.experiments.comparing.folders import LETTERS
 from pipistrelle.experiments.comparing.missions import ComparedMissions
 from pipistrelle.experiments.comparing.studies import ComparedStudies
-from pipistrelle.files import spelt
-from pipistrelle.own_files import OwnFiles, drawn_files
+from pipistrelle.files import OwnFiles, drawn_files, spelt
 
 if TYPE_CHECKING:
     import polars as pl
@@ -64,7 +63,7 @@ def write_comparison(
 ) -> None:
     """Write a comparison into a folder, in place of an earlier one.
 
-    `own`: the folder, as `pipistrelle.own_files.claim` gives it. `command`: the command line, for
+    `own`: the folder, as `pipistrelle.files.claim` gives it. `command`: the command line, for
     the reader. `notes`: what a reader must know of it. `draw`: given a folder to draw the figure
     into. Raises InputError where a file cannot be written, or one that would be replaced is not as
     we wrote it.

@@ -23,8 +23,8 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from pipistrelle.acoustics.call_settings import sound_of
-from pipistrelle.acoustics.callers import Caller, callers_of, moves
+from pipistrelle.acoustics.call import sound_of
+from pipistrelle.acoustics.paths import Caller, callers_of, moves
 from pipistrelle.arrays.sampling import free_tones
 from pipistrelle.config import (
     SWEEP,

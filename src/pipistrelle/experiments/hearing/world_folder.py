@@ -15,9 +15,9 @@ import numpy as np
 from jaxtyping import Float
 from pydantic import ConfigDict, Field, ValidationError
 
-from pipistrelle.acoustics.call_settings import settings_of
-from pipistrelle.acoustics.callers import VEHICLE, moves
-from pipistrelle.acoustics.target import SHAPES, Bodies
+from pipistrelle.acoustics.call import settings_of
+from pipistrelle.acoustics.emitter import SHAPES, Bodies
+from pipistrelle.acoustics.paths import VEHICLE, moves
 from pipistrelle.config import CallerConfig, Config, InputError, Section, TargetConfig
 from pipistrelle.detection.logs.text_tables import (
     Table,
@@ -27,7 +27,7 @@ from pipistrelle.detection.logs.text_tables import (
 )
 from pipistrelle.estimation.catalogue import SECTIONS
 from pipistrelle.experiments.hearing.caller_paths import routes_read
-from pipistrelle.experiments.hearing.scenario import Scenario
+from pipistrelle.experiments.hearing.scenario import Scenario, World
 from pipistrelle.experiments.hearing.trajectories import (
     Commands,
     Course,
@@ -35,7 +35,6 @@ from pipistrelle.experiments.hearing.trajectories import (
     Waypoints,
     steps_of,
 )
-from pipistrelle.experiments.hearing.world import World
 from pipistrelle.files import read_file, read_text
 from pipistrelle.refusals import expectation, refusal, shown
 from pipistrelle.settings import (

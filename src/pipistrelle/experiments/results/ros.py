@@ -16,7 +16,7 @@ import numpy as np
 from jaxtyping import Float
 
 from pipistrelle.detection.logs.bag import need_rosbags
-from pipistrelle.detection.logs.bag_frames import after, inverse, planar
+from pipistrelle.detection.logs.bag_log import after, inverse, planar
 from pipistrelle.estimation.catalogue import short_name
 from pipistrelle.experiments.results.scores import TrialResult
 from pipistrelle.experiments.results.tables import landmark_table

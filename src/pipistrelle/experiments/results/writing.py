@@ -1,14 +1,22 @@
 """Writing a result folder: scores, tracks, maps and tables, for Pipistrelle and other tools.
 
 ``summary.json`` is written last: its presence means that the folder is complete.
+
+The folder for results: the one that the user named, or a new one under ``runs``.
 """
 
+import contextlib
 import hashlib
 import io
 import json
 import math
+import os
+import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import asdict
+from datetime import datetime
+from itertools import count
 from pathlib import Path
 from types import MappingProxyType
 from typing import TYPE_CHECKING
@@ -16,6 +24,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from pydantic import BaseModel
 
+from pipistrelle.config import InputError
 from pipistrelle.estimation.beliefs import Track
 from pipistrelle.estimation.catalogue import short_name
 from pipistrelle.experiments.drives import Truth
@@ -28,9 +37,85 @@ from pipistrelle.experiments.results.tables import (
     step_table,
     tum_text,
 )
-from pipistrelle.own_files import OwnFiles, drawn_files
+from pipistrelle.files import (
+    COMMAND_LINE,
+    RESULTS,
+    OwnFiles,
+    claim,
+    drawn_files,
+    make_folder,
+    partial_of,
+    remove_empty,
+)
 from pipistrelle.settings import to_toml
 from pipistrelle.version import find_version
+
+_OURS = re.compile(r"\d{8}-\d{6}-(run|slam)(-\d+)?")
+"""Names that `result_folder` gives."""
+
+
+@contextmanager
+def result_folder(
+    path: Path | None, name: str, *, overwrite: bool, flags: tuple[str, str] = COMMAND_LINE
+) -> Iterator[OwnFiles]:
+    """Lend the folder for the results; if there are none in the end, nothing is left of it.
+
+    Without a path it is ``runs/<time>-<name>``, and once it is whole ``runs/latest`` points at it,
+    where the file system has symbolic links and no other file has that name. Earlier results stay
+    until the new ones are whole.
+
+    >>> from tempfile import TemporaryDirectory
+    >>> with TemporaryDirectory() as parent:
+    ...     with result_folder(Path(parent) / "one", "run", overwrite=False) as own:
+    ...         own.replace({"summary.json": "{}"})
+    ...     own.folder.is_dir()
+    True
+    """
+    if path is not None:
+        yield claim(path, RESULTS, overwrite=overwrite, flags=flags)
+        return
+    made = _new_folder(name)
+    try:
+        yield claim(made[0], RESULTS, overwrite=False)
+        _point_latest_at(made[0])
+    finally:
+        remove_empty(made)
+
+
+def _new_folder(name: str) -> list[Path]:
+    """Make ``runs/<time>-<name>``; return it, and ``runs`` if that was missing."""
+    runs = Path("runs")
+    try:
+        made = make_folder(runs)[:1]
+        stem = f"{datetime.now():%Y%m%d-%H%M%S}-{name}"
+        for attempt in count(1):
+            folder = runs / (stem if attempt == 1 else f"{stem}-{attempt}")
+            with contextlib.suppress(FileExistsError):
+                folder.mkdir()
+                break
+        return [folder, *made]
+    except OSError as error:
+        raise InputError(
+            f"{runs}: cannot be used as a folder for results ({error.strerror}); name one that "
+            f"can be written with {COMMAND_LINE[0]}"
+        ) from error
+
+
+def _point_latest_at(folder: Path) -> None:
+    """Let ``runs/latest`` point at a folder, unless a file that is not ours has that name."""
+    latest = folder.parent / "latest"
+    if os.path.lexists(latest) and not (
+        latest.is_symlink() and _OURS.fullmatch(str(latest.readlink()))
+    ):
+        return
+    link = partial_of(latest)
+    with contextlib.suppress(OSError):
+        link.symlink_to(folder.name, target_is_directory=True)
+        try:
+            link.replace(latest)
+        finally:
+            link.unlink(missing_ok=True)
+
 
 if TYPE_CHECKING:
     import polars as pl
@@ -108,7 +193,7 @@ def write_results(
     >>> import tempfile
     >>> from pipistrelle.config import Config
     >>> from pipistrelle.experiments.drives import NO_TRUTH
-    >>> from pipistrelle.own_files import RESULTS, OwnFiles
+    >>> from pipistrelle.files import RESULTS, OwnFiles
     >>> with tempfile.TemporaryDirectory() as name:
     ...     run = {"command": "pipistrelle", "seed": 7, "trials": (), "ignored_rows": {}}
     ...     write_results(OwnFiles(Path(name), RESULTS), config=Config(), truth=NO_TRUTH, **run)

@@ -19,13 +19,13 @@ from pipistrelle.config import (
 from pipistrelle.detection.scans import OWN, UNLABELLED, Scan, make_scan
 from pipistrelle.estimation.association import KNOWN
 from pipistrelle.estimation.catalogue import CATALOGUE
-from pipistrelle.estimation.data_association.methods import METHODS
+from pipistrelle.estimation.data_association.sequential import METHODS
 from pipistrelle.experiments.drives import Drive
 from pipistrelle.experiments.machine import cores
 from pipistrelle.experiments.named_settings import each_its_own
 from pipistrelle.experiments.runs.heard_world import drive_of
 from pipistrelle.experiments.runs.trial import run_mission, run_trials
-from pipistrelle.experiments.runs.validate_mission import checked_scenario
+from pipistrelle.experiments.runs.validate import checked_scenario
 from pipistrelle.geometry import wrap
 from pipistrelle.kernel_clock import announce
 
@@ -73,7 +73,7 @@ def in_two_processes(
     """Let a second process compile the kernels of filters, if any kernel must be compiled.
 
     It begins with the first that this process compiles, which `tell` announces, where given. What
-    both need is compiled by one of them (`pipistrelle.kernel_turns`).
+    both need is compiled by one of them (`pipistrelle.kernel_folder`).
     """
     second = None
 

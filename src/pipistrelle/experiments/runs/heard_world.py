@@ -1,14 +1,17 @@
 """A world as it was heard: what each strategy takes of it, and the bound on any estimate of it.
 
 A mission and the cases of a study ask the same `HeardWorld`, so both have the same scans and bound.
+
+The record of a mission, simulated or solved from a recorded log.
 """
 
-from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Float
 
+from pipistrelle.acoustics.paths import Caller
 from pipistrelle.arithmetic.random_stream import stream_key
 from pipistrelle.config import (
     AssociationConfig,
@@ -18,10 +21,10 @@ from pipistrelle.config import (
     ListeningConfig,
     Strategy,
 )
-from pipistrelle.detection.faces import FrameMeasurements
-from pipistrelle.detection.merging import scan_of
+from pipistrelle.detection.front_end import FrameMeasurements
+from pipistrelle.detection.logs.recording import Log
 from pipistrelle.detection.noise import noise_of, without_hidden
-from pipistrelle.detection.scans import Scan
+from pipistrelle.detection.scans import Scan, scan_of
 from pipistrelle.estimation.association import KNOWN
 from pipistrelle.estimation.beliefs import Gaussian
 from pipistrelle.evaluation.association import Causes, causes_of
@@ -29,14 +32,45 @@ from pipistrelle.evaluation.bound import bound_of_drawn_start
 from pipistrelle.experiments.drives import Drive, Truth
 from pipistrelle.experiments.hearing.scenario import (
     Scenario,
+    World,
     assumed_motion,
     caller_labels,
     moving_callers,
     standing_landmarks,
 )
 from pipistrelle.experiments.hearing.trajectories import motion_of
-from pipistrelle.experiments.results.scores import drive_bound
+from pipistrelle.experiments.results.scores import TrialResult, drive_bound
 from pipistrelle.geometry import wrap_angle
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Mission:
+    """A mission, simulated or from a log: what was driven and heard, and each estimate of it."""
+
+    config: Config
+    """Of a log, the sections that estimators read count."""
+    drive: Drive
+    trials: tuple[TrialResult, ...]
+    beamwidth: float | None
+    """Full half-power width of the vehicle's beam; of a log, that outside which ranges were hidden
+    [rad]."""
+    callers: tuple[Caller, ...] = ()
+    """Callers besides the vehicle, where the world is known."""
+    scenario: Scenario | None = None
+    """The world that was drawn; None for a log."""
+    world: World | None = None
+    """The user's own world, if one was given."""
+    heard: tuple[FrameMeasurements, ...] = ()
+    """The frames of a simulated mission."""
+    log: Log | None = None
+    """The recorded log; None for a simulated mission."""
+    source: Mapping[str, object] | None = None
+    """Which log it was, for ``summary.json`` (`log_entry`)."""
+    notes: Callable[[], Iterable[str]] = tuple
+    """Returns the warnings for the user; it is called after the results are written."""
+    difference: str = ""
+    """Of a mission that was rerun: how its tracks differ from those of its folder, in a line."""
+
 
 _NOISE = ("noise", "range_std", "bearing_std", "excess_path_std", "calibrate")
 _CALLERS = ("caller_speed_std", "caller_walk_std")

@@ -17,11 +17,11 @@ from pipistrelle.detection.logs.readers import (
     recording_of,
 )
 from pipistrelle.detection.logs.recording import Log
-from pipistrelle.detection.merging import labelled
 from pipistrelle.detection.noise import noise_of, without_hidden
 from pipistrelle.detection.scans import (
     UNLABELLED,
     Scan,
+    labelled,
     rows_of,
     with_columns,
     without_excess_paths,
@@ -29,19 +29,19 @@ from pipistrelle.detection.scans import (
 )
 from pipistrelle.estimation.association import KNOWN
 from pipistrelle.estimation.beliefs import Gaussian, Landmarks
-from pipistrelle.estimation.data_association.methods import left_out
+from pipistrelle.estimation.data_association.sequential import left_out
 from pipistrelle.estimation.motion import Motion
-from pipistrelle.estimation.smoother.calibration import OF_ODOMETRY
+from pipistrelle.estimation.smoother.preintegration import OF_ODOMETRY
 from pipistrelle.evaluation.association import Causes, causes_of
 from pipistrelle.experiments.drives import Drive, Truth
 from pipistrelle.experiments.hearing.listening import Progress
 from pipistrelle.experiments.named_settings import each_its_own
 from pipistrelle.experiments.results.scores import TrialResult
-from pipistrelle.experiments.runs.mission import Mission
+from pipistrelle.experiments.runs.heard_world import Mission
 from pipistrelle.experiments.runs.trial import Watch, in_order, run_trials
 from pipistrelle.experiments.runs.truth_files import TRUTHS, WithTruth, with_files_beside
-from pipistrelle.experiments.runs.validate_filters import check_filters
-from pipistrelle.own_files import LOG, OwnFiles
+from pipistrelle.experiments.runs.validate import check_filters
+from pipistrelle.files import LOG, OwnFiles
 from pipistrelle.refusals import refusal
 
 NO_BAG = BagConfig()

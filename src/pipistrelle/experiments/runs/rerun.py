@@ -18,16 +18,16 @@ from pipistrelle.config import InputError
 from pipistrelle.detection.logs.readers import Robot, reader_of
 from pipistrelle.estimation.association import KNOWN
 from pipistrelle.estimation.catalogue import CATALOGUE, short_name
-from pipistrelle.estimation.data_association.methods import METHODS
+from pipistrelle.estimation.data_association.sequential import METHODS
 from pipistrelle.experiments.hearing.listening import Progress
-from pipistrelle.experiments.hearing.world import ALL_DRAWN
+from pipistrelle.experiments.hearing.scenario import ALL_DRAWN
 from pipistrelle.experiments.hearing.world_folder import read_world
 from pipistrelle.experiments.results.reading import SUMMARY, Summary, read_summary
 from pipistrelle.experiments.results.scores import TrialResult
 from pipistrelle.experiments.results.tables import tum_text
 from pipistrelle.experiments.results.writing import settings_hash
 from pipistrelle.experiments.runs import truth_files
-from pipistrelle.experiments.runs.mission import Mission
+from pipistrelle.experiments.runs.heard_world import Mission
 from pipistrelle.experiments.runs.replay import load, replay
 from pipistrelle.experiments.runs.trial import Watch, run_mission
 from pipistrelle.files import read_file, text_of
@@ -53,7 +53,7 @@ def rerun(
     >>> from pipistrelle.config import Config, ScenarioConfig
     >>> from pipistrelle.experiments.drives import NO_TRUTH
     >>> from pipistrelle.experiments.results.writing import write_results
-    >>> from pipistrelle.own_files import RESULTS, OwnFiles
+    >>> from pipistrelle.files import RESULTS, OwnFiles
     >>> config = Config(scenario=ScenarioConfig(steps=8, landmarks=3))
     >>> done = run_mission(config, ["fused"])
     >>> kept = {"command": "pipistrelle run", "seed": config.seed, "ignored_rows": {}}

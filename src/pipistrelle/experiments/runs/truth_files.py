@@ -21,8 +21,8 @@ from pipistrelle.detection.logs.readers import Robot
 from pipistrelle.detection.logs.recording import Log, check_seconds
 from pipistrelle.detection.logs.text_tables import check_unique, read_table, table_text
 from pipistrelle.experiments.drives import LabelledPoints, Truth
+from pipistrelle.files import LOG, OwnFiles
 from pipistrelle.geometry import poses_at
-from pipistrelle.own_files import LOG, OwnFiles
 from pipistrelle.refusals import refusal
 
 FILES = ("truth.csv", "landmarks.csv")

@@ -17,7 +17,7 @@ from contextlib import contextmanager
 from typing import Any
 
 from pipistrelle.config import InputError
-from pipistrelle.experiments.studies.world_files import EndedTrial
+from pipistrelle.experiments.studies.world import EndedTrial
 
 AHEAD = 1000
 """Worlds handed to a cluster before the first of them is done."""

@@ -2,19 +2,70 @@
 
 The cases are the product of the grid, the strategies and the filters. A passive case does not
 depend on the vehicle's beam: there is one for all radii, heard beside the narrowest beam.
+
+A plan as a file: read, checked, written, compared.
+
+Beamwidths in a plan's grid: each stands for the piston that makes it.
+
+A plan may vary `beamwidth` [deg] in place of `emitter.radius` [m]. What is kept and compared is the
+radius alone, so that both ways of writing a plan are one study.
 """
 
-from collections.abc import Iterator, Mapping
+import json
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
+from decimal import ROUND_FLOOR, Context
+from hashlib import sha256
+from importlib.resources import files
 from itertools import product
+from math import isfinite, prod, radians
+from pathlib import Path
 from types import MappingProxyType
-from typing import Any, cast
+from typing import Annotated, Any, Literal, cast
 
-from pipistrelle.config import Config, Strategy
-from pipistrelle.experiments.cases import Case
-from pipistrelle.experiments.hearing.world import ALL_DRAWN, World
-from pipistrelle.experiments.hearing.world_folder import laid_over
-from pipistrelle.settings import RADIUS_KEY, WORLD_KEY, Given, Key, Layer, from_flags, resolve
+from pydantic import Field, PlainValidator, ValidationError
+from pydantic_core import PydanticCustomError
+
+from pipistrelle.acoustics.call import with_calls
+from pipistrelle.arrays.array_file import with_array
+from pipistrelle.config import STRATEGIES, Config, InputError, Section, Strategy
+from pipistrelle.estimation.catalogue import (
+    CATALOGUE,
+    PAPERS,
+    SECTIONS,
+    check_distinct,
+    check_name,
+)
+from pipistrelle.experiments.hearing.caller_paths import routes_read, with_routes
+from pipistrelle.experiments.hearing.scenario import ALL_DRAWN, World
+from pipistrelle.experiments.hearing.world_folder import (
+    laid_over,
+    named_world,
+    read_world,
+    settled,
+)
+from pipistrelle.experiments.named_settings import PLANS, Case, laid, over_named, parted
+from pipistrelle.files import check_ordinary, text_of
+from pipistrelle.refusals import expectation, meant, refusal, shown
+from pipistrelle.settings import (
+    ARRAY_KEY,
+    CALLERS,
+    OWN,
+    RADIUS_KEY,
+    SETTINGS,
+    WORLD_KEY,
+    Given,
+    Key,
+    Layer,
+    beside,
+    derived,
+    from_flags,
+    known_settings,
+    leaves,
+    read_toml,
+    resolve,
+    with_places,
+)
 
 RADIUS, WORLD = ".".join(RADIUS_KEY), ".".join(WORLD_KEY)
 MOST_CASES = 2**15 - 1
@@ -146,3 +197,482 @@ def combinations(
         world = worlds[named[WORLD]] if WORLD in named else None
         over = layer | varied if world is None else laid_over(world, layer, varied)
         yield named, resolve(over)
+
+
+BEAMWIDTH = "beamwidth"
+MAKERS = (
+    *("emitter.call", "emitter.band", "emitter.frequency"),
+    *("air.speed_of_sound", "air.temperature_c"),
+)
+"""Settings that change the beamwidth; the last one unless the speed of sound is set."""
+DIGITS = Context(prec=12, rounding=ROUND_FLOOR)
+"""Digits of a radius on which machines agree; rounded down, so that no beam exceeds the widest."""
+
+
+def with_radii(
+    where: str, grid: Mapping[str, Any], strategies: Sequence[str], layer: Layer
+) -> dict[str, Any]:
+    """Replace the beamwidths of a grid by piston radii, in the same order.
+
+    The layer holds the plan's settings, which give the tone and the speed of sound.
+
+    >>> with_radii("grid", {"beamwidth": [180, 11.4], "seed": []}, ["active"], {})
+    {'emitter.radius': [0.0025210352264, 0.0253830203249], 'seed': []}
+    """
+    if BEAMWIDTH not in grid:
+        return dict(grid)
+    _check_alone(where, grid, strategies, layer)
+    widths, place = grid[BEAMWIDTH], f"{where}.{BEAMWIDTH}"
+    if not isinstance(widths, list) or not widths:
+        raise refusal(place, shown(widths), "a list of degrees", "write it as [180, 33, 11]")
+    config = resolve(layer)
+    radii: dict[float, Any] = {}
+    for width in widths:
+        radius = _radius(place, width, config)
+        if radius in radii:
+            raise refusal(place, f"{shown(width)} twice", "each value once", "leave one out")
+        radii[radius] = width
+    widest = max(radii)
+    resolve(layer | {("emitter", "radius"): Given(widest, f"{place}: radius of {radii[widest]}")})
+    varied = {RADIUS if name == BEAMWIDTH else name: values for name, values in grid.items()}
+    return varied | {RADIUS: [*radii]}
+
+
+def _check_alone(
+    where: str, grid: Mapping[str, Any], strategies: Sequence[str], layer: Layer
+) -> None:
+    """Refuse beamwidths beside radii or settings that decide them, or if all is passive."""
+    emitter = grid.get("emitter")
+    if RADIUS in grid or (isinstance(emitter, dict) and "radius" in emitter):
+        raise InputError(f"{where}.{BEAMWIDTH}: is {RADIUS} in other words; vary one of them")
+    given = ("air", "speed_of_sound") in layer
+    for name in MAKERS[: -1 if given else None]:
+        section, _, leaf = name.partition(".")
+        table = grid.get(section)
+        if name in grid or (isinstance(table, dict) and leaf in table):
+            why = f"a beamwidth is no one radius where {name} varies too; vary {RADIUS}"
+            raise InputError(f"{where}.{BEAMWIDTH}: {why}")
+    if set(strategies) == {"passive"}:
+        why = "the beam is that of the vehicle's call, which passive sensing does not hear"
+        raise InputError(f"{where}.{BEAMWIDTH}: {why}; add another strategy or take it out")
+
+
+def _radius(where: str, width: Any, config: Config) -> float:
+    """Find the piston that makes a beamwidth [deg]."""
+    from pipistrelle.acoustics.emitter import piston_radius
+
+    number = isinstance(width, (int, float)) and not isinstance(width, bool)
+    if not number or not isfinite(width) or not 0.0 < width <= 180.0:
+        expected = "degrees above 0 and up to 180, the widest beam of a back-baffled piston"
+        raise refusal(where, shown(width), expected, "correct the value")
+    tone = {"frequency": config.emitter.centre, "speed_of_sound": config.medium.sound_speed}
+    return float(DIGITS.create_decimal_from_float(float(piston_radius(radians(width), **tone))))
+
+
+FORMAT = 1
+
+
+def _named(found: Any) -> str:
+    """Accept the name of an estimator; one from outside need not be installed to read a plan."""
+    try:
+        return check_name(str(found))
+    except InputError:
+        expected = ", ".join(f"'{name}'" for name in CATALOGUE) + " or module:Class"
+        raise PydanticCustomError(
+            "filter", "Input should be {expected}", {"expected": expected}
+        ) from None
+
+
+class _Head(Section):
+    """A plan without settings and grid, as its file holds it."""
+
+    format: Literal[1]
+    name: Annotated[str, Field(pattern=r"^\w[\w.-]*$")]
+    iterations: Annotated[int, Field(ge=1, le=MOST_WORLDS)]
+    planned: int = 0
+    strategies: Annotated[tuple[Strategy, ...], Field(min_length=1)] = STRATEGIES
+    filters: Annotated[tuple[Annotated[str, PlainValidator(_named)], ...], Field(min_length=1)] = (
+        PAPERS
+    )
+
+
+def find_plan(word: str) -> Path:
+    """Return the path of a plan that is named by a word of `PLANS` or by its path.
+
+    >>> find_plan("paper").name
+    'paper.toml'
+    """
+    path = Path(word)
+    if word in PLANS:
+        return Path(str(files("pipistrelle.experiments.studies") / f"{word}.toml"))
+    if not path.exists():
+        raise InputError(
+            f"{word}: found no such file; expected {', '.join(PLANS)} or the path of a plan"
+        )
+    check_ordinary(path)
+    return path
+
+
+def read_plan(path: Path, over: Layer | None = None, iterations: int | None = None) -> Plan:
+    """Read a plan, lay settings over its own, and check every combination.
+
+    Iterations replace the plan's number of worlds.
+
+    >>> from pipistrelle.experiments.studies.plan import cases_of
+    >>> plan = read_plan(find_plan("paper"))
+    >>> plan.iterations, len(cases_of(plan))
+    (115, 50)
+    """
+    return plan_of(read_toml(path), path, over, iterations)
+
+
+def plan_of(
+    table: Mapping[str, Any],
+    path: Path = Path("plan"),
+    over: Layer | None = None,
+    iterations: int | None = None,
+) -> Plan:
+    """Make a plan of what its file would hold, and check every combination.
+
+    The path is the file's name in refusals, and its relative paths lead from there.
+
+    >>> levels = {"beacon.level_db": [36.8, 42.8]}
+    >>> plan_of({"format": 1, "iterations": 6, "grid": levels}).grid
+    {'beacon.level_db': (36.8, 42.8)}
+    """
+    over = over or {}
+    named, usual = _beneath(path, table, over)
+    head = _head(path, {"filters": usual, **table} if usual else table, iterations)
+    within = {"config": table.get("config", {}), "grid": table.get("grid", {})}
+    for name, settings in within.items():
+        if not isinstance(settings, dict):
+            raise InputError(
+                f"{path}: {name}: found {shown(settings)}, expected a table of settings"
+            )
+    worlds: dict[str, World] = {}
+    layer = _laid(path, within["config"], over, worlds)
+    radii = with_radii(f"{path}: grid", within["grid"], head.strategies, layer)
+    asked = [
+        (key, name, _read(path, key, values, worlds))
+        for key, name, values in _settings(path, "grid", radii)
+    ]
+    varied = {key for key, _, _ in asked}
+    named = {k: given for k, given in named.items() if not {k, k[2:]} & varied}
+    layer, own = parted(laid(named, layer))
+    lengths = [len(values) for _, _, values in asked if isinstance(values, list)]
+    most = prod(lengths) * len(head.strategies) * len(head.filters)
+    if most > MOST_CASES:
+        raise InputError(f"{path}: grid: found {most} cases, expected at most {MOST_CASES}")
+    grid = {name: _values(path, name, key, values, layer) for key, name, values in asked}
+    _check_unvaried(path, layer, grid, over, BEAMWIDTH in within["grid"])
+    tables = _with_named(table.get("own", {}), own, head.filters)
+    plan = Plan(
+        name=head.name,
+        iterations=head.iterations,
+        planned=max(head.iterations, head.planned),
+        strategies=head.strategies,
+        filters=head.filters,
+        config=resolve(layer),
+        grid=grid,
+        own=_own(path, tables, head.filters, grid, layer, worlds),
+        worlds=worlds,
+    )
+    for _ in combinations(layer, grid, f"{path}: grid.", worlds):
+        pass
+    return plan
+
+
+def _check_unvaried(
+    path: Path, layer: Layer, grid: Mapping[str, Any], over: Layer, in_degrees: bool
+) -> None:
+    """Refuse a setting of which the grid has several values; `in_degrees`: those of the beam."""
+    for key in (key for key in layer if ".".join(key) in grid):
+        # The plan in a study's folder names every setting; a default there says nothing.
+        if key in over or resolve({key: layer[key]}) != Config():
+            name = f" as {BEAMWIDTH}" * (in_degrees and ".".join(key) == RADIUS)
+            why = f"the plan varies this setting{name}; take it out of [grid] in {path}"
+            raise InputError(f"{layer[key].where}: {why}")
+
+
+def _beneath(path: Path, table: Mapping[str, Any], over: Layer) -> tuple[Layer, tuple[str, ...]]:
+    """Return the settings that lie beneath a plan by name, and the estimators that they name."""
+    config = table.get("config")
+    places = (config if isinstance(config, dict) else {}, table)
+    words = [Given(one["settings"], f"{path}: settings") for one in places if "settings" in one]
+    given = [*words, *(one for key, one in over.items() if key == SETTINGS)]
+    return over_named(*({SETTINGS: one} for one in given))
+
+
+def _with_named(own: Any, named: Mapping[str, Layer], filters: Sequence[str]) -> Any:
+    """Lay the settings of a plan that are one filter's own over those that are by name."""
+    if not isinstance(own, dict) or not all(isinstance(one, dict) for one in own.values()):
+        return own  # refused with all else
+    beneath = {
+        name: {".".join(key): given.value for key, given in named[name].items()}
+        for name in filters
+        if name in named
+    }
+    return {name: beneath.get(name, {}) | own.get(name, {}) for name in {**own, **beneath}}
+
+
+def _laid(path: Path, table: Mapping[str, Any], over: Layer, worlds: dict[str, World]) -> Layer:
+    """Return a plan's settings over those of the world that they name, below the given ones."""
+    layer: Layer = {
+        key: Given(value, f"{path}: config.{name}")
+        for key, name, value in _settings(path, "config", table)
+    }
+    layer = with_array(with_calls(with_routes(with_places(path, layer) | over)))
+    world = named_world(layer)
+    if world is None:
+        return layer
+    worlds[world.name] = world
+    return settled(world, layer) | {WORLD_KEY: Given(world.name, layer[WORLD_KEY].where)}
+
+
+def _beside(path: Path, folder: str) -> str:
+    """Return the path of a folder that a file names, from where the file lies."""
+    return str(path.parent / folder)
+
+
+def _read(path: Path, key: Key, values: Any, worlds: dict[str, World]) -> Any:
+    """Read the files that a grid names: of worlds, and of the routes of callers."""
+    if key == WORLD_KEY:
+        return _worlds(path, values, worlds)
+    if key == CALLERS and isinstance(values, list):
+        where = f"{path}: grid.callers"
+        return [routes_read(beside(path, callers), where) for callers in values]
+    if key == ARRAY_KEY and isinstance(values, list):
+        where = f"{path}: grid.{'.'.join(key)}"
+        placed = [with_places(path, {key: Given(value, where)}) for value in values]
+        return [with_array(layer)[key].value for layer in placed]
+    return values
+
+
+def _worlds(path: Path, folders: Any, worlds: dict[str, World]) -> Any:
+    """Read the worlds of a grid, and return their names."""
+    if not isinstance(folders, list) or not all(isinstance(one, str) for one in folders):
+        return folders  # refused with all other values
+    names = []
+    for folder in folders:
+        world = read_world(Path(_beside(path, folder)))
+        if world.files != worlds.setdefault(world.name, world).files:
+            raise InputError(
+                f"{path}: grid.{WORLD}: found two worlds called {world.name}; rename a folder"
+            )
+        names.append(world.name)
+    return names
+
+
+def _own(
+    path: Path,
+    table: Any,
+    filters: Sequence[str],
+    grid: Mapping[str, Any],
+    layer: Layer,
+    worlds: Mapping[str, World],
+) -> dict[str, dict[str, Any]]:
+    """Check the settings that are one filter's own: none of them changes what is heard."""
+    if not isinstance(table, dict) or not all(
+        isinstance(settings, dict) for settings in table.values()
+    ):
+        raise InputError(f"{path}: own: found {shown(table)}, expected a table for each filter")
+    own: dict[str, dict[str, Any]] = {}
+    for name, settings in table.items():
+        where = f"{path}: own.{name}"
+        if name not in filters:
+            raise InputError(f"{where}: no filter of this plan; {_meant(name, filters)}")
+        given: Layer = {}
+        for key, setting, value in _settings(path, f"own.{name}", settings):
+            if key[0] not in SECTIONS:
+                sections = ", ".join(SECTIONS)
+                why = f"this setting changes what is heard; expected one of the sections {sections}"
+                raise InputError(f"{where}.{setting}: {why}")
+            if setting in grid:
+                raise InputError(f"{where}.{setting}: the plan varies this setting; take it out")
+            given[key] = Given(value, f"{where}.{setting}")
+        if not given:
+            continue
+        for _ in combinations(layer | given, grid, f"{path}: grid.", worlds):
+            pass
+        settled: Any = resolve(layer | given).model_dump(mode="json")
+        own[name] = {".".join(key): settled[key[0]][key[1]] for key in given}
+    return own
+
+
+def plan_text(plan: Plan) -> str:
+    """Write a plan as TOML that names every setting and reads back as the same plan.
+
+    >>> print(plan_text(read_plan(find_plan("paper"), iterations=3)).splitlines()[2])
+    iterations = 3
+    """
+    import tomli_w
+
+    return tomli_w.dumps(_as_table(plan))
+
+
+def changed_settings(there: Plan, asked: Plan) -> list[str]:
+    """Name what differs between two plans, except the number of worlds.
+
+    >>> plans = [
+    ...     read_plan(find_plan("paper"), from_flags({"seed": seed}), seed) for seed in (1, 2)
+    ... ]
+    >>> changed_settings(*plans)
+    ['config.seed: 1 there, 2 asked for']
+    """
+    old, new = plan_settings(there), plan_settings(asked)
+    return [
+        f"{name}: {_worded(old, name)} there, {_worded(new, name)} asked for"
+        for name in dict.fromkeys((*old, *new))
+        if name != "iterations" and (name not in old or name not in new or old[name] != new[name])
+    ]
+
+
+def _digest(world: World) -> str:
+    """Return 16 hexadecimal digits that identify the files of a world."""
+    digest = sha256()
+    for name in sorted(world.files):
+        digest.update(f"{name}\n{len(world.files[name])}\n".encode() + world.files[name])
+    return digest.hexdigest()[:16]
+
+
+def plan_settings(plan: Plan) -> dict[str, Any]:
+    """Return all that a plan says, by dotted names.
+
+    The speed of sound is among it, given or not, and of each world a sum of its files.
+
+    >>> plan_settings(read_plan(find_plan("paper")))["iterations"]
+    115
+    """
+    table = {".".join(key): value for key, value in leaves(_as_table(plan)) if key != ("planned",)}
+    worlds = {f"worlds/{name}": _digest(world) for name, world in plan.worlds.items()}
+    values = {f"config.{'.'.join(key)}": value for key, value in derived(plan.config).items()}
+    return table | worlds | values
+
+
+def _worded(table: Mapping[str, Any], name: str) -> str:
+    """Return a plan's value as text."""
+    return json.dumps(table[name]) if name in table else "nothing"
+
+
+def _as_table(plan: Plan) -> dict[str, Any]:
+    """Return a plan as nested tables and lists; what the grid varies has its default beside it."""
+    layer = from_flags(plan.config.model_dump(mode="json"))
+    kept = {key: layer[key] for key in layer if ".".join(key) not in plan.grid}
+    own = {name: dict(settings) for name, settings in plan.own.items()}
+    if plan.config.scenario.world is not None:
+        kept[WORLD_KEY] = Given(f"worlds/{plan.config.scenario.world}", "")
+    grid = {name: list(values) for name, values in plan.grid.items()}
+    if WORLD in grid:
+        grid[WORLD] = [f"worlds/{name}" for name in grid[WORLD]]
+    config = resolve(kept).model_dump(mode="json", exclude_none=True)
+    settings = config.pop("settings", None)
+    return {
+        "format": FORMAT,
+        "name": plan.name,
+        "iterations": plan.iterations,
+        **({"planned": plan.planned} if plan.planned > plan.iterations else {}),
+        "strategies": list(plan.strategies),
+        "filters": list(plan.filters),
+        **({"settings": settings} if settings else {}),
+        "config": config,
+        "grid": grid,
+        **({"own": own} if own else {}),
+    }
+
+
+def _head(path: Path, table: Mapping[str, Any], iterations: int | None) -> _Head:
+    """Check the keys of a plan other than its settings and grid."""
+    keys = (*_Head.model_fields, "settings", "config", "grid", "own")
+    for name in table:
+        if name not in keys:
+            raise InputError(f"{path}: {name}: no such key of a plan; {_meant(name, keys)}")
+    given = {"name": text_of(path.stem)} | {
+        k: v for k, v in table.items() if k in _Head.model_fields
+    }
+    if iterations is not None:
+        if isinstance(given.get("iterations"), int):
+            given.setdefault("planned", given["iterations"])
+        given["iterations"] = iterations
+    try:
+        head = _Head.model_validate_json(json.dumps(given, default=str), strict=True)
+    except ValidationError as refused:
+        wrong = refused.errors(include_url=False)  # a list of refused items counts as too short
+        wrong = [error for error in wrong if error["type"] != "too_short" or error["input"] == []]
+        problems = [_problem(path, error) for error in wrong]
+        raise InputError("\n".join(problems)) from None
+    for name in ("strategies", "filters"):
+        _check_distinct(f"{path}: {name}", getattr(head, name))
+    check_distinct(head.filters, f"{path}: filters")
+    return head
+
+
+def _problem(path: Path, error: Any) -> str:
+    """Say which key of a plan was refused, what was found and what was expected."""
+    name = ".".join(map(str, error["loc"]))
+    if error["type"] == "missing":
+        example = {"format": FORMAT, "iterations": 20}.get(name)
+        return f"{path}: no key {name!r}; add {name}" + f" = {example}" * (example is not None)
+    expected = expectation(error)
+    if error["type"] == "string_pattern_mismatch":
+        expected = "letters, digits, _ . and -, for it names a folder"
+    return f"{path}: {name}: found {shown(error['input'])}, expected {expected}"
+
+
+def _settings(
+    path: Path, table: str, settings: Mapping[str, Any]
+) -> Iterator[tuple[Key, str, Any]]:
+    """Walk through a table's settings: key, dotted name and value of each."""
+    keys_by_name = {".".join(key): key for key in known_settings()}
+    for key, value in leaves(settings, (CALLERS,)):
+        name = ".".join(key)
+        if name in keys_by_name:
+            yield keys_by_name[name], name, value
+        elif value != {} or not any(other.startswith(f"{name}.") for other in keys_by_name):
+            names = [*keys_by_name, BEAMWIDTH] if table == "grid" else keys_by_name
+            raise InputError(f"{path}: {table}.{name}: no such setting; {_meant(name, names)}")
+
+
+def _values(path: Path, name: str, key: Key, values: Any, layer: Layer) -> tuple[Any, ...]:
+    """Check the values that a grid gives a setting."""
+    where = f"{path}: grid.{name}"
+    if key == ("seed",):
+        raise InputError(f"{where}: every iteration is another world already; raise iterations")
+    if key in (SETTINGS, OWN):
+        raise InputError(f"{where}: holds for a whole plan; vary settings themselves")
+    if not isinstance(values, list) or not values:
+        raise InputError(f"{where}: found {shown(values)}, expected a list of values")
+    checked = []
+    for value in values:
+        table: Any = resolve(layer | {key: Given(value, where)}).model_dump(mode="json")
+        for part in key:
+            table = table[part]
+        checked.append(_stated(table) if key == CALLERS else table)
+    _check_distinct(where, checked)
+    return tuple(checked)
+
+
+def _stated(callers: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
+    """Return the tables of callers without the keys that are None."""
+    return [{k: v for k, v in caller.items() if v is not None} for caller in callers]
+
+
+def _check_distinct(where: str, values: Sequence[Any]) -> None:
+    """Refuse values that occur twice."""
+    seen = set()
+    for value in values:
+        before = len(seen)
+        seen.add(json.dumps(value) if isinstance(value, list) else value)
+        if len(seen) == before:
+            raise InputError(f"{where}: found {shown(value)} twice, expected each value once")
+
+
+def _meant(name: str, names: Iterable[str]) -> str:
+    """Suggest the name that was probably meant."""
+    names = list(names)
+    near = meant(name, names)
+    return f"did you mean {near}?" if near else f"expected one of {_some(names)}"
+
+
+def _some(names: Sequence[str]) -> str:
+    """List names, or say where they are listed when they are many."""
+    return ", ".join(names) if len(names) < 10 else "those of `pipistrelle config show`"

@@ -1,7 +1,7 @@
 """A study's folder: its plan, and one file per world and table, whole or not there.
 
 So a study can be killed anywhere, continued, and written to by many processes at once
-(`pipistrelle.experiments.studies.world_files`).
+(`pipistrelle.experiments.studies.world`).
 """
 
 from collections.abc import Sequence
@@ -13,15 +13,14 @@ from typing import TYPE_CHECKING
 from pipistrelle.config import InputError
 from pipistrelle.experiments.hearing.world_folder import kept_world
 from pipistrelle.experiments.results.scores import OF_ASSOCIATION
-from pipistrelle.experiments.studies.plan import Plan
-from pipistrelle.experiments.studies.plan_file import changed_settings, plan_text, read_plan
-from pipistrelle.experiments.studies.world import world_schemas
-from pipistrelle.experiments.studies.world_files import (
+from pipistrelle.experiments.studies.plan import Plan, changed_settings, plan_text, read_plan
+from pipistrelle.experiments.studies.world import (
     TABLES,
     check_world,
     done_worlds,
     scan_tables,
     unusable,
+    world_schemas,
 )
 from pipistrelle.files import read_file, whole_name, write_whole
 from pipistrelle.settings import to_toml
@@ -72,7 +71,7 @@ def open_store(folder: Path, plan: Plan) -> None:
     """Make a study's folder, or accept one of the same plan, perhaps with fewer iterations.
 
     >>> import tempfile
-    >>> from pipistrelle.experiments.studies.plan_file import find_plan
+    >>> from pipistrelle.experiments.studies.plan import find_plan
     >>> with tempfile.TemporaryDirectory() as name:
     ...     open_store(Path(name), read_plan(find_plan("paper")))
     ...     sorted(path.name for path in Path(name).iterdir())

@@ -15,13 +15,11 @@ from functools import partial
 from pathlib import Path
 
 from pipistrelle.config import InputError
-from pipistrelle.estimation.catalogue import CATALOGUE
-from pipistrelle.estimation.outside import look_in
+from pipistrelle.estimation.catalogue import CATALOGUE, look_in
 from pipistrelle.experiments.hearing.scenario import moving_callers, standing_landmarks
 from pipistrelle.experiments.hearing.trajectories import motion_of
 from pipistrelle.experiments.machine import check_memory, keep_freed_memory
-from pipistrelle.experiments.runs.validate_filters import check_filters
-from pipistrelle.experiments.runs.validate_mission import checked_scenario, warnings_of
+from pipistrelle.experiments.runs.validate import check_filters, checked_scenario, warnings_of
 from pipistrelle.experiments.studies.executors import (
     AHEAD,
     Results,
@@ -32,12 +30,14 @@ from pipistrelle.experiments.studies.executors import (
 )
 from pipistrelle.experiments.studies.plan import Plan, PlannedCase, cases_of
 from pipistrelle.experiments.studies.store import open_store
-from pipistrelle.experiments.studies.world import failed_records, heard_together, run_world
-from pipistrelle.experiments.studies.world_files import (
+from pipistrelle.experiments.studies.world import (
     EndedTrial,
     done_worlds,
+    failed_records,
+    heard_together,
     read_ended_trials,
     refuse_strange,
+    run_world,
     sweep,
     write_world,
 )

@@ -10,13 +10,13 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Float, Int
 
-from pipistrelle.acoustics.callers import moves
+from pipistrelle.acoustics.paths import moves
 from pipistrelle.config import InputError
 from pipistrelle.detection.scans import UNLABELLED
 from pipistrelle.estimation.beliefs import Landmarks, some_of
 from pipistrelle.experiments.drives import LabelledPoints
 from pipistrelle.experiments.results.scores import TrialResult
-from pipistrelle.experiments.runs.mission import Mission
+from pipistrelle.experiments.runs.heard_world import Mission
 from pipistrelle.figures.animation import pruned
 from pipistrelle.figures.excess_paths import (
     MAX_ELLIPSES,

@@ -6,8 +6,8 @@ from collections.abc import Sequence
 import numpy as np
 from jaxtyping import Float
 
-from pipistrelle.acoustics.callers import VEHICLE, Caller, moves
 from pipistrelle.acoustics.emitter import HALF_POWER, piston_directivity, piston_radius
+from pipistrelle.acoustics.paths import VEHICLE, Caller, moves
 from pipistrelle.config import Config
 from pipistrelle.experiments.hearing.scenario import Scenario
 from pipistrelle.figures.chart import Axis, Chart, Panel, Series

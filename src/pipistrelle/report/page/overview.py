@@ -8,8 +8,7 @@ import numpy as np
 from pipistrelle.config import Config
 from pipistrelle.estimation.catalogue import CATALOGUE
 from pipistrelle.evaluation.consistency import anees, anees_bounds_about
-from pipistrelle.experiments.studies.plan import RADIUS
-from pipistrelle.experiments.studies.plan_file import find_plan, read_plan
+from pipistrelle.experiments.studies.plan import RADIUS, find_plan, read_plan
 from pipistrelle.report.claims.contrasts import anees_departure
 from pipistrelle.report.claims.published import (
     EXCLUDED,

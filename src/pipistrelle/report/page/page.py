@@ -17,8 +17,7 @@ from pipistrelle.evaluation.comparison import INTERVALS, Finding
 from pipistrelle.evaluation.scores import shown_in
 from pipistrelle.figures.chart import Chart, Panel, columns_of, csv_rows, csv_text
 from pipistrelle.figures.style import page_colours
-from pipistrelle.files import upright
-from pipistrelle.own_files import REPORT, claim, drawn_files
+from pipistrelle.files import REPORT, claim, drawn_files, upright
 from pipistrelle.report.charts.results import Figure, answers, study_charts
 from pipistrelle.report.charts.setting import model_charts
 from pipistrelle.report.claims.published import FILTERS
@@ -62,7 +61,7 @@ def write_report(
     study holds its cases, else none. `charts`: each gives the charts of a figure; they have names
     of their own. If not said, as `charts.results.study_charts` has it. `progress`: given the name
     of each figure before it is drawn. Returns: as ``summary.json`` holds it. Raises InputError: as
-    `pipistrelle.own_files.claim`: an earlier report is replaced, and nothing else.
+    `pipistrelle.files.claim`: an earlier report is replaced, and nothing else.
     """
     own = claim(folder, REPORT, overwrite=True)
     result = answered(study, claims)
