@@ -1,8 +1,11 @@
 """Where compiled kernels are kept, in an install that cannot be written to as in any other."""
 
+import io
 import os
+import shutil
 import subprocess
 import sys
+import tokenize
 from pathlib import Path
 
 import pytest
@@ -11,6 +14,7 @@ from pipistrelle import kernel_folder
 from pipistrelle.kernel_clock import COMPILING
 from pipistrelle.kernel_folder import sources_key
 
+PACKAGE = Path(kernel_folder.__file__).parent
 SHOW = "import os, pipistrelle.jit; print(os.environ['NUMBA_CACHE_DIR'])"
 COMPILE = SHOW + "; from pipistrelle.geometry import wrap_angle; wrap_angle(4.0)"
 NOWHERE = os.devnull + "/home"  # no folder can be made in a file, not even by root
@@ -315,3 +319,36 @@ def test_what_cannot_be_kept_is_compiled_all_the_same(tmp_path):
     assert said[0] == COMPILING
     assert len(said) == 2, "said once, whatever number of rooms has kernels"
     assert f"{folder}: compiled kernels could not be kept (No space left on device)" in said[1]
+
+
+def code_of(text: bytes) -> list[tuple[int, str]]:
+    """Return the tokens of a source that are code, without any text in three quotes."""
+    layout = {tokenize.NL, tokenize.COMMENT, tokenize.INDENT, tokenize.DEDENT, tokenize.NEWLINE}
+    return [
+        (token.type, token.string)
+        for token in tokenize.tokenize(io.BytesIO(text).readline)
+        if token.type not in layout and not token.string.startswith(('"""', 'r"""'))
+    ]
+
+
+def test_the_key_of_kernels_depends_on_all_code_and_on_nothing_else():
+    sources = [path.read_bytes() for path in PACKAGE.rglob("*.py")]
+    compiled = [text for text in sources if b"jit" in text]
+    assert len(compiled) > 40
+    for text in compiled:
+        kept = kernel_folder._NO_CODE.sub(b"", text)
+        assert code_of(kept) == code_of(text)
+        assert kept.count(b"\n") < text.count(b"\n")
+
+
+def test_kernels_are_shared_by_copies_of_the_package_whose_prose_differs(tmp_path):
+    copies = [tmp_path / name / "pipistrelle" for name in ("first", "second")]
+    for copy in copies:
+        shutil.copytree(PACKAGE, copy, ignore=shutil.ignore_patterns("__pycache__", "*.toml"))
+    geometry = copies[1] / "geometry.py"
+    geometry.write_text('"""Other words.\n\nAnd more."""\n# A remark.\n' + geometry.read_text())
+    folders, said = zip(
+        *(place(tmp_path, COMPILE, PYTHONPATH=str(copy.parent)) for copy in copies), strict=True
+    )
+    assert folders[0] == folders[1]
+    assert (said[0][0], said[1]) == (COMPILING, [])

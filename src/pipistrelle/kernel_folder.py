@@ -79,6 +79,8 @@ _MAX_STATES = 3
 """How many states of the sources keep their kernels."""
 _KEY = "[0-9a-f]{16}"
 """How the name of a state's folder looks (`sources_key`)."""
+_NO_CODE = re.compile(rb'^ *r?"{3}[^"]*(?:"{1,2}[^"]+)*"{3}\n|^ *#.*\n|^ *\n', re.MULTILINE)
+"""Docstrings, lines of comments and empty lines."""
 _MIN_ROOM = 64_000_000
 """Bytes that all kernels of a state have room in, several times over."""
 
@@ -107,15 +109,16 @@ def place_kernels(*, plain: bool = False) -> bool:
 
 
 def sources_key(plain: bool = False) -> str:
-    """Hash the interpreter's version and every source that compiles a kernel.
+    """Hash the interpreter's version and the code of every source that compiles a kernel.
 
-    Returns sixteen hexadecimal digits, others where kernels are compiled by plain Numba.
+    Docstrings and lines of comments are left out: kernels do not depend on them. Returns sixteen
+    hexadecimal digits, others where kernels are compiled by plain Numba.
     """
     digest = sha256(sys.version.encode() + b"plain" * plain)
     for source in sorted(Path(__file__).parent.rglob("*.py")):
         text = source.read_bytes()
         if b"jit" in text:
-            digest.update(source.name.encode() + text)
+            digest.update(source.name.encode() + _NO_CODE.sub(b"", text))
     return digest.hexdigest()[:16]
 
 

@@ -29,7 +29,7 @@ from numba.core.compiler import Compiler
 from numba.core.environment import lookup_environment
 from numba.core.registry import CPUDispatcher
 
-from pipistrelle.kernel_folder import TURN, close_to_others
+from pipistrelle.kernel_folder import TURN
 
 _said: set[str] = set()
 """What was said once need not be said for every kernel."""
@@ -95,14 +95,20 @@ class CheckedFiles(IndexDataCacheFile):
 def checked(dispatcher: Any) -> Any:
     """Let a compiled function keep its code in checked files.
 
-    Where compilation is switched off, the function itself takes the dispatcher's place.
+    They are named after the function, and neither after its line nor after the folder of the
+    package: the folder of kernels belongs to one state of all code. Where compilation is switched
+    off, the function itself takes the dispatcher's place.
     """
     if cache := getattr(dispatcher, "_cache", None):
-        files = cache._cache_file
+        function = dispatcher.py_func
+        root = Path(numba.config.CACHE_DIR)  # pyrefly: ignore[missing-attribute]
+        folder, made = root / function.__module__, Path(cache.cache_path)
         with suppress(OSError):
-            close_to_others(Path(files._cache_path))
-        cache._cache_file = CheckedFiles.__new__(CheckedFiles)
-        cache._cache_file.__dict__.update(files.__dict__)
+            folder.mkdir(mode=0o700, exist_ok=True)
+            if made.parent == root:  # by Numba, just now
+                made.rmdir()
+        cache._impl.locator._cache_path = cache._cache_path = str(folder)
+        cache._cache_file = CheckedFiles(str(folder), function.__qualname__, "")
     return dispatcher
 
 

@@ -13,8 +13,7 @@ __getattr__, __dir__, __all__ = attach(
     __name__,
     submod_attrs={
         "arrivals": ["Arrivals", "arrivals_of_emission", "through_piston"],
-        "emitter": ["beamwidth", "piston_directivity", "piston_radius"],
+        "emitter": ["beamwidth", "piston_directivity", "piston_radius", "target_strength_db"],
         "propagation": ["absorption_db_per_m"],
-        "target": ["target_strength_db"],
     },
 )

@@ -12,11 +12,10 @@ from lazy_loader import attach
 __getattr__, __dir__, __all__ = attach(
     __name__,
     submod_attrs={
-        "faces": ["average_faces"],
+        "front_end": ["average_faces"],
         "logs.folder": ["read_log", "write_log"],
         "matched": ["filter_blocks"],
-        "merging": ["scan_of"],
-        "scans": ["Scan"],
+        "scans": ["scan_of", "Scan"],
         "snapshots": ["detect", "detector"],
     },
 )

@@ -413,7 +413,7 @@ CATALOGUE = {
         Entry(
             name="iekf",
             title="invariant EKF",
-            build=_builder("iekf", "ekf.invariant:InvariantEkfSlam"),
+            build=_builder("iekf", "ekf.filter:InvariantEkfSlam"),
             sections=READ,
             nees_limit=50.0,
             memory=_ekf_bytes,

@@ -16,7 +16,6 @@ __getattr__, __dir__, __all__ = attach(
         "hearing.scenario": ["draw_scenario"],
         "results.writing": ["write_results"],
         "runs.replay": ["load"],
-        "runs.filtering": ["run_filter"],
-        "runs.trial": ["run_mission", "run_trial"],
+        "runs.trial": ["run_filter", "run_mission", "run_trial"],
     },
 )
