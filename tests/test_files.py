@@ -7,6 +7,7 @@ import pytest
 
 from pipistrelle.config import InputError
 from pipistrelle.files import (
+    PiecesFile,
     partial_of,
     put_in_place,
     read_file,
@@ -131,3 +132,18 @@ def test_characters_that_turn_the_direction_of_writing_are_escaped_and_no_others
     assert "".join(map(upright, turning)).isascii()
     plain = "µ · 95 %\n\tשלום سلام \u200d\u00a0<b>"
     assert upright(plain) == plain
+
+
+def test_a_file_in_pieces_that_a_disk_does_not_take_is_refused_by_name_and_removed(tmp_path):
+    resource = pytest.importorskip("resource")
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (10, before[1]))
+    try:
+        rows = PiecesFile(tmp_path / "rows.csv")
+        rows.write(b"more than ten bytes")
+        with pytest.raises(InputError, match=r"rows\.csv: could not be written \(File too large\)"):
+            rows.close()
+        rows.discard()
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+    assert not [*tmp_path.iterdir()]

@@ -9,7 +9,7 @@ from shutil import which
 
 import pytest
 
-from pipistrelle import files
+from pipistrelle import files, own_files
 from pipistrelle.config import InputError
 from pipistrelle.files import (
     KINDS,
@@ -342,3 +342,29 @@ def test_pictures_are_drawn_elsewhere_and_come_back_by_their_names(tmp_path):
         assert room.resolve().is_relative_to(tmp_path.resolve()) is False
 
     assert drawn_files(draw, "figures/") == {"figures/a.png": b"one", "figures/b.png": b"two"}
+
+
+@pytest.mark.skipif(not Path("/proc/self/fd").is_dir(), reason="only Linux has such a path")
+@pytest.mark.parametrize("moment", ["partial_of", "write_down", "put_in_place"])
+def test_a_folder_that_another_takes_the_place_of_while_it_is_written_is_not_touched(
+    tmp_path, monkeypatch, moment
+):
+    folder, other = tmp_path / "mine", tmp_path / "other"
+    own = OwnFiles(folder, REPORT)
+    own.replace({"index.html": "first", "summary.json": "{}"})
+    other.mkdir()
+    for name in ("index.html", "summary.json"):
+        (other / name).write_text("another's")
+    was, plain = tree(other), getattr(own_files, moment)
+
+    def swapped(*args, **words):
+        if not folder.is_symlink():
+            folder.rename(tmp_path / "moved")
+            folder.symlink_to(other)
+        return plain(*args, **words)
+
+    monkeypatch.setattr(own_files, moment, swapped)
+    own.replace({"index.html": "second", "summary.json": "[]"})
+    assert tree(other) == was
+    assert tree(tmp_path / "moved")["index.html"] == b"second"
+    assert len(tree(tmp_path / "moved")) == 3

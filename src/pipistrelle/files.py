@@ -7,6 +7,8 @@ Folders that we write into: which files in them are ours, and how these are repl
 
 ``SHA256SUMS``, as ``sha256sum -c`` reads it, lists what we wrote into a folder. Such lists lie
 beside many downloads, so one is ours only if its first line says so and each name on it is one that
+from collections.abc import Iterator
+from contextlib import contextmanager
 we write. What it names is ours as long as it is an ordinary file of that sum, reached through no
 link. Only that is ever replaced or removed; everything else is somebody's, the list itself too.
 
@@ -32,6 +34,7 @@ from pipistrelle.refusals import refusal, shown
 
 _TURNS = {"LRE", "RLE", "LRO", "RLO", "PDF", "LRI", "RLI", "FSI", "PDI"}
 """Classes of characters that embed, override or isolate a direction of writing."""
+_DESCRIPTORS = Path("/proc/self/fd")
 _PARTIAL = re.compile(r"(.+)\.[0-9a-f]{8}\.partial")
 
 
@@ -124,6 +127,22 @@ def without_links(path: Path) -> Path:
     return Path(os.path.realpath(path))  # Path.resolve raises RuntimeError for such a link
 
 
+@contextmanager
+def held(folder: Path) -> Iterator[Path]:
+    """Lend a path that leads to a folder even if another is put in its place meanwhile.
+
+    On Linux it leads by a descriptor; elsewhere it is the folder's own path.
+    """
+    if not hasattr(os, "O_PATH") or not _DESCRIPTORS.is_dir():
+        yield folder
+        return
+    descriptor = os.open(folder, os.O_PATH | os.O_DIRECTORY)
+    try:
+        yield _DESCRIPTORS / str(descriptor)
+    finally:
+        os.close(descriptor)
+
+
 def partial_of(path: Path) -> Path:
     """Return a new name beside a file, under which it is written before it is whole."""
     return path.with_name(f"{path.name}.{uuid4().hex[:8]}.partial")
@@ -148,8 +167,9 @@ class PiecesFile:
     """
 
     def __init__(self, path: Path) -> None:
-        self.path = partial_of(path)
-        self._file = self.path.open("xb")
+        self.path, self._whole = partial_of(path), path
+        with self._faults_named():
+            self._file = self.path.open("xb")
         self._sum = sha256()
 
     @property
@@ -159,21 +179,39 @@ class PiecesFile:
 
     def write(self, data: bytes) -> None:
         """Write one more piece."""
-        self._file.write(data)
+        with self._faults_named():
+            self._file.write(data)
         self._sum.update(data)
 
     def close(self) -> None:
         """Write all down to the disk."""
         if not self._file.closed:
-            self._file.flush()
-            os.fsync(self._file.fileno())
-            self._file.close()
+            with self._faults_named():
+                self._file.flush()
+                os.fsync(self._file.fileno())
+                self._file.close()
 
     def discard(self) -> None:
         """Remove the file where it was not put in its place."""
-        with contextlib.suppress(OSError):
+        with contextlib.suppress(OSError):  # on a full disk, it writes what is left
             self._file.close()
+        with contextlib.suppress(OSError):
             self.path.unlink(missing_ok=True)
+
+    @contextmanager
+    def _faults_named(self) -> Iterator[None]:
+        """Refuse with the file's name what the system cannot write."""
+        try:
+            yield
+        except OSError as error:
+            raise not_written(self._whole, error) from error
+
+
+def not_written(path: Path, error: OSError) -> InputError:
+    """Return the error for a file or folder that could not be written."""
+    return InputError(
+        f"{path}: could not be written ({error.strerror}); make room or name another folder"
+    )
 
 
 def whole_name(partial: str) -> str | None:
@@ -345,8 +383,9 @@ def claim(
     try:
         made = make_folder(folder)
         try:
-            TemporaryFile(dir=folder).close()
-            empty = all(whole_name(path.name) == SUMS for path in folder.iterdir())
+            with held(folder) as place:
+                TemporaryFile(dir=place).close()
+                empty = all(whole_name(path.name) == SUMS for path in place.iterdir())
         finally:
             remove_empty(made)
     except OSError as error:
@@ -431,6 +470,8 @@ class OwnFiles:
 
     def __init__(self, folder: Path, kind: Kind) -> None:
         self.folder, self.kind = folder, kind
+        self._place = folder
+        """Leads to the folder while it is written to (`held`)."""
         self._list = _list_in(folder)
         self._there, self._sums = _sums_of(self._list)
 
@@ -471,7 +512,7 @@ class OwnFiles:
     def check(self) -> None:
         """Refuse a folder that holds changed files under the names to be replaced."""
         self.check_kind()
-        named = (name for name in _names_in(self.folder) if _matches(name, self.kind.names))
+        named = (name for name in _names_in(self._place) if _matches(name, self.kind.names))
         for name in sorted({*named, *self._sums}):
             self.refuse(name)
 
@@ -479,19 +520,20 @@ class OwnFiles:
         """Refuse to replace a file that we did not write or that was changed since."""
         if "\n" in name:
             raise InputError(f"{name!r}: holds a line break; choose another name")
-        if self._there is None and os.path.lexists(self.folder / SUMS):
+        if self._there is None and os.path.lexists(self._place / SUMS):
             raise _in_the_way(self.folder / SUMS, "is not Pipistrelle's")
         for parent in reversed(PurePosixPath(name).parents[:-1]):
-            place = self.folder / parent
+            place = self._place / parent
             if place.is_symlink() or (place.exists() and not place.is_dir()):
-                raise _in_the_way(place, "is a link" if place.is_symlink() else "is no folder")
-        if os.path.lexists(self.folder / name) and not self._is_ours(name):
+                what = "is a link" if place.is_symlink() else "is no folder"
+                raise _in_the_way(self.folder / parent, what)
+        if os.path.lexists(self._place / name) and not self._is_ours(name):
             changed, strange = "was changed since Pipistrelle wrote it", "is not Pipistrelle's"
             raise _in_the_way(self.folder / name, changed if name in self._sums else strange)
 
     def _is_ours(self, name: str) -> bool:
         """Tell whether a file is as we wrote it."""
-        path = self.folder / name
+        path = self._place / name
         if name not in self._sums or path.is_symlink() or not path.is_file():
             return False
         with contextlib.suppress(OSError):
@@ -514,20 +556,39 @@ class OwnFiles:
             As `check`; also where somebody else has written here since this object was made, or
             where there is no room, and all is as it was.
         """
-        if _list_in(self.folder) != self._list:
-            raise InputError(
-                f"{self.folder}: somebody else wrote into it meanwhile, so nothing there is "
-                "replaced; name another folder"
-            )
-        self.check()
         self._write(files, keep=False)
 
     def add(self, name: str, content: bytes) -> None:
         """Write one file beside the others, in place of what we wrote there before."""
-        self.check_kind()
         self._write({name: content}, keep=True)
 
     def _write(self, files: Mapping[str, str | bytes | PiecesFile], *, keep: bool) -> None:
+        """Write files into the folder that is there now, and into no other."""
+        made: list[Path] = []
+        try:
+            made = make_folder(self.folder)
+            with held(self.folder) as self._place:
+                if keep:
+                    self.check_kind()
+                else:
+                    self._check_list()
+                    self.check()
+                self._write_held(files, keep=keep)
+        except OSError as error:
+            raise not_written(self.folder, error) from error
+        finally:
+            self._place = self.folder
+            remove_empty(made)
+
+    def _check_list(self) -> None:
+        """Refuse a folder whose list is another than it was."""
+        if _list_in(self._place) != self._list:
+            raise InputError(
+                f"{self.folder}: somebody else wrote into it meanwhile, so nothing there is "
+                "replaced; name another folder"
+            )
+
+    def _write_held(self, files: Mapping[str, str | bytes | PiecesFile], *, keep: bool) -> None:
         """Write files under other names, list them, and then give them their own."""
         contents = {n: c.encode() if isinstance(c, str) else c for n, c in files.items()}
         for name in contents:
@@ -536,14 +597,15 @@ class OwnFiles:
             self.refuse(name)
         before, new = self._sums, {n: {_sum_of(c)} for n, c in contents.items()}
         partials = {
-            name: c.path if isinstance(c, PiecesFile) else partial_of(self.folder / name)
+            name: (self._place / name).with_name(c.path.name)
+            if isinstance(c, PiecesFile)
+            else partial_of(self._place / name)
             for name, c in contents.items()
         }
         made: list[Path] = []
         at = self.folder
         try:
             try:
-                made = make_folder(self.folder)
                 self._list_sums({n: before.get(n, set()) | new.get(n, set()) for n in before | new})
                 for name, partial in partials.items():
                     at = self.folder / name
@@ -557,9 +619,7 @@ class OwnFiles:
             self._put_in_place(partials, () if keep else before.keys() - new.keys())
             self._list_sums(before | new if keep else new)
         except OSError as error:
-            raise InputError(
-                f"{at}: could not be written ({error.strerror}); make room or name another folder"
-            ) from error
+            raise not_written(at, error) from error
         finally:
             with contextlib.suppress(OSError):
                 _remove(partials.values())
@@ -573,21 +633,21 @@ class OwnFiles:
             if sums:
                 self._list_sums(sums)
             elif self._there:
-                (self.folder / SUMS).unlink(missing_ok=True)
+                (self._place / SUMS).unlink(missing_ok=True)
         remove_empty(made)
 
     def _put_in_place(self, partials: Mapping[str, Path], old: Iterable[str]) -> None:
         """Give files their names; take away what is old, and what a killed process left."""
         *_, last = partials
-        _remove(self.folder / name for name in (*([last] if last in self._sums else ()), *old))
-        left = (self.folder / name for name in _names_in(self.folder) if self._is_left(name))
+        _remove(self._place / name for name in (*([last] if last in self._sums else ()), *old))
+        left = (self._place / name for name in _names_in(self._place) if self._is_left(name))
         _remove([path for path in left if path not in partials.values()])
         for name, partial in partials.items():
-            put_in_place(partial, self.folder / name, replace=self._is_ours(name))
+            put_in_place(partial, self._place / name, replace=self._is_ours(name))
 
     def _is_left(self, name: str) -> bool:
         """Tell whether a file is what a killed process left of one of ours."""
-        path = self.folder / name
+        path = self._place / name
         return whole_name(name) in (*self._sums, SUMS) and path.is_file() and not path.is_symlink()
 
     def _list_sums(self, sums: Mapping[str, set[str]]) -> None:
@@ -595,7 +655,7 @@ class OwnFiles:
         lines = [f"{one}  {name}" for name, some in sums.items() for one in sorted(some)]
         text = "\n".join([_HEAD.format(self.kind.title), *lines, ""])
         data = text.encode(errors="surrogateescape")
-        write_whole(self.folder / SUMS, data, replace=self._there is not None)
+        write_whole(self._place / SUMS, data, replace=self._there is not None)
         self._list, self._there, self._sums = data, self.kind.title, dict(sums)
 
 
