@@ -27,7 +27,12 @@ def place(tmp_path: Path, code: str = SHOW, **environment: str) -> tuple[Path, l
     inherited = {name: value for name, value in os.environ.items() if name not in unset}
     inherited |= {"HOME": str(tmp_path), "TMPDIR": str(tmp_path / "tmp")} | environment
     done = subprocess.run(
-        [sys.executable, "-c", code], env=inherited, capture_output=True, text=True, check=True
+        [sys.executable, "-c", code],
+        env=inherited,
+        capture_output=True,
+        text=True,
+        check=True,
+        timeout=300,
     )
     return Path(done.stdout.strip()), done.stderr.splitlines()
 
@@ -167,6 +172,7 @@ def emptied(_: bytes) -> bytes:
     return b""
 
 
+PIPE = "a pipe that nobody writes into"
 AT_NIGHT = [("nbi", flipped), ("nbi", emptied), ("nbc", cut), ("nbc", emptied)]
 
 
@@ -174,6 +180,7 @@ AT_NIGHT = [("nbi", flipped), ("nbi", emptied), ("nbc", cut), ("nbc", emptied)]
     ("kind", "damage"),
     [
         ("nbi", cut),
+        pytest.param("nbi", PIPE, marks=pytest.mark.skipif(os.name != "posix", reason="pipes")),
         ("nbc", flipped),
         *(pytest.param(*one, marks=pytest.mark.slow) for one in AT_NIGHT),
     ],
@@ -184,7 +191,12 @@ def test_a_damaged_file_is_thrown_away_and_its_kernel_compiled_anew(tmp_path, ki
     kept = sorted(folder.rglob(f"*.{kind}"))
     assert kept
     for path in kept:
-        path.write_bytes(damage(path.read_bytes()))
+        data = path.read_bytes()
+        path.unlink()
+        if damage is PIPE:
+            os.mkfifo(path)
+        else:
+            path.write_bytes(damage(data))
     _, again = place(tmp_path, "import sys; " + turned)
     damaged = [line for line in again if "compiled kernels were damaged" in line]
     assert len(damaged) == 1

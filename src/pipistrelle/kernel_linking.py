@@ -19,6 +19,7 @@ from functools import cached_property
 from hashlib import sha256
 from io import BytesIO
 from pathlib import Path
+from stat import S_ISREG
 from typing import Any
 
 import numba
@@ -70,13 +71,15 @@ class CheckedFiles(IndexDataCacheFile):
     def _is_sound(self, path: Path) -> bool:
         """Tell whether a file is as it was written, or is not there; remove any other."""
         try:
-            found = path.read_bytes()
+            state = path.stat()
+            if S_ISREG(state.st_mode):  # a pipe would be waited for
+                found = path.read_bytes()
+                if sha256(found[:-32]).digest() == found[-32:]:
+                    return True
         except FileNotFoundError:
             return True
         except OSError:
             return False
-        if sha256(found[:-32]).digest() == found[-32:]:
-            return True
         _say(f"{path.parent.parent}: compiled kernels were damaged, and are compiled anew")
         with suppress(OSError):
             path.unlink()
