@@ -253,6 +253,14 @@ ODD = {
         "cannot be built: ZeroDivisionError: division by zero",
     ),
     "a title": (f"class Mine:{PARTS}\n    title = 3", "title: found 3, expected text"),
+    "a title of two lines": (
+        f"class Mine:{PARTS}\n    title = 'a\\nb'",
+        r"title: found 'a\nb', expected text in one line that can be printed",
+    ),
+    "a title that turns": (
+        f"class Mine:{PARTS}\n    title = '\\u202eb'",
+        r"title: found '\u202eb', expected text in one line that can be printed",
+    ),
     "a limit": (
         f"class Mine:{PARTS}\n    nees_limit = 0",
         "nees_limit: found 0, expected a",

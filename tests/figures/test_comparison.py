@@ -107,6 +107,13 @@ def test_names_are_no_formulae_and_long_ones_end_as_they_end(tmp_path):
     save_figure(figure, tmp_path / "out", "comparison")
 
 
+def test_the_title_of_an_estimate_with_dollars_is_shown_as_text(tmp_path):
+    paths = {("fused", "own:$x^{$"): loop()}
+    figure = draw_comparison(missions_of(tmp_path, paths, paths))
+    assert "$x^{$" in figure.axes[0].get_title(loc="left")
+    save_figure(figure, tmp_path / "out", "comparison")
+
+
 def test_a_path_that_is_lost_or_far_away_leaves_the_others_to_be_seen(tmp_path):
     far = OFF + np.linspace(0.0, 1e6, len(OFF))[:, None]
     paths = [{("fused", "ekf"): p} for p in (OFF, LOST, far)]

@@ -118,6 +118,12 @@ def test_a_head_names_strategy_and_filter_side_by_side_a_strangers_too():
     assert left.y0 == pytest.approx(right.y0, abs=1.0)
 
 
+def test_a_head_shows_a_title_with_dollars_as_text(tmp_path):
+    figure = Figure()
+    head(figure.add_subplot(), "fused", "$x^{$")
+    figure.savefig(tmp_path / "head.png")
+
+
 def test_callers_are_drawn_as_stars_where_they_stand_and_as_lines_where_they_move():
     angle = np.linspace(0.0, 6.0, 50)
     path = 40.0 * np.column_stack([np.cos(angle), np.sin(angle)])

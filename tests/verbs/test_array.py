@@ -43,6 +43,12 @@ def test_the_picture_is_written_where_it_is_asked_for_and_nothing_is_replaced(ob
     assert Path("new/square.png").read_bytes() != picture
 
 
+def test_a_file_with_dollars_in_its_name_is_drawn(obey):
+    Path("$x^{$.csv").write_text(LINE)
+    status, _, said = obey("array", "$x^{$.csv", "-o", "line.png", "--quiet")
+    assert (status, said) == (0, "")
+
+
 @pytest.mark.parametrize(
     ("words", "said"),
     [

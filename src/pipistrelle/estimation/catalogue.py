@@ -88,14 +88,14 @@ def class_of(role: Role, name: str) -> type:
 def title_met(name: str) -> str | None:
     """Return the title of a class from outside that is imported already; import nothing.
 
-    It is None where the class is not imported or has no title.
+    It is None where the class is not imported or has no title that can be printed.
 
     >>> title_met("never.imported:Here") is None
     True
     """
     module, _, wanted = name.partition(":")
     title = getattr(getattr(sys.modules.get(module), wanted, None), "title", None)
-    return title if isinstance(title, str) else None
+    return title if isinstance(title, str) and title.isprintable() else None
 
 
 def build(role: Role, name: str, kind: Any, given: tuple[Any, ...], values: dict[str, Any]) -> Any:
@@ -240,8 +240,9 @@ def entry(name: str) -> Entry:
         return CATALOGUE[name]
     kind: Any = class_of(ESTIMATOR, check_name(name))
     title, limit = getattr(kind, "title", kind.__name__), getattr(kind, "nees_limit", math.inf)
-    if not isinstance(title, str):
-        raise InputError(f"filter {name}: title: found {title!r}, expected text")
+    if not (isinstance(title, str) and title.isprintable()):
+        expected = "text in one line that can be printed"
+        raise InputError(f"filter {name}: title: found {title!r}, expected {expected}")
     if not isinstance(limit, (int, float)) or not limit > 0.0:
         raise InputError(f"filter {name}: nees_limit: found {limit!r}, expected a number above 0")
     return Entry(

@@ -8,6 +8,7 @@ import numpy as np
 from pipistrelle.arrays.array_file import Microphones
 from pipistrelle.arrays.beamforming import Pattern, beam_power, spread_towards
 from pipistrelle.arrays.layout import Scattered
+from pipistrelle.figures.chart_plot import PLAIN
 from pipistrelle.figures.style import INK, STRATEGY_COLOURS, STYLE, TRUTH
 
 if TYPE_CHECKING:
@@ -42,7 +43,7 @@ def draw_array(
     matplotlib.use("Agg")
     from matplotlib.figure import Figure
 
-    with matplotlib.rc_context(STYLE):
+    with matplotlib.rc_context(STYLE | PLAIN):
         figure = Figure(figsize=(11.0, 4.6), layout="constrained")
         places = figure.add_subplot(1, 3, 1)
         _draw_places(places, microphones, layout)

@@ -64,7 +64,8 @@ def _draw_missions(compared: ComparedMissions) -> "Figure":
             _draw_paths(axes, compared, estimate, fitted=fitted)
             axes.set(xlim=limits[0], ylim=limits[1], aspect="equal", xlabel="x [m]")
         raw.set_ylabel("y [m]")
-        raw.set_title(", ".join(filter(None, [estimate.title, "as they are"])), loc="left")
+        title = ", ".join(filter(None, [estimate.title, "as they are"]))
+        raw.set_title(title, loc="left", parse_math=False)
         whom = "its truth" if known else "the first"
         aligned.set_title(f"each turned and shifted onto {whom}", loc="left")
         _draw_errors(figure, (grid[2 * row, 2], grid[2 * row + 1, 2]), estimate, known=known)

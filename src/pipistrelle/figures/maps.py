@@ -188,7 +188,7 @@ def head(axes: "Axes", strategy: str, estimator: str, name: str = "") -> "Annota
     style = {"color": strategy_colour(strategy), "fontsize": 13, "weight": "bold"}
     first = axes.annotate(name or strategy, xytext=(0, 21), **style, **above)
     beside = above | {"xy": (1, 0), "xycoords": first, "va": "bottom"}
-    axes.annotate(title_of(estimator), xytext=(6, 0), fontsize=13, **beside)
+    axes.annotate(title_of(estimator), xytext=(6, 0), fontsize=13, parse_math=False, **beside)
     return axes.annotate("", xytext=(0, 7), fontsize=9.5, **above)
 
 

@@ -115,6 +115,13 @@ def test_channels_that_are_dead_clipped_or_off_zero_are_named(tape):
     assert len(faults) == 4  # and that the order was not looked at
 
 
+def test_silence_says_nothing_of_the_sample_rate(tape):
+    with_samples(tape, lambda samples: samples.fill(0.0))
+    faults = checked(tape)
+    assert any("dead" in fault for fault in faults)
+    assert not any("sample rate" in fault for fault in faults)
+
+
 def test_a_sample_rate_that_does_not_fit_the_call_is_told_with_the_one_that_would(tape):
     samples, _ = soundfile.read(tape / "recording.wav", dtype="float32")
     soundfile.write(tape / "recording.wav", samples, 192_000, subtype="PCM_16")

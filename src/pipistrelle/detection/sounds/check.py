@@ -351,8 +351,8 @@ def _tone_rate(
         windowed = (samples - samples.mean(axis=0)) * np.hanning(len(samples))[:, np.newaxis]
         power += (np.abs(np.fft.rfft(windowed, 8 * length, axis=0)) ** 2).sum(axis=1)
     peak = int(power[1:-1].argmax()) + 1
-    if power[peak] < 50.0 * np.median(power):
-        return  # nothing leaks
+    if not power[peak] > 50.0 * np.median(power):
+        return  # nothing leaks, or all is silence
     a, b, c = np.log(power[peak - 1 : peak + 2])
     found = (peak + 0.5 * (a - c) / (a - 2.0 * b + c)) * sound.rate / (8 * length)
     own = sent.frequency
