@@ -108,7 +108,7 @@ AT_THE_DISK = {
     "report/page/page.py": {"read_text"},
     "files.py": {"read_bytes", "open", "unlink", "rmdir"},
     "figures/player/rerun_file.py": {"read_bytes"},  # what it wrote into a temporary folder
-    "kernel_linking.py": {"read_bytes", "unlink"},  # our own cache
+    "kernel_linking.py": {"read_bytes", "unlink", "rmdir"},  # our own cache
     "kernel_folder.py": {"read_bytes", "rmtree", "open"},  # a file that is locked is opened
     "verbs/streams.py": {"open"},  # /dev/null
     "version.py": {"read_text"},  # our own pyproject.toml

@@ -127,7 +127,7 @@ def without_links(path: Path) -> Path:
     return Path(os.path.realpath(path))  # Path.resolve raises RuntimeError for such a link
 
 
-@contextmanager
+@contextlib.contextmanager
 def held(folder: Path) -> Iterator[Path]:
     """Lend a path that leads to a folder even if another is put in its place meanwhile.
 
@@ -198,7 +198,7 @@ class PiecesFile:
         with contextlib.suppress(OSError):
             self.path.unlink(missing_ok=True)
 
-    @contextmanager
+    @contextlib.contextmanager
     def _faults_named(self) -> Iterator[None]:
         """Refuse with the file's name what the system cannot write."""
         try:

@@ -31,7 +31,7 @@ UNTIL_KILLED = """\
 import os, signal, sys
 from pathlib import Path
 from pipistrelle import files
-from pipistrelle.experiments.studies import world_files
+from pipistrelle.experiments.studies import world as world_files
 from pipistrelle.experiments.studies.plan import read_plan
 from pipistrelle.experiments.studies.study import run_study
 

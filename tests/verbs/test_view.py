@@ -193,7 +193,6 @@ def test_a_disk_that_is_full_leaves_what_was_there(obey, folder, refused, monkey
         raise OSError(28, "No space left on device")
 
     monkeypatch.setattr("pipistrelle.files.write_down", full)
-    monkeypatch.setattr("pipistrelle.files.write_down", full)
     said = refused("view", folder, "--quiet", "--overwrite", "-o", "page.html")
     assert "page.html: could not be written (No space left on device); make room" in said
     assert Path("page.html").read_text() == "mine"
