@@ -5,11 +5,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from pipistrelle.config import FastSlamConfig
 from pipistrelle.detection.scans import make_scan
 from pipistrelle.estimation.beliefs import Gaussian, placed
 from pipistrelle.estimation.ekf.filter import EkfSlam, InvariantEkfSlam
-from pipistrelle.estimation.fastslam.filter import FastSlam
 from pipistrelle.estimation.measurement import excess_path_of, landmark_range
 from pipistrelle.estimation.smoother.filter import Smoother
 from reference.missions import BICYCLE, map_with, ray_config
@@ -17,7 +15,6 @@ from reference.missions import BICYCLE, map_with, ray_config
 ESTIMATORS = [
     EkfSlam(motion=BICYCLE, rays=ray_config()),
     InvariantEkfSlam(motion=BICYCLE, rays=ray_config()),
-    FastSlam(motion=BICYCLE, rays=ray_config(), settings=FastSlamConfig(particles=64)),
     Smoother(motion=BICYCLE, rays=ray_config()),
 ]
 HERE, CALLER = np.zeros(2), np.array([10.0, 0.0])

@@ -85,23 +85,6 @@ def test_fastslam_learns_from_it_what_the_linear_update_does():
     np.testing.assert_allclose(np.sqrt(np.diag(after.covariance)), spread, rtol=0.15)
 
 
-def test_fastslam_lights_landmarks_up_by_a_caller_whose_place_is_known():
-    known = map_with([7], [[1.0, 3.0]], [1e-6 * np.eye(2)])
-    belief = FASTSLAM.knowing(FASTSLAM.init(replace(START, covariance=1e-6 * np.eye(3))), known)
-    spot = np.array([8.0, -1.0])
-    bearing = range_and_bearing(START.mean, spot[None])[1]
-    over = np.hypot(*(spot - known.mean[0])) + np.hypot(*(spot - START.mean[:2]))
-    e = over - np.hypot(*(known.mean[0] - START.mean[:2]))
-    scan = make_scan(
-        0.0, np.array([20]), bearing,
-        caller=1, excess_path=e, excess_path_std=0.02, bearing_std=0.01,
-    )  # fmt: skip
-    scan = replace(scan, callers=np.array([-1, 7]))
-    rows = FASTSLAM.update(belief, scan, np.random.default_rng(7)).landmarks()
-    assert np.sum(rows.landmark == 20) == 1, "placed at once"
-    np.testing.assert_allclose(rows.mean[rows.landmark == 20][0], spot, rtol=0, atol=0.1)
-
-
 @pytest.mark.parametrize("kind", KINDS)
 def test_who_moves_is_not_known_beforehand(kind):
     slam = kind(motion=BICYCLE, rays=ray_config())

@@ -167,7 +167,7 @@ def _ekf(belief: EkfBelief) -> bool:
 def _fastslam(belief: FastSlamBelief) -> Any:
     """Blocks have room for all particles, and particles for all members of their landmarks."""
     blocks, landmarks, lanes = belief.count.shape
-    room, parents, slopes = np.diff(belief.first), belief.parent.size, belief.slope.shape
+    room = np.diff(belief.first)
     if {room.size, belief.landmark.size, belief.best_count.size} != {landmarks}:
         return False
     rows = belief.member.shape[1], len(belief.best_member)
@@ -180,10 +180,7 @@ def _fastslam(belief: FastSlamBelief) -> Any:
         and belief.first[-1] <= min(rows)
         and within(belief.count, 0, 1 + room[:, None])
         and within(belief.best_count, 0, 1 + room)
-        and np.unique(belief.landmark).size == landmarks >= parents
-        and within(belief.parent, -1, landmarks)
-        and slopes in ((blocks, 0, 4 * LANES), (blocks, parents, 4 * LANES))
-        and (slopes[1] or not np.any(belief.parent >= 0))
+        and np.unique(belief.landmark).size == landmarks
         and _is_pose(belief.estimate)
         and _finite(belief.poses)
         and not np.isnan(belief.log_weight).any()

@@ -10,6 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from pipistrelle.config import RayConfig
+from pipistrelle.detection.scans import with_columns
 from pipistrelle.estimation.beliefs import Gaussian
 from pipistrelle.estimation.motion import Motion
 from pipistrelle.estimation.rays import RANGED
@@ -20,6 +21,7 @@ from reference.missions import (
     STEPS_PER_FRAME,
     Mission,
     draw_mission,
+    measured_to,
     ray_config,
     scan_of,
     scattered,
@@ -28,6 +30,7 @@ from reference.odometry import ANYONE, wandering
 from reference.swarms import (
     Drawn,
     arrays_of,
+    assert_same,
     followed,
     members,
     never_resampling,
@@ -281,3 +284,19 @@ def test_update_draws_three_normals_and_a_uniform_number_per_particle_where_it_h
             other.standard_normal((7, 3))
             other.random(7)
         assert rng.bit_generator.state == other.bit_generator.state
+
+
+@pytest.mark.parametrize("gate", [1.0, 0.999])
+def test_a_scan_with_excess_paths_is_used_without_them(gate):
+    slam, mission = swarm_filter(gate=gate), small_mission("fused", frames=8)
+    plain, timed = slam.init(START), slam.init(START)
+    for k, scan in enumerate(mission.scans):
+        excess_path = np.where(np.isnan(scan.range), 4.0 + 0.1 * scan.landmark, np.nan)
+        scan = measured_to(scan, 0.2, 0.15)
+        by_others = with_columns(
+            scan, excess_path=excess_path, excess_path_std=0.1, caller=np.isnan(scan.range) * 1
+        )
+        plain = slam.update(plain, scan, np.random.default_rng(k))
+        timed = slam.update(timed, by_others, np.random.default_rng(k))
+        assert_same(plain, timed)
+    assert np.isfinite(by_others.excess_path).any()

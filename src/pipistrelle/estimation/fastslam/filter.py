@@ -48,28 +48,8 @@ proposal is refined to the mean and covariance of the mixture of its members' re
 A frame without measurements is not sampled: its motion goes on accumulating, which loses nothing.
 The start is not sampled either: its covariance P0 is the first that accumulates.
 
-**Excess paths** (`measurement.excess_path_of`) depend on two landmarks, which are then no longer
-independent given the path. They are independent given the path and the caller's place: each
-landmark is a Gaussian conditional on its caller (`block_conditional`), which is the joint Gaussian
-of them all. Were the caller's error drawn anew for each excess path, the map would grow surer than
-it is. With excess paths the steps change:
-
-- *Propose*: excess paths neither refine nor weigh a pose, though theory allows it: in twelve worlds
-  a thousand particles then had a median NEES of 19 to 50 instead of 2, and positions off by 0.6 to
-  0.7 m instead of 0.4 to 0.5 m, because within a few frames only the paths survived whose first
-  turn was the same. Excess paths reach the weights through the map, and even that needs more
-  particles: over 115 worlds the mean NEES is 3 to 5 instead of 2 to 3. Bearings and ranges weigh
-  with each landmark's marginal; the error that landmarks of one caller share made no difference
-  there.
-- *Correct*: range, bearing and excess path of a landmark correct it and its caller.
-- *Place*: where bearing and excess path give the range to a fifth of itself, a landmark is placed
-  at once, or replaces its ray. Elsewhere (it stands between caller and vehicle, or the angle at it
-  is wide) it is, or stays, a ray.
-
-Excess paths of a caller are ignored until it has one hypothesis with a standard deviation of at
-most a fifth of its distance: some 15 to 55 frames in the paper's worlds. So are those of a second
-caller of a landmark, as each landmark has one parent, and those of a landmark without a bearing in
-the frame.
+Excess paths are not used: they tie each landmark to a caller, and the paper's FastSLAM has a
+Gaussian for each landmark of its own. A scan that has them is used without them.
 
 Landmarks of all particles: their moments, taken out, and two that become one.
 """
@@ -83,7 +63,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from pipistrelle.config import FastSlamConfig, InputError, RayConfig
-from pipistrelle.detection.scans import Scan, rows_of, with_columns
+from pipistrelle.detection.scans import Scan, rows_of
 from pipistrelle.estimation.beliefs import (
     NO_INNOVATIONS,
     Gaussian,
@@ -100,8 +80,6 @@ from pipistrelle.estimation.checking import (
     usable_scan,
 )
 from pipistrelle.estimation.fastslam.block import LANES, MEMBER
-from pipistrelle.estimation.fastslam.block_conditional import SLOPES
-from pipistrelle.estimation.fastslam.conditional_landmarks import Parents, resample_slopes
 from pipistrelle.estimation.fastslam.particles import (
     Arrays,
     correct_particles,
@@ -120,7 +98,7 @@ from pipistrelle.estimation.fastslam.poses import (
     stratified,
     summarise,
 )
-from pipistrelle.estimation.measurement import Timings, columns_of, timings_of
+from pipistrelle.estimation.measurement import columns_of
 from pipistrelle.estimation.motion import Motion, motion_numbers
 from pipistrelle.estimation.rays import UpdateParams, update_params
 from pipistrelle.geometry import wrap
@@ -154,10 +132,6 @@ class FastSlamBelief:
     full: float  # weighted mean number of fully initialised landmarks
     gated: int
     innovations: Innovations = NO_INNOVATIONS  # of the heaviest particle before each scan
-    parent: Int[np.ndarray, " parents"]
-    """Each landmark's parent, or -1 (`conditional_landmarks`), when excess paths came last."""
-    slope: Float[np.ndarray, "b parents_or_0 slopes"]
-    """(b, n, 4 L), the slopes by the parent; no rows while no landmark has one."""
     best: int = 0  # the heaviest particle, or after a resampling its first copy
     mixed: bool = False  # whether the map is that of all particles
     before: "FastSlamBelief | None" = (
@@ -240,8 +214,6 @@ class FastSlam:
             best_member=np.empty((0, 6)),
             full=0.0,
             gated=0,
-            parent=np.empty(0, dtype=np.int64),
-            slope=np.empty((blocks, 0, SLOPES)),
             mixed=self.settings.estimate == "mixture",
         )
 
@@ -305,9 +277,9 @@ class FastSlam:
         params = update_params(self.rays, self.gate, exact=self.settings.mixture == "exact")
         inside, gated = self._inside(belief, scan, params)
         most = int(belief.log_weight.argmax())
-        off = innovations_of(_arrays(belief)[0], columns_of(inside), most)
-        (poses, landmark, first, count, member), (parent, slope), gained = correct_particles(
-            *_arrays(belief), columns_of(inside), _timings(belief, inside), normal, params, sampled
+        off = innovations_of(_arrays(belief), columns_of(inside), most)
+        (poses, landmark, first, count, member), gained = correct_particles(
+            _arrays(belief), columns_of(inside), normal, params, sampled
         )
         weight = normalised(belief.log_weight + gained)
         best = int(np.argmax(weight))
@@ -326,8 +298,6 @@ class FastSlam:
             full=mean_full(count, weight),
             gated=belief.gated + gated,
             innovations=belief.innovations.plus(*off),
-            parent=parent,
-            slope=slope,
             best=best,
             mixed=belief.mixed,
         )
@@ -343,8 +313,7 @@ class FastSlam:
 
     def _resampled(self, belief: FastSlamBelief, ancestor: Int[np.ndarray, " p"]) -> FastSlamBelief:
         """Replace the particles by copies of the ancestors, with equal weights."""
-        arrays, (_, slope) = _arrays(belief)
-        poses, count, member = resample_into(arrays, ancestor)
+        poses, count, member = resample_into(_arrays(belief), ancestor)
         if self.settings.resampled_rays == "restart":
             restart_rays(belief.first, count, member)
         log_weight = np.full(ancestor.size, -math.log(ancestor.size))
@@ -354,32 +323,21 @@ class FastSlam:
             log_weight=log_weight,
             count=count,
             member=member,
-            slope=resample_slopes(slope, ancestor) if slope.size else slope,
             best=int(np.argmax(ancestor == belief.best)),
             before=belief if belief.mixed else None,
         )
 
     def _inside(self, belief: FastSlamBelief, scan: Scan, params: UpdateParams) -> tuple[Scan, int]:
-        """Drop rows and excess paths that no particle expected; return how many of each, summed."""
+        """Return a scan without the measurements that no particle expected, and their number."""
         if self.gate >= 1.0:
             return scan, 0
-        dropped, late = gated_by_all(
-            *_arrays(belief), columns_of(scan), _timings(belief, scan), params
-        )
-        if late.any():
-            scan = with_columns(scan, excess_path=np.where(late, np.nan, scan.excess_path))
-        return rows_of(scan, ~dropped), int(np.count_nonzero(dropped) + np.count_nonzero(late))
+        gated = gated_by_all(_arrays(belief), columns_of(scan), params)
+        return rows_of(scan, ~gated), int(np.count_nonzero(gated))
 
 
-def _arrays(belief: FastSlamBelief) -> tuple[Arrays, Parents]:
-    """Return a belief's particles and parents as kernels take them."""
-    arrays = belief.poses, belief.landmark, belief.first, belief.count, belief.member
-    return arrays, (belief.parent, belief.slope)
-
-
-def _timings(belief: FastSlamBelief, scan: Scan) -> Timings | None:
-    """Return a scan's caller columns; None without excess paths where no landmark has a parent."""
-    return timings_of(scan) if belief.slope.size == 0 else (scan.caller, scan.callers, scan.moving)
+def _arrays(belief: FastSlamBelief) -> Arrays:
+    """Return a belief's particles as kernels take them."""
+    return belief.poses, belief.landmark, belief.first, belief.count, belief.member
 
 
 def _rows(
@@ -472,9 +430,8 @@ def joint_of(belief: FastSlamBelief) -> JointGaussian:
     .. math:: \bar x = \sum_i w_i x_i, \qquad
               P = \sum_i w_i \left( (x_i - \bar x)(x_i - \bar x)^T + P_i \right)
 
-    with each particle's own covariances :math:`P_i` of its pose and of its landmarks, of which
-    those of one parent share that parent's error. A landmark counts that most particles have
-    placed; where one has not, it is at the mean.
+    with each particle's own covariances :math:`P_i` of its pose and of its landmarks. A landmark
+    counts that most particles have placed; where one has not, it is at the mean.
     """
     there, weight, placed, members, share, spots = _placed_by_most(belief)
     rows = _numbers(belief.poses, 9)[: weight.size]
@@ -484,41 +441,10 @@ def joint_of(belief: FastSlamBelief) -> JointGaussian:
     off = np.hstack([rows[:, :3], points.reshape(weight.size, 2 * there.size)]) - mean
     covariance = np.einsum("p,pd,pe->de", weight, off, off, optimize=True)
     covariance[:3, :3] += _packed(np.einsum("p,pe->e", weight, rows[:, 3:9]))
-    covariance[3:, 3:] += _by_parents(belief, there, members, weight[:, np.newaxis] * placed)
     own = np.einsum("pn,pne->ne", share, members[..., 2:5])
     for n, (xx, xy, yy) in enumerate(own.tolist()):
         covariance[3 + 2 * n : 5 + 2 * n, 3 + 2 * n : 5 + 2 * n] += [[xx, xy], [xy, yy]]
     return JointGaussian(landmark=belief.landmark[there], mean=mean, covariance=covariance)
-
-
-def _by_parents(
-    belief: FastSlamBelief,
-    there: Int[np.ndarray, " k"],
-    members: Float[np.ndarray, "p k 6"],
-    weight: Float[np.ndarray, "p k"],
-) -> Float[np.ndarray, "d d"]:
-    """Return what landmarks have in common by their parents' errors, in the mean over particles.
-
-    ``weight``: of each particle where it has placed a landmark, else 0.
-    """
-    size, parent = there.size, np.full(belief.landmark.size, -1)
-    parent[: belief.parent.size] = belief.parent
-    common = np.zeros((size, size, 2, 2))
-    for h in np.intersect1d(parent, there).tolist():
-        family = np.append(np.flatnonzero(parent[there] == h), np.flatnonzero(there == h))
-        A = np.zeros((len(weight), family.size, 4))
-        A[:, :-1] = _numbers(belief.slope[:, there[family[:-1]]], 4)[: len(weight)]
-        A[:, -1] = 1.0, 0.0, 0.0, 1.0
-        A *= np.sqrt(weight[:, family, np.newaxis])
-        by_x, by_y = A[..., ::2], A[..., 1::2]
-        xx, xy, yy = np.moveaxis(members[:, family[-1:], 2:5, np.newaxis], 2, 0)
-        AB = np.stack([by_x * xx + by_y * xy, by_x * xy + by_y * yy])
-        flat = 2 * len(weight), 2 * family.size
-        both = AB.reshape(flat), np.stack([by_x, by_y]).reshape(flat)
-        ABA = np.einsum("kd,ke->de", *both, optimize=True).reshape(family.size, 2, family.size, 2)
-        common[np.ix_(family, family)] += np.swapaxes(ABA, 1, 2)
-    common[np.arange(size), np.arange(size)] = 0.0
-    return np.swapaxes(common, 1, 2).reshape(2 * size, 2 * size)
 
 
 def _numbers(blocks: np.ndarray, count: int) -> np.ndarray:
@@ -573,9 +499,6 @@ def _without(
     """Return the arrays of a belief of which some landmarks are left, by their new labels."""
     rows = np.diff(belief.first)
     members = np.repeat(kept, rows)
-    number = np.where(kept, np.cumsum(kept) - 1, -1)
-    parents, slopes = belief.parent.size, belief.slope.shape[1]
-    parent = belief.parent[kept[:parents]]
     return {
         "landmark": landmark[kept],
         "first": np.append(0, np.cumsum(rows[kept])),
@@ -583,6 +506,4 @@ def _without(
         "member": np.ascontiguousarray(belief.member[:, members]),
         "best_count": belief.best_count[kept],
         "best_member": belief.best_member[members],
-        "parent": np.where(parent >= 0, number[parent], -1),
-        "slope": np.ascontiguousarray(belief.slope[:, kept[:slopes]]),
     }

@@ -1,6 +1,6 @@
 """Kernels on all particles: gate, correct, resample.
 
-The steps of a block are in `block`, `block_rays` and `conditional_landmarks`.
+The steps of a block are in `block` and `block_rays`.
 
 Landmark n of a block has its members in the rows ``member[b, first[n] : first[n + 1]]``, of which
 lane i has the first ``count[b, n, i]``: the particles share the rows, not the members.
@@ -30,13 +30,6 @@ from pipistrelle.estimation.fastslam.block import (
     squared_innovation,
     weigh_sample,
 )
-from pipistrelle.estimation.fastslam.block_conditional import (
-    Pairs,
-    correct_pair,
-    lanes_with_parent,
-    lanes_with_sure_parent,
-    place_by_excess_path,
-)
 from pipistrelle.estimation.fastslam.block_rays import (
     Rows,
     Scratch,
@@ -52,26 +45,7 @@ from pipistrelle.estimation.fastslam.block_rays import (
     weigh_by_active,
     weigh_by_bearing,
 )
-from pipistrelle.estimation.fastslam.conditional_landmarks import (
-    Parents,
-    ParentsAfter,
-    assign_parents,
-    copy_lanes,
-    copy_row,
-    excess_paths_of_parents,
-    gated_excess_paths,
-    shift_all,
-    slot_of,
-)
-from pipistrelle.estimation.measurement import (
-    Columns,
-    Measurements,
-    Row,
-    Timings,
-    excess_paths,
-    measurements,
-    row_of,
-)
+from pipistrelle.estimation.measurement import Columns, Measurements, Row, measurements, row_of
 from pipistrelle.estimation.rays import ANEW, BEARING, CORRECTED, MOVED, OTHERS, RESET, UpdateParams
 from pipistrelle.jit import Whole, kernel, no_alloc, no_alloc_inlined
 
@@ -100,6 +74,15 @@ class Block(NamedTuple):
     member: Float[np.ndarray, "c numbers"]
 
 
+@no_alloc
+def slot_of(landmark: Int[np.ndarray, " n"], label: Whole) -> Whole:
+    """Return the index of a landmark by its label; -1 if the map lacks it."""
+    for n in range(landmark.size):
+        if landmark[n] == label:
+            return n
+    return -1
+
+
 @kernel
 def _slots(landmark: Int[np.ndarray, " n"], labels: Int[np.ndarray, " m"]) -> Int[np.ndarray, " m"]:
     """Return the index of each label among the landmarks; -1 for a new one."""
@@ -110,18 +93,11 @@ def _slots(landmark: Int[np.ndarray, " n"], labels: Int[np.ndarray, " m"]) -> In
 
 
 @kernel
-def gated_by_all(
-    arrays: Arrays,
-    parents: Parents,
-    columns: Columns,
-    timings: Timings | None,
-    params: UpdateParams,
-) -> tuple[Bool[np.ndarray, " m"], Bool[np.ndarray, " m"]]:
-    """Return masks of the bearings and of the excess paths beyond the gate of every particle."""
+def gated_by_all(arrays: Arrays, columns: Columns, params: UpdateParams) -> Bool[np.ndarray, " m"]:
+    """Return a mask of the measurements that are outside the gate of every particle."""
     particles, heard = Particles(*arrays), measurements(columns)
     slot = _slots(particles.landmark, heard.landmark)
     gated, blocks = np.zeros(columns[0].size, dtype=np.bool_), particles.pose.shape[0]
-    late = np.zeros_like(gated)
     for m in range(slot.size):
         n = slot[m]
         gated[m] = n >= 0
@@ -137,13 +113,7 @@ def gated_by_all(
                 gated[m] = gated[m] and bearing_beyond(
                     pose, rows[j], row_of(heard, m), count, j, params.passive_bound
                 )
-    if timings is not None:
-        timed = excess_paths(columns, timings)
-        late[timed.row] = gated_excess_paths(
-            particles.pose, particles.first, particles.count, particles.member, particles.landmark,
-            parents, timed, params.passive_bound,
-        )  # fmt: skip
-    return gated, late
+    return gated
 
 
 @kernel
@@ -278,44 +248,17 @@ def _correct_row(block: Block, n: Whole, row: Row, params: UpdateParams, scratch
 
 
 @no_alloc
-def _correct_with_parent(
-    block: Block, n: Whole, heard: Measurements, m: Whole, pairs: Pairs
-) -> Whole:
-    """Correct landmark n, copied to ``pairs.row``, with its caller; return in how many lanes."""
-    h, turns = pairs.parent[n], 0
-    if h >= 0:
-        turns = lanes_with_parent(block.count[n], block.count[h], pairs.turn)
-    if turns > 0:
-        copy_row(block.member[block.first[n]], pairs.row)
-        correct_pair(
-            block.pose, block.member[block.first[h]], block.count[h], n, pairs, row_of(heard, m), m
-        )
-    return turns
-
-
-@no_alloc
 def _correct(
     block: Block,
     slot: Int[np.ndarray, " m"],
     heard: Measurements,
-    pairs: Pairs | None,
     params: UpdateParams,
     scratch: Scratch,
 ) -> None:
-    """Correct a block's measured landmarks from its sampled poses, in place.
-
-    Those with a parent are corrected together with it, in lanes where both have one member.
-    """
+    """Correct a block's measured landmarks from its sampled poses, in place."""
     for m in range(slot.size):
-        n, turns = slot[m], 0
-        if n < 0:
-            continue
-        if pairs is not None:
-            turns = _correct_with_parent(block, n, heard, m, pairs)
-        if turns < LANES:
-            _correct_row(block, n, row_of(heard, m), params, scratch)
-        if pairs is not None and turns > 0:
-            copy_lanes(pairs.row, block.member[block.first[n]], pairs.turn)
+        if slot[m] >= 0:
+            _correct_row(block, slot[m], row_of(heard, m), params, scratch)
 
 
 @no_alloc
@@ -334,38 +277,20 @@ def _add_new(pose: Poses, rows: Rows, count: Counts, row: Row, params: UpdatePar
 
 
 @no_alloc
-def _place_by_parent(block: Block, n: Whole, heard: Measurements, m: Whole, pairs: Pairs) -> None:
-    """Place landmark n where it is a ray and an excess path gives its range."""
-    h = pairs.parent[n]
-    if h < 0 or math.isnan(pairs.excess_path[m]):
-        return
-    caller, member = block.member[block.first[h]], block.member[block.first[n]]
-    measured = heard.bearing[m], pairs.excess_path[m], heard.bearing_variance[m], pairs.variance[m]
-    lanes_with_sure_parent(block.pose, caller, block.count[h], pairs.usable)
-    place_by_excess_path(
-        block.pose, caller, member, pairs.slope[n], measured, block.count[n], pairs.usable
-    )
-
-
-@no_alloc
 def _place(
     block: Block,
     slot: Int[np.ndarray, " m"],
     known: Whole,
     heard: Measurements,
-    pairs: Pairs | None,
     params: UpdateParams,
 ) -> None:
-    """Place a block's new landmarks, and rays whose range an excess path gives."""
+    """Initialise a block's new landmarks."""
     new = known
     for m in range(slot.size):
-        n = slot[m]
-        if n < 0:
-            n, new = new, new + 1
-            rows = block.member[block.first[n] : block.first[n + 1]]
-            _add_new(block.pose, rows, block.count[n], row_of(heard, m), params)
-        if pairs is not None:
-            _place_by_parent(block, n, heard, m, pairs)
+        if slot[m] < 0:
+            rows = block.member[block.first[new] : block.first[new + 1]]
+            _add_new(block.pose, rows, block.count[new], row_of(heard, m), params)
+            new += 1
 
 
 @kernel
@@ -410,14 +335,12 @@ def _copy_members(particles: Particles, b: Whole, block: Block) -> None:
 @kernel
 def correct_particles(
     arrays: Arrays,
-    parents: Parents,
     columns: Columns,
-    timings: Timings | None,
     normal: Float[np.ndarray, "p 3"],
     params: UpdateParams,
     sampled: bool,
-) -> tuple[Arrays, ParentsAfter, Float[np.ndarray, " p"]]:
-    """Refine, sample, correct and extend a copy of all particles; return it, parents, log weights.
+) -> tuple[Arrays, Float[np.ndarray, " p"]]:
+    """Refine, sample, correct and extend a copy of all particles; return it and log weights.
 
     With ``sampled`` they are weighed at the sample.
     """
@@ -425,16 +348,10 @@ def correct_particles(
     blocks, known, total = old.pose.shape[0], old.landmark.size, normal.shape[0]
     slot = _slots(old.landmark, heard.landmark)
     landmark, first, widest = _rows(old, slot, heard, params.ray_ranges.size)
-    of_parents = np.empty(0), np.empty(0)
-    if timings is not None:
-        timed = excess_paths(columns, timings)
-        parents = assign_parents(parents, landmark, old.count, total, timed, timings[1])
-        of_parents = excess_paths_of_parents(parents[0], landmark, heard.landmark, timed)
     pose, gained = old.pose.copy(), np.zeros((blocks, LANES))
     count = np.zeros((blocks, landmark.size, LANES), dtype=np.int64)
     member = np.empty((blocks, first[-1], MEMBER))
     scratch, draw, proposal = scratch_for(widest), np.empty(3 * LANES), np.empty(POSE)
-    room = np.empty(LANES), np.empty(LANES), np.empty(MEMBER)
     for b in range(blocks):
         block = Block(pose[b], gained[b], first, count[b], member[b])
         _copy_members(old, b, block)
@@ -445,16 +362,9 @@ def correct_particles(
         sample_pose(block.pose, draw)
         if sampled:
             _weigh_at_sample(block, slot, heard, (old.pose[b], proposal), params, scratch)
-        if timings is None:
-            _correct(block, slot, heard, None, params, scratch)
-            _place(block, slot, known, heard, None, params)
-        else:
-            pairs = Pairs(parents[0], parents[1][b], *of_parents, *room)
-            shift_all(pairs, first, block.member, -1.0)
-            _correct(block, slot, heard, pairs, params, scratch)
-            _place(block, slot, known, heard, pairs, params)
-            shift_all(pairs, first, block.member, 1.0)
-    return (pose, landmark, first, count, member), parents, gained.ravel()[:total]
+        _correct(block, slot, heard, params, scratch)
+        _place(block, slot, known, heard, params)
+    return (pose, landmark, first, count, member), gained.ravel()[:total]
 
 
 @kernel
