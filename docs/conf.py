@@ -35,6 +35,7 @@ extensions = [
     "sphinx.ext.napoleon",
     "sphinx_gallery.gen_gallery",
     "docs.formulae",
+    "docs.glossary_page",
     "docs.settings_page",
 ]
 exclude_patterns = ["_build", "**sg_execution_times.rst"]  # whose table is fetched from elsewhere

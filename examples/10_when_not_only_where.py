@@ -18,7 +18,7 @@ from pipistrelle.estimation.beliefs import Gaussian
 from pipistrelle.estimation.ekf.filter import InvariantEkfSlam
 from pipistrelle.estimation.measurement import excess_path_of
 from pipistrelle.estimation.motion import Motion
-from pipistrelle.figures.outlines import RAY, ellipses, excess_path_ellipse
+from pipistrelle.figures.maps import RAY, ellipses, excess_path_ellipse
 from pipistrelle.figures.style import INK, STRATEGY_COLOURS, STYLE
 from pipistrelle.geometry import range_and_bearing
 

@@ -13,6 +13,7 @@ from typing import NamedTuple
 
 ROOT = Path(__file__).resolve().parents[1]
 BUDGETS = Path(__file__).with_suffix(".toml")
+GLOSSARY = ROOT / "docs" / "glossary.toml"
 
 SLACK = 0.02
 """How far a measure may fall below its budget, as a share of the budget, before it is lowered."""
@@ -65,6 +66,23 @@ class House(NamedTuple):
 def broken_rules(line: str) -> list[str]:
     """Return the names of the rules that a line breaks."""
     return [name for name, rule in RULES.items() if re.search(rule, line, re.IGNORECASE)]
+
+
+@cache
+def replaced_words() -> dict[re.Pattern[str], str]:
+    """Return a pattern for the words that each term of the glossary replaces, with the term."""
+    entries = tomllib.loads(GLOSSARY.read_text(encoding="utf-8"))["term"]
+    words = {entry["term"]: "|".join(map(re.escape, entry.get("never", ()))) for entry in entries}
+    return {re.compile(rf"\b({w})\b", re.IGNORECASE): term for term, w in words.items() if w}
+
+
+def against_glossary(where: str, text: str) -> list[Flagged]:
+    """Return a flag for each word in a text that the glossary replaces."""
+    return [
+        Flagged(where, text, [f"glossary: {word[0]}, say {term}"])
+        for pattern, term in replaced_words().items()
+        for word in pattern.finditer(text)
+    ]
 
 
 def is_record(node: ast.AST) -> bool:
@@ -120,8 +138,8 @@ def docstrings(tree: ast.Module) -> Iterator[tuple[int, str, str]]:
                 yield getattr(node, "lineno", 1), getattr(node, "name", "(module)"), text
 
 
-def leaning_texts(tree: ast.Module) -> Iterator[tuple[int, str]]:
-    """Yield line and first line of each field's text that leans on the text before it."""
+def texts_of_fields(tree: ast.Module) -> Iterator[tuple[int, str]]:
+    """Yield line and text of each documented field."""
     for node in ast.walk(tree):
         if isinstance(node, ast.ClassDef):
             for field, text in zip(node.body, node.body[1:], strict=False):
@@ -129,9 +147,8 @@ def leaning_texts(tree: ast.Module) -> Iterator[tuple[int, str]]:
                     isinstance(field, ast.AnnAssign)
                     and isinstance(text, ast.Expr)
                     and isinstance(text.value, ast.Constant)
-                    and LEANING.match(str(text.value.value))
                 ):
-                    yield text.lineno, str(text.value.value).splitlines()[0]
+                    yield text.lineno, str(text.value.value)
 
 
 def imported(tree: ast.Module, module: str, modules: set[str], package: bool) -> set[str]:
@@ -169,7 +186,7 @@ def measure(root: Path = ROOT) -> House:
     """Measure `src` and `tests` below a folder."""
     count: Counter[str] = Counter()
     words = idiom = 0
-    flagged = []
+    flagged, replaced = [], []
     source = root / "src" / "pipistrelle"
     paths = sorted(source.rglob("*.py"))
     names = {".".join(path.relative_to(root / "src").with_suffix("").parts): path for path in paths}
@@ -199,10 +216,14 @@ def measure(root: Path = ROOT) -> House:
             if rules := broken_rules(first):
                 count[f"first lines of {in_a_room}"] += 1
                 flagged.append(Flagged(f"{place}:{line} {name}", first, rules))
+            replaced += against_glossary(f"{place}:{line} {name}", first)
         if module == "pipistrelle.config":
-            for line, first in leaning_texts(tree):
-                count["leaning texts of settings"] += 1
-                flagged.append(Flagged(f"{place}:{line}", first, ["leans on a neighbour"]))
+            for line, text in texts_of_fields(tree):
+                if LEANING.match(text):
+                    count["leaning texts of settings"] += 1
+                    first = text.splitlines()[0]
+                    flagged.append(Flagged(f"{place}:{line}", first, ["leans on a neighbour"]))
+                replaced += against_glossary(f"{place}:{line}", text)
     for path in sorted((root / "tests").rglob("*.py")):
         text = path.read_text(encoding="utf-8")
         count["lines of tests"] += text.count("\n")
@@ -213,9 +234,10 @@ def measure(root: Path = ROOT) -> House:
                 place = path.relative_to(root).as_posix()
                 flagged.append(Flagged(f"{place}:{node.lineno}", node.name, rules))
     measures: dict[str, float] = dict.fromkeys(budgets(), 0) | count
+    measures["words against the glossary"] = len(replaced)
     measures["files in cycles of imports"] = files_in_cycles(graph)
     measures["idiom per 1,000 words"] = round(1000 * idiom / max(words, 1), 1)
-    return House(measures, flagged)
+    return House(measures, flagged + replaced)
 
 
 def budgets(text: str | None = None) -> dict[str, float]:

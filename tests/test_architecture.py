@@ -104,10 +104,9 @@ AT_THE_DISK = {
     "detection/sounds/sound_file.py": {"open"},  # a few bytes of an ordinary file
     "detection/logs/bag.py": {"open"},  # of a compressed file that rosbags has opened
     "detection/logs/text_tables.py": {"loadtxt"},  # of lines that were read
-    "figures/player/page.py": {"read_text"},  # the package's own pages
+    "figures/player/playback.py": {"read_text"},  # the package's own pages
     "report/page/page.py": {"read_text"},
     "files.py": {"read_bytes", "open", "unlink", "rmdir"},
-    "figures/player/rerun_file.py": {"read_bytes"},  # what it wrote into a temporary folder
     "kernel_linking.py": {"read_bytes", "unlink", "rmdir"},  # our own cache
     "kernel_folder.py": {"read_bytes", "rmtree", "open"},  # a file that is locked is opened
     "verbs/streams.py": {"open"},  # /dev/null

@@ -1,4 +1,4 @@
-"""What the documentation says is there, is there; what it shows, happens."""
+"""Names, links, examples and numbers of the documentation are right."""
 
 import re
 import subprocess
@@ -9,6 +9,7 @@ from types import ModuleType
 
 import numpy as np
 import pytest
+from docs import glossary_page
 
 from pipistrelle.evaluation.comparison import Statement, judge
 
@@ -37,7 +38,7 @@ def test_links_between_files_lead_somewhere(page):
 
 
 @pytest.mark.parametrize("page", [*PAGES, *TEXTS], ids=lambda page: page.name)
-def test_links_into_files_lead_to_headings_that_stand_there_unbuilt(page):
+def test_links_into_files_lead_to_headings_of_the_sources(page):
     links = re.findall(r"\]\(([^)#:]*\.md|)#([^)]+)\)", page.read_text())
     for name, anchor in links:
         text = (page.parent / name if name else page).read_text()
@@ -102,7 +103,7 @@ def guide():
     return names
 
 
-def test_the_guides_beam_changes_active_arrivals_outside_it_alone(guide):
+def test_the_guides_beam_changes_only_active_arrivals_outside_it(guide):
     from pipistrelle.acoustics.arrivals import arrivals_of_emission
     from pipistrelle.acoustics.paths import callers_of
     from pipistrelle.config import Config
@@ -147,7 +148,7 @@ def test_the_guides_shape_call_and_medium_are_heard(guide):
     assert sum(frame.rows.landmark.size for frame in frames) > 20
 
 
-def test_the_guides_second_caller_is_mapped_and_its_moving_one_is_not(guide):
+def test_the_guides_second_caller_is_mapped_unless_it_moves(guide):
     two, moving = guide["two_beacons"].track.landmarks, guide["with_a_boat"].track.landmarks
     assert {51, 52} <= set(two.landmark.tolist())
     assert 51 in moving.landmark
@@ -174,7 +175,7 @@ def test_the_guides_filter_drives_a_mission(guide):
 
 
 def heard_and_drive(steps=120):
-    """What active sensing hears of a short drive, as the oracle labels it, and the drive."""
+    """Return the labelled measurements of active sensing in a short drive, and the drive."""
     from pipistrelle.config import Config, ScenarioConfig
     from pipistrelle.experiments.hearing.listening import listen
     from pipistrelle.experiments.hearing.scenario import world_of
@@ -186,7 +187,7 @@ def heard_and_drive(steps=120):
     return config, heard, drive_of(world, config)
 
 
-def test_the_guides_association_finds_again_what_the_oracle_knew(guide):
+def test_the_guides_association_reproduces_the_known_labels(guide):
     from pipistrelle.detection.noise import without_hidden
     from pipistrelle.detection.scans import NO_CALLERS, scan_of, without_labels
     from pipistrelle.estimation.association import Assignment
@@ -339,7 +340,7 @@ def test_the_plans_of_the_page_on_robustness_have_the_truth_among_their_values(t
     }  # fmt: skip
 
 
-def test_the_scale_of_a_path_on_the_page_on_robustness_is_its_size_wherever_it_lies():
+def test_the_scale_on_the_page_on_robustness_ignores_pose():
     import polars as pl
 
     names = vars(ModuleType("guide"))
@@ -354,7 +355,7 @@ def test_the_scale_of_a_path_on_the_page_on_robustness_is_its_size_wherever_it_l
 
 
 @pytest.mark.slow
-def test_the_readme_shows_what_the_command_prints(tmp_path, capsys):
+def test_the_readme_shows_the_output_of_the_command(tmp_path, capsys):
     from pipistrelle.__main__ import main
 
     best, paper = blocks("text", ROOT / "README.md")
@@ -413,18 +414,45 @@ def _first_found(page, pages, word):
     return re.sub(r"\?[^#]*", "", page.locator("ul.search li > a").first.get_attribute("href"))
 
 
-def test_the_glossary_says_of_each_word_what_it_is_and_where_there_is_more():
-    text = (DOCS / "glossary.md").read_text(encoding="utf-8").split("```")[1]
-    entries = re.findall(r"^((?:\S.*\n)+)  (.+)$", text, flags=re.MULTILINE)
-    words = [word for names, _ in entries for word in names.splitlines()]
-    assert {"ray", "member", "label", "caller", "bound", "aligned", "gate", "family"} <= {*words}
+def test_the_glossary_is_sorted_and_defines_each_name_once():
+    entries = glossary_page.terms()
+    names = [entry["term"] for entry in entries]
+    assert names == sorted(names, key=str.casefold)
+    every = [name.casefold() for entry in entries for name in (entry["term"], *also(entry))]
+    assert len(every) == len({*every})
+    assert (DOCS / "glossary.md").read_text(encoding="utf-8").count(glossary_page.PLACE) == 1
+    assert glossary_page.markdown().count("\n  ") == len(entries)
+
+
+@pytest.mark.parametrize("entry", glossary_page.terms(), ids=lambda entry: entry["term"])
+def test_a_term_of_the_glossary_has_a_short_meaning_and_a_page(entry):
+    assert entry.keys() <= {"term", "also", "meaning", "page", "not", "never"}
+    sentences = re.split(r"(?<=\.) (?=[A-Z])", entry["meaning"])
+    assert len(sentences) <= 2
+    assert all(sentence.endswith(".") for sentence in sentences)
+    assert max(len(sentence.split()) for sentence in sentences) <= 25
+    assert glossary_page.title_of(entry["page"])
+
+
+def test_a_word_that_the_glossary_replaces_is_no_term_and_replaced_once():
+    entries = glossary_page.terms()
+    names = {name for entry in entries for name in (entry["term"], *also(entry))}
+    words = [word for entry in entries for word in entry.get("never", ())]
+    assert names.isdisjoint(words)
     assert len(words) == len({*words})
-    for names, meaning in entries:
-        assert re.search(r"\]\([\w-]+\.md(#[\w-]+)?\)", meaning), names
-        assert len(re.findall(r"[.:] [A-Z]", meaning)) <= 3, names
+    for entry in entries:
+        own = [*entry.get("not", ()), *entry.get("never", ())]
+        assert {entry["term"], *also(entry)}.isdisjoint(own), entry["term"]
+        text = " ".join([entry["term"], *also(entry), entry["meaning"]])
+        used = [word for word in words if re.search(rf"\b{word}\b", text, re.IGNORECASE)]
+        assert used == [], entry["term"]
 
 
-def test_page_and_docs_say_one_thing_of_a_claim_of_absence():
+def also(entry):
+    return entry.get("also", ())
+
+
+def test_page_and_docs_have_the_same_rule_for_absence():
     """It is undecided while the worlds are too few to see one standard deviation."""
     rule = "is not significant and the study could have seen one of one standard deviation, which"
     page = (ROOT / "src/pipistrelle/report/page/page.html").read_text(encoding="utf-8")

@@ -1,4 +1,4 @@
-"""The README's film: fewer and smaller pictures, that show what the long one shows."""
+"""The film in the README: a short and small copy of the long film."""
 
 import numpy as np
 import pytest
@@ -10,13 +10,13 @@ from pipistrelle.figures.style import STRATEGY_COLOURS
 
 
 def picture(k: int) -> np.ndarray:
-    """A white picture with a square of a strategy's colour that moves."""
+    """Return a white picture with a moving square of a strategy's colour."""
     drawn = np.full((200, 2 * WIDTH, 3), 255, np.uint8)
     drawn[40:120, 100 * k : 100 * k + 80] = (0x1F, 0x4E, 0x96)
     return drawn
 
 
-def test_pictures_are_left_out_and_shrunk_and_the_last_one_stays(tmp_path):
+def test_a_short_film_keeps_some_pictures_and_the_last(tmp_path):
     write_gif([picture(k) for k in range(6)], tmp_path / "long.gif")
     shrink(tmp_path / "long.gif", tmp_path / "short.gif")
     with Image.open(tmp_path / "short.gif") as film:
@@ -27,10 +27,10 @@ def test_pictures_are_left_out_and_shrunk_and_the_last_one_stays(tmp_path):
             seen = np.asarray(film.convert("RGB")).astype(int)
             assert seen[40, 50 * k + 20] == pytest.approx([0x1F, 0x4E, 0x96], abs=16)
             gone = np.delete(seen, slice(50 * k - 5, 50 * k + 45), axis=1)
-            assert (gone == 255).all(), "what was drawn before is left behind"
+            assert (gone == 255).all(), "the previous picture remains"
 
 
-def test_the_palette_has_the_colours_of_the_strategies_and_room_for_one_more():
+def test_the_palette_contains_the_colours_of_the_strategies():
     colours = {"#{:02x}{:02x}{:02x}".format(*colour) for colour in palette()}
     assert {"#ffffff", *STRATEGY_COLOURS.values()} <= colours
     assert len(colours) < 64

@@ -137,6 +137,32 @@ def test_lines_in_the_idiom_are_counted_by_room_and_listed(tmp_path):
     assert flagged[-1].rules == ["R1 nominal what", "R2 tell, say"]
 
 
+def test_words_that_the_glossary_replaces_are_counted_in_first_lines_and_settings(tmp_path):
+    sources = {
+        "__init__.py": '"""A package of ears, and of years."""',
+        "config.py": '''
+            """Settings.
+
+            A later line may name ears.
+            """
+
+
+            class Part:
+                """A part."""
+
+                first: float = 1.0
+                """Speed [m/s] of a caller,
+                or how sure it is."""
+            ''',
+    }
+    measures, flagged = written(tmp_path, sources)
+    assert measures["words against the glossary"] == 2
+    assert [line.rules for line in flagged] == [
+        ["glossary: ears, say array"],
+        ["glossary: how sure, say standard deviation"],
+    ]
+
+
 def test_budgets_are_lowered_and_not_raised(tmp_path, monkeypatch):
     monkeypatch.setattr(house, "BUDGETS", tmp_path / "house.toml")
     house.BUDGETS.write_text('# why\n[size]\nfiles = 10\n"code lines" = 9\n')

@@ -38,7 +38,7 @@ def written(folder: Path, text: str) -> Path:
 
 
 def refusal(folder: Path, text: str) -> str:
-    """What is said of a file, without its place."""
+    """Return the message about a file, without the path."""
     path = written(folder, text)
     with pytest.raises(InputError) as refused:
         resolve(from_file(path))
@@ -47,7 +47,7 @@ def refusal(folder: Path, text: str) -> str:
     return "\n".join(line.removeprefix(f"{path}: ") for line in lines)
 
 
-def test_every_setting_of_the_configuration_is_known_and_says_what_it_means():
+def test_every_setting_of_the_configuration_is_known_and_documented():
     leaves = {
         (section, leaf)
         for section, values in Config().model_dump().items()
@@ -70,14 +70,12 @@ def test_every_setting_of_the_configuration_is_known_and_says_what_it_means():
         ("", {"PIPISTRELLE_RAYS__RATIO": "0.3"}, {"rays": {"ratio": 0.4}}, 0.4),
     ],
 )
-def test_flags_go_over_the_environment_over_the_file_over_the_defaults(
-    tmp_path, file, environment, flags, ratio
-):
+def test_flags_override_environment_file_and_defaults(tmp_path, file, environment, flags, ratio):
     layer = from_file(written(tmp_path, file)) | from_environment(environment) | from_flags(flags)
     assert resolve(layer).rays.ratio == ratio
 
 
-def test_layers_leave_alone_what_they_do_not_name(tmp_path):
+def test_layers_keep_settings_that_they_do_not_name(tmp_path):
     file = from_file(written(tmp_path, "[rays]\nratio = 0.4\nweights = 'aggregated'\n"))
     environment = from_environment({"PIPISTRELLE_RAYS__POWER": "3"})
     flags = from_flags({"air": {"relative_humidity": 0.3}, "seed": 9})
@@ -89,7 +87,7 @@ def test_layers_leave_alone_what_they_do_not_name(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("text", "said"),
+    ("text", "message"),
     [
         ("rays.powr = 3", "rays.powr: no such setting; did you mean rays.power?"),
         ("power = 3", "power: no such setting; did you mean rays.power?"),
@@ -196,15 +194,15 @@ def test_layers_leave_alone_what_they_do_not_name(tmp_path):
         ),
     ],
 )
-def test_a_mistake_in_a_file_is_said_with_its_key_what_was_found_and_expected(tmp_path, text, said):
-    assert refusal(tmp_path, text) == said
+def test_an_invalid_file_is_reported_by_key_value_and_expectation(tmp_path, text, message):
+    assert refusal(tmp_path, text) == message
 
 
-def test_all_refused_values_are_said_at_once(tmp_path):
+def test_all_invalid_values_are_reported_together(tmp_path):
     assert len(refusal(tmp_path, "rays.power = 0\nair.pressure_kpa = 'high'").splitlines()) == 2
 
 
-def test_a_file_that_is_not_toml_is_refused_with_its_line(tmp_path):
+def test_a_file_with_invalid_toml_is_reported_by_line(tmp_path):
     assert "(at line 2," in refusal(tmp_path, "seed = 3\nrays.power 3\n")
     path = tmp_path / "mission.toml"
     path.write_bytes(b"seed = 3 # \xff")
@@ -212,7 +210,7 @@ def test_a_file_that_is_not_toml_is_refused_with_its_line(tmp_path):
         from_file(path)
 
 
-def test_a_setting_that_is_no_text_is_refused_by_its_name():
+def test_a_path_without_utf8_is_reported_by_its_setting():
     layer = from_flags({"scenario": {"world": os.fsdecode(b"w\xff")}, "seed": 3})
     with pytest.raises(InputError, match=r"--scenario.world: found .*, expected UTF-8 text; "):
         resolve(layer)
@@ -225,11 +223,11 @@ def test_a_setting_that_is_no_text_is_refused_by_its_name():
     ("text", "value"),
     [("2", 2.0), (".5", 0.5), ("1e-3", 1e-3), (" 4 ", 4.0)],
 )
-def test_a_number_in_the_environment_may_be_spelled_in_any_usual_way(text, value):
+def test_the_environment_accepts_usual_spellings_of_numbers(text, value):
     assert resolve(from_environment({"PIPISTRELLE_RAYS__POWER": text})).rays.power == value
 
 
-def test_text_and_lists_in_the_environment_are_spelled_as_in_a_file():
+def test_text_and_lists_in_the_environment_are_spelled_as_in_files():
     config = resolve(
         from_environment(
             {
@@ -247,7 +245,7 @@ def test_text_and_lists_in_the_environment_are_spelled_as_in_a_file():
 
 
 @pytest.mark.parametrize(
-    ("name", "text", "said"),
+    ("name", "text", "message"),
     [
         ("PIPISTRELLE_RAYS__POWER", "x", "found 'x', expected a valid number"),
         ("PIPISTRELLE_RAYS__POWER", "nan", "found nan, expected a finite number"),
@@ -261,10 +259,10 @@ def test_text_and_lists_in_the_environment_are_spelled_as_in_a_file():
         ),
     ],
 )
-def test_a_mistake_in_the_environment_is_said_with_its_variable(name, text, said):
+def test_an_invalid_environment_is_reported_by_its_variable(name, text, message):
     with pytest.raises(InputError) as refused:
         resolve(from_environment({name: text}))
-    assert str(refused.value) == f"{name}: {said}"
+    assert str(refused.value) == f"{name}: {message}"
 
 
 CALLING = (
@@ -277,7 +275,7 @@ CALLING = (
 
 
 @pytest.mark.parametrize("text", CALLING)
-def test_callers_are_the_same_wherever_they_are_given_and_when_they_are_written(tmp_path, text):
+def test_callers_are_equal_from_every_source_and_after_writing(tmp_path, text):
     config = resolve(from_file(written(tmp_path, f"callers = [{text}]")))
     assert config.callers is not None
     assert len(config.callers) == text.count("{")
@@ -288,18 +286,18 @@ def test_callers_are_the_same_wherever_they_are_given_and_when_they_are_written(
     assert resolve(from_flags(config.model_dump(mode="json"))) == config
 
 
-def test_without_callers_the_settings_say_what_they_said_before():
-    told = Config().model_dump(mode="json", exclude_none=True)
-    assert "callers" not in told
-    assert resolve(from_flags(told)) == Config()
+def test_settings_without_callers_are_written_without_callers():
+    values = Config().model_dump(mode="json", exclude_none=True)
+    assert "callers" not in values
+    assert resolve(from_flags(values)) == Config()
 
 
-def test_a_route_lies_where_its_file_of_settings_does(tmp_path):
+def test_a_route_is_relative_to_its_file_of_settings(tmp_path):
     layer = from_file(written(tmp_path, "[[callers]]\nroute = 'boat.csv'\n"))
     assert layer[CALLERS].value == [{"route": (tmp_path / "boat.csv").as_posix()}]
 
 
-def test_a_mistake_in_a_flag_is_said_with_the_flag():
+def test_an_invalid_flag_is_reported_by_its_name():
     with pytest.raises(InputError) as refused:
         resolve(from_flags({"air": {"relative_humidity": 3.0}}))
     found = "--air.relative-humidity: found 3.0, expected less than or equal to 1"
@@ -314,7 +312,7 @@ able = st.floats(min_value=1e-9, max_value=1e9)
     bounds=st.tuples(able, able).filter(lambda pair: pair[0] < pair[1]),
     start=st.tuples(able, able.map(float.__neg__), able),
 )
-def test_settings_written_as_toml_read_back_bit_for_bit(tmp_path_factory, seed, bounds, start):
+def test_settings_written_as_toml_are_read_back_exactly(tmp_path_factory, seed, bounds, start):
     config = Config(
         seed=seed,
         scenario=ScenarioConfig(start=start),
@@ -324,18 +322,18 @@ def test_settings_written_as_toml_read_back_bit_for_bit(tmp_path_factory, seed, 
     assert resolve(from_file(path)) == config
 
 
-def test_written_settings_name_each_setting_once_with_its_meaning():
+def test_written_settings_contain_each_setting_once_with_its_meaning():
     text = to_toml(Config())
     values = tomllib.loads(text)
     named = sum(len(value) if isinstance(value, dict) else 1 for value in values.values())
     others = [key[-1] for key, field in known_settings().items() if field.default is None]
     assert len(known_settings()) == named + len(others)
     assert {"world", "speed_of_sound", "wheelbase"} <= set(others)
-    assert all(f"# {name} =" in text for name in others)  # settled by others unless it is given
+    assert all(f"# {name} =" in text for name in others)  # derived from others by default
     assert all(" # " in line for line in text.splitlines() if " = " in line)
 
 
-def test_the_speed_of_sound_is_that_of_the_temperature_unless_it_is_given():
+def test_the_speed_of_sound_follows_the_temperature_by_default():
     assert Config().air.sound_speed == 343.0
     for temperature in (-40.0, 5.0, 35.0):
         air = AirConfig(temperature_c=temperature)
@@ -344,7 +342,7 @@ def test_the_speed_of_sound_is_that_of_the_temperature_unless_it_is_given():
         assert AirConfig(temperature_c=temperature, speed_of_sound=340.0).sound_speed == 340.0
 
 
-def test_the_speed_of_sound_that_was_not_given_follows_a_grid_of_temperatures(tmp_path):
+def test_the_default_speed_of_sound_follows_a_grid_of_temperatures(tmp_path):
     (tmp_path / "air.toml").write_text(
         "format = 1\niterations = 1\nfilters = ['ekf']\nstrategies = ['fused']\n"
         "[grid]\n'air.temperature_c' = [5.0, 20.0]\n"
@@ -357,7 +355,7 @@ def test_the_speed_of_sound_that_was_not_given_follows_a_grid_of_temperatures(tm
 
 
 def numbers_of(section, path=()):
-    """Every setting that may be a float, by the names that lead to it."""
+    """Yield the path of names to every setting that can be a float."""
     for name, field in type(section).model_fields.items():
         value = getattr(section, name)
         if isinstance(value, Section):
@@ -367,7 +365,7 @@ def numbers_of(section, path=()):
 
 
 @pytest.mark.filterwarnings("error")
-def test_a_whole_number_for_a_setting_that_is_a_float_becomes_the_float():
+def test_an_integer_for_a_float_setting_becomes_a_float():
     tried = set()
     for path, whole in product(numbers_of(Config()), [1, [1, 2], [2, 1], [1, 2, 3]]):
         table = reduce(lambda inner, name: {name: inner}, reversed(path), whole)

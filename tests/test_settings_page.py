@@ -1,4 +1,4 @@
-"""The page of settings: every one of them, spelled as it can be given, with what it takes."""
+"""The page of settings: meaning, default, values and spellings of every setting."""
 
 import re
 import tomllib
@@ -15,7 +15,7 @@ SETTINGS = list(known_settings())
 VALUES = [key for key in SETTINGS if key not in TABLES]
 
 
-def test_every_setting_has_its_place_under_its_section():
+def test_every_setting_is_listed_under_its_section():
     assert PAGE.read_text().count(PLACE) == 1
     sections = re.split(r"^## ", markdown(), flags=re.MULTILINE)[1:]
     named = {text.split("\n")[0]: re.findall(r"^`(\w+)`\n: ", text, re.M) for text in sections}
@@ -27,12 +27,12 @@ def test_every_setting_has_its_place_under_its_section():
 
 
 @pytest.mark.parametrize("key", VALUES, ids=".".join)
-def test_an_entry_spells_the_setting_as_it_can_be_given(key):
-    name, says, spelled = entry(key).replace("\xa0", " ").strip().split("\n")
+def test_an_entry_contains_meaning_default_values_flag_and_variable(key):
+    name, text, spelled = entry(key).replace("\xa0", " ").strip().split("\n")
     assert name == f"`{key[-1]}`"
     assert spelled == f"  `{flag(key)}`, `{variable(key)}`"
     meaning, default, takes = re.fullmatch(
-        r": (.*?) (None by default|Default `[^`]*`[^;]*); (.+)\.\\", says
+        r": (.*?) (None by default|Default `[^`]*`[^;]*); (.+)\.\\", text
     ).groups()
     field = known_settings()[key]
     if field.default is None:
@@ -43,7 +43,7 @@ def test_an_entry_spells_the_setting_as_it_can_be_given(key):
             list(field.default) if isinstance(field.default, tuple) else field.default
         )
     assert takes == extent(field)
-    assert re.search(r"\w{3}", meaning), "a unit alone says nothing"
+    assert re.search(r"\w{3}", meaning), "the meaning is only a unit"
     assert list(from_environment({variable(key): "1"})) == [key]
     words = flag(key).removeprefix("--").replace("-", "_").split(".")
     assert tuple(words) == key
@@ -68,12 +68,12 @@ def test_an_entry_spells_the_setting_as_it_can_be_given(key):
         (("rays", "range_bounds"), "2 numbers, each > 0"),
     ],
 )
-def test_what_a_setting_takes_is_said_in_a_few_signs(key, takes):
+def test_the_values_of_a_setting_are_listed_briefly(key, takes):
     assert extent(known_settings()[key]) == takes
 
 
 @pytest.mark.parametrize("key", VALUES, ids=".".join)
-def test_a_bound_that_the_page_names_is_where_values_are_refused(key):
+def test_values_beyond_a_listed_bound_are_rejected(key):
     takes = extent(known_settings()[key])
     if "`" in takes or "numbers" in takes:
         return
@@ -88,10 +88,10 @@ def test_a_bound_that_the_page_names_is_where_values_are_refused(key):
             resolve(from_flags(nested))
 
 
-def test_a_unit_stands_beside_the_default_and_not_twice():
+def test_a_single_unit_follows_the_default():
     assert entry(("scenario", "beacon_distance")).startswith(
-        "`beacon_distance`\n: Distance of the beacon from the centre, and of callers that say "
-        "nothing else. Default `15.0` m; >\xa00.\\\n"
+        "`beacon_distance`\n: Distance of the beacon from the centre, and of callers without a "
+        "position. Default `15.0` m; >\xa00.\\\n"
     )
     assert 'Default `"paper"`; `paper` or `bistatic`.' in entry(("air", "spreading"))
     assert (
@@ -100,7 +100,7 @@ def test_a_unit_stands_beside_the_default_and_not_twice():
     )
 
 
-def test_the_start_of_the_page_is_true():
+def test_the_spellings_at_the_top_of_the_page_work():
     assert resolve(from_environment({"PIPISTRELLE_RAYS__POWER": "3"})).rays.power == 3.0
     assert resolve(from_flags({"rays": {"power": 3.0}})).rays.power == 3.0
     assert Config().rays.power == 2.0

@@ -1,8 +1,8 @@
 """Every setting, with its unit, its range and the paper's value (Table I) as its default.
 
 Sections are the stages of the chain. Standard deviations end in ``_std`` and are squared once,
-where a covariance is built; levels end in ``_db``. A setting that the paper does not report says
-so. This module needs pydantic alone, so that the command line can show its help at once.
+where a covariance is built; levels end in ``_db``. "Unreported" marks values that the paper does
+not give. This module imports only pydantic, so that the command line shows its help at once.
 """
 
 import math
@@ -21,29 +21,29 @@ from pydantic import (
 )
 
 LARGEST = 1e9
-"""No setting needs more of its unit, nor its inverse less: what is squared stays a number."""
+"""Largest value of a setting and of its inverse, so that squares stay finite."""
 FARTHEST = 1e6
-"""No range, excess path or step of a vehicle is longer [m], nor any less sure."""
+"""Largest range, excess path or step of a vehicle, and largest standard deviation of one [m]."""
 FASTEST = 1e4
-"""No vehicle is faster [m/s]."""
+"""Largest speed of a vehicle [m/s]."""
 WIDEST = 1e4
-"""No vehicle steers by more [rad] or turns faster [rad/s], nor is a bearing less sure [rad]."""
+"""Largest steering angle [rad], turn rate [rad/s] and standard deviation of a bearing [rad]."""
 STEEPEST = 1.1
-"""No car's front wheels steer by more [rad]."""
+"""Largest steering angle of a car's front wheels [rad]."""
 LONGEST_STEP = 1e5
-"""No control step is longer [s]: more than a day."""
+"""Longest control step [s], more than a day."""
 LATEST = 3600.0
-"""No clock of a sensor is later or earlier than the odometry's by more [s]."""
+"""Largest offset between the clocks of sensor and odometry [s]."""
 TONE, SWEEP = "tone", "sweep"
 """Calls that need no file."""
 BLOCK = 2e-4
 """Length of a block of samples, over which a receiver sums [s]."""
 LEAST_STD = 1e-6
-"""No measurement is surer [m] or [rad]: beside the other numbers its variance would be lost."""
+"""Least standard deviation of a measurement [m] or [rad]; smaller variances would round to 0."""
 
 
 def _not_tiny(value: float) -> float:
-    """Refuse a number that is above zero in name alone."""
+    """Raise if a positive number is below 1 / LARGEST."""
     if value < 1.0 / LARGEST:
         raise ValueError(f"at least {1.0 / LARGEST:g}")
     return value
@@ -60,7 +60,7 @@ Probability = Annotated[float, Field(gt=0, le=1)]
 
 
 def _gate(value: Any) -> Any:
-    """Refuse what is neither a share nor "auto"; a whole number is a share, too."""
+    """Return a gate as a float in (0, 1] or as "auto"; raise for any other value."""
     if value == "auto":
         return value
     if isinstance(value, (int, float)) and value is not True and 0.0 < value <= 1.0:
@@ -78,15 +78,15 @@ STRATEGIES: tuple[Strategy, ...] = ("active", "fused", "passive")
 
 
 class InputError(ValueError):
-    """A user's mistake: says where it is, what was found, what was expected and the fix."""
+    """A mistake of the user, with its place, the found and the expected value, and a fix."""
 
     def _render_traceback_(self) -> list[str]:
-        """Show a notebook the line alone, for what it names is the user's and not in our code."""
+        """Return only the message for a notebook, because the mistake is not in the code."""
         return [f"InputError: {self}"]
 
 
 class Section(BaseModel):
-    """A frozen group of settings: unknown keys and non-finite numbers are refused."""
+    """A frozen group of settings that rejects unknown keys and non-finite numbers."""
 
     model_config = ConfigDict(
         extra="forbid", frozen=True, allow_inf_nan=False, use_attribute_docstrings=True
@@ -94,7 +94,7 @@ class Section(BaseModel):
 
 
 MAX_OTHERS = 7
-"""Callers besides the vehicle that a recording can tell apart."""
+"""Most callers besides the vehicle that a recording can distinguish."""
 
 
 Mark = dict[str, JsonValue]
@@ -103,41 +103,41 @@ BEAM: Mark = {"is": "beam"}
 TABLES: Mark = {"is": "tables"}
 ARRAY: Mark = {"is": "array"}
 CALL: Mark = {"is": "call"}
-"""Marks of settings that are treated in their own way, read by `settings.marked`: a folder, in a
-file from where the file lies; what makes the vehicle's beam; a list of tables; and the files of an
-array and of a call, from where the file lies, too. ``derived`` names the property that has a
-setting's value where it is not given."""
+"""Marks of settings with a special treatment, read by `settings`: a folder, the piston of the beam,
+a list of tables, the files of an array and of a call. Paths of marked settings are relative to the
+file of settings. ``derived`` names the property with the value of an omitted setting."""
 
 
 class ScenarioConfig(Section):
     """The true world: a noisy drive, round the paper's circle, among random landmarks."""
 
     world: Annotated[str, Field(min_length=1)] | None = Field(None, json_schema_extra=FOLDER)
-    """Folder of a world of one's own; what it leaves open is drawn as the rest says."""
+    """Folder of a world to use; whatever it omits is drawn by the other settings."""
     medium: Literal["air", "water"] = "air"
-    """Medium of the sound; the section of that name describes it."""
+    """Medium of the sound; its properties are in the section `air` or `water`."""
     steps: Count = 1500
-    """Control steps."""
+    """Number of control steps of the mission."""
     step: Annotated[Positive, Field(le=LONGEST_STEP)] = 0.125
     """Length of a control step [s]."""
     steps_per_frame: Count = 4
-    """Control steps between two emissions."""
+    """Number of control steps between two emissions."""
     speed: Annotated[float, Field(ge=-FASTEST, le=FASTEST)] = 0.75
-    """Nominal speed [m/s]."""
+    """Commanded speed of the vehicle [m/s]."""
     steering: Annotated[float, Field(ge=-WIDEST, le=WIDEST)] = 0.027
-    """Nominal steering angle [rad]."""
+    """Commanded steering angle of the vehicle [rad]."""
     start: tuple[Real, Real, Real] = (0.0, -7.408, 0.0)
-    """True start: x, y [m], heading [rad]; unreported: the noise-free path circles the centre."""
+    """True start pose: x, y [m], heading [rad]; by default (unreported) the path circles the
+    centre."""
     vehicle: Annotated[int, Field(ge=1, le=1 + MAX_OTHERS)] = 1
-    """Whose mission it is: of 2 on, callers with `course = "mission"`, in their order."""
+    """Number of the vehicle to run: 1, or from 2 on the callers with `course = "mission"`."""
     course: Literal["circle", "eight", "corridor", "lawn-mower"] = "circle"
-    """A circle by constant controls, or another shape, for which a driver steers."""
+    """Course of the vehicle: a circle by constant controls, or a shape that a driver follows."""
     extent: Positive = 12.0
-    """Half the length of a course that is no circle [m]."""
+    """Half the length of any course except the circle [m]."""
     lane: Positive = 4.0
-    """Distance of a lawn-mower's lanes, of an orchard's rows; a corridor's width [m]."""
+    """Distance between lawn-mower lanes or orchard rows, and width of a corridor [m]."""
     field: Literal["disc", "rows", "rooms"] = "disc"
-    """Landmarks lie anywhere on a disc, in an orchard's rows, or at corners of rooms."""
+    """Arrangement of the landmarks: anywhere on a disc, in orchard rows, or at corners of rooms."""
     landmarks: Annotated[int, Field(ge=0)] = 50
     """Number of landmarks, without the beacon."""
     radius: Positive = 25.0
@@ -145,56 +145,58 @@ class ScenarioConfig(Section):
     spacing: NonNegative = 3.0
     """Smallest distance between two landmarks [m]."""
     clearance: NonNegative = 0.5
-    """Smallest distance of landmarks and beacon from the path and from each other [m]."""
+    """Smallest distance of landmarks and beacon from the trajectory and from each other [m]."""
     beacon_distance: Positive = 15.0
-    """Distance of the beacon from the centre [m], and of callers that say nothing else."""
+    """Distance of the beacon from the centre, and of callers without a position [m]."""
 
 
 class AirConfig(Section):
-    """The medium, unless `scenario.medium` says water. Humidity is unreported in the paper."""
+    """The air, the default medium; the paper does not report its humidity."""
 
     speed_of_sound: Annotated[float, Field(ge=10, le=10_000)] | None = Field(
         None, json_schema_extra={"derived": "sound_speed"}
     )
-    """Speed of sound [m/s]; unless given, that of the temperature T: 343 sqrt(T / 293.15 K)."""
+    """Speed of sound [m/s]; by default 343 sqrt(T / 293.15 K) at the temperature T."""
     temperature_c: Annotated[float, Field(gt=-50, lt=60)] = 20.0
-    """Temperature [degrees Celsius]."""
+    """Temperature of the air [degrees Celsius]."""
     relative_humidity: Annotated[float, Field(ge=0, le=1)] = 0.5
-    """Relative humidity [0 to 1]."""
+    """Relative humidity of the air [0 to 1]."""
     pressure_kpa: Positive = 101.325
-    """Pressure [kPa]."""
+    """Pressure of the air [kPa]."""
     spreading: Literal["paper", "bistatic"] = "paper"
-    """Passive echoes lose 20 log10(d1 + d2), the paper's mirror law, or 20 log10(d1 d2) [dB]."""
+    """Spreading loss of passive echoes in air [dB]: `paper`, 20 log10(d1 + d2), a mirror, or
+    `bistatic`, 20 log10(d1 d2)."""
 
     @property
     def sound_speed(self) -> float:
-        """The speed of sound [m/s]: as it was given, or that of an ideal gas at the temperature."""
+        """The given speed of sound, or the speed in an ideal gas at the temperature [m/s]."""
         if self.speed_of_sound is not None:
             return self.speed_of_sound
         return 343.0 * math.sqrt((self.temperature_c + 273.15) / 293.15)
 
 
 class WaterConfig(Section):
-    """The medium where `scenario.medium` is water, of the sea or fresh."""
+    """Sea or fresh water, the medium if `scenario.medium` is `water`."""
 
     speed_of_sound: Annotated[float, Field(ge=10, le=10_000)] | None = Field(
         None, json_schema_extra={"derived": "sound_speed"}
     )
-    """Speed of sound [m/s]; unless given, that of temperature, salinity and depth."""
+    """Speed of sound [m/s]; by default computed from temperature, salinity and depth."""
     temperature_c: Annotated[float, Field(ge=-2, le=35)] = 10.0
-    """Temperature [degrees Celsius]."""
+    """Temperature of the water [degrees Celsius]."""
     salinity: Annotated[float, Field(ge=0, le=45)] = 35.0
-    """Salinity, in parts per thousand; 0 is fresh water."""
+    """Salinity of the water, in parts per thousand; 0 is fresh water."""
     depth: Annotated[float, Field(ge=0, le=4000)] = 0.0
-    """Depth at which vehicle, callers and landmarks are [m]."""
+    """Depth of vehicle, callers and landmarks [m]."""
     ph: Annotated[float, Field(ge=5, le=10)] = 8.0
-    """Acidity, pH; it counts below some 10 kHz."""
+    """Acidity of the water, pH; it affects sound below about 10 kHz."""
     spreading: Literal["bistatic", "paper"] = "bistatic"
-    """Passive echoes lose 20 log10(d1 d2), or 20 log10(d1 + d2), the paper's mirror law [dB]."""
+    """Spreading loss of passive echoes in water [dB]: `bistatic`, 20 log10(d1 d2), or `paper`, 20
+    log10(d1 + d2), a mirror."""
 
     @property
     def sound_speed(self) -> float:
-        """The speed of sound [m/s]: as it was given, or by Coppens (1981).
+        """The given speed of sound, or the speed by Coppens (1981) [m/s].
 
         A. B. Coppens, Simple equations for the speed of sound in Neptunian waters, J. Acoust. Soc.
         Am. 69 (1981), 862-863: for 0 to 35 degrees, salinities of 0 to 45 and 0 to 4000 m.
@@ -209,10 +211,11 @@ class WaterConfig(Section):
 
 
 class TargetConfig(Section):
-    """What a landmark reflects (radius and shape in practice unreported)."""
+    """The bodies of the landmarks; their radius and shape are unreported."""
 
     shape: Literal["cylinder", "sphere"] = "cylinder"
-    """Short-wave rigid cylinder (the paper's formula, mended) or sphere."""
+    """Shape of a landmark, rigid at short waves: cylinder (the paper's formula, corrected) or
+    sphere."""
     radius: Positive = 0.025
     """Radius of a landmark [m]."""
 
@@ -224,23 +227,23 @@ Share = Annotated[float, Field(ge=0, le=1)]
 
 
 class CallConfig(Section):
-    """The call: a tone, a sweep or a recording."""
+    """A call: a tone, a sweep or a recorded sound."""
 
     call: CallName = Field(TONE, json_schema_extra=CALL)
-    """A `tone`, a `sweep`, or a WAV file of one's own, as long as the call at most."""
+    """Waveform of the call: `tone`, `sweep`, or a WAV file no longer than the call."""
     sweep: Sweep = "linear"
-    """Law of a sweep: its frequency is linear in time, or, `hyperbolic`, its period is."""
+    """Law of a sweep: `linear`, its frequency is linear in time, or `hyperbolic`, its period is."""
     band: Band = (60e3, 35e3)
     """First and last frequency of a sweep [Hz]."""
     taper: Share = 0.0
-    """Share of the call in which it rises and falls as a cosine does: 0 switches it on and off, 1
-    is Hann's window, between them Tukey's. A file has what it has."""
+    """Share of the call with a cosine rise and fall (Tukey's window; 1: Hann's); 0 switches the
+    call on and off abruptly. A WAV file is not tapered."""
     frequency: Positive = 35e3
-    """Tone of the call, or where a file's band lies; a sweep has its band [Hz]."""
+    """Frequency of a tone, or centre of a WAV file's band; a sweep uses its band instead [Hz]."""
 
     @property
     def centre(self) -> float:
-        """Where the call's band lies, which beams and absorption go by [Hz]."""
+        """The centre of the call's band, used for beams and absorption [Hz]."""
         return 0.5 * (self.band[0] + self.band[1]) if self.call == SWEEP else self.frequency
 
 
@@ -248,24 +251,26 @@ class EmitterConfig(CallConfig):
     """The vehicle's back-baffled piston and its call."""
 
     radius: Positive = Field(0.0088, json_schema_extra=BEAM)
-    """Radius of the piston [m]; 8.8 mm makes a half-power beamwidth of 33 degrees."""
+    """Radius of the piston [m]; 8.8 mm give a half-power beamwidth of 33 degrees."""
     level_db: Level = 49.7
-    """Source level on the axis at 1 m [dB]; unreported, fitted."""
+    """Source level of the vehicle's call on the axis at 1 m [dB]; unreported, fitted."""
     off_axis: Literal["pressure", "power"] = "pressure"
-    """Off the axis the call loses 20 log10 p, p the piston's pressure, or 10 log10 p [dB]."""
+    """Loss off the axis [dB]: `pressure`, 20 log10 p with the piston's pressure p, or `power`, 10
+    log10 p."""
     pulse: Positive = 2.8e-3
-    """Length of the call, of the beacon's too [s]; unreported."""
+    """Length of the calls of vehicle and callers [s]; unreported."""
 
 
 class BeaconConfig(CallConfig):
-    """The omnidirectional beacon's call; where callers are listed, what the first leaves open."""
+    """The omnidirectional beacon's call, and the defaults of the first of the listed callers."""
 
     band: Band = (28e3, 18e3)
-    """First and last frequency of a sweep [Hz]."""
+    """First and last frequency of the beacon's sweep [Hz]."""
     frequency: Positive = 30e3
-    """Tone of the call, or where a file's band lies; a sweep has its band [Hz]."""
+    """Frequency of a tone, or centre of a WAV file's band; a sweep uses its band instead [Hz]."""
     level_db: Level = 42.8
-    """Source level at 1 m [dB]; unreported, fitted. Of every caller that says no other."""
+    """Source level at 1 m of the beacon and of callers without a `level_db` [dB]; unreported,
+    fitted."""
 
 
 Point = tuple[Real, Real]
@@ -278,70 +283,75 @@ _WAYS = {
     "mission": ((), 'course = "mission"'),
     "stand": (("place", "distance"), "a caller that stands"),
 }
-"""What may be said of each way to be somewhere, and how a refusal calls it."""
+"""Settings allowed for each kind of motion, and its name in messages."""
 
 
 _CLOCK = ("period", "offset", "jitter", "times")
-"""Settings of a caller's own clock."""
+"""Settings of a caller's clock."""
 
 
 class CallerConfig(Section):
-    """Someone else who calls, in all directions or as another vehicle: from a place or a way."""
+    """A caller, fixed or moving, that calls in all directions or through a vehicle's piston."""
 
     name: Annotated[str, Field(pattern=r"^\w[\w-]*$", max_length=40)] | None = None
-    """In messages, figures and files; else `beacon` of the first, `caller2` of the second."""
+    """Name in messages, figures and files; by default `beacon`, `caller2`, and so on."""
     call: CallName | None = None
-    """Its call, as `emitter.call`; else the first calls as the beacon, others send a tone."""
+    """Waveform of the call, as for `emitter.call`; by default the beacon's for the first caller, a
+    tone for others."""
     sweep: Sweep | None = None
-    """As `emitter.sweep`; else the beacon's."""
+    """Law of a sweep, as for `emitter.sweep`; by default the beacon's."""
     band: Band | None = None
-    """As `emitter.band`, each caller's own; else the beacon's [Hz]."""
+    """Band of a sweep, as for `emitter.band`, different for each caller; by default the beacon's
+    [Hz]."""
     taper: Share | None = None
-    """As `emitter.taper`; else the beacon's."""
+    """Taper of the call, as for `emitter.taper`; by default the beacon's."""
     frequency: Positive | None = None
-    """Tone of the call [Hz], each caller's own; else, of the first, the beacon's."""
+    """Frequency of the tone [Hz], different for each caller; the first has the beacon's by
+    default."""
     level_db: Level | None = None
-    """Source level at 1 m [dB]; else the beacon's, or, of a mission, the vehicle's."""
+    """Source level at 1 m [dB]; by default the beacon's, or the vehicle's with `course =
+    "mission"`."""
     place: Point | None = None
-    """Where it stands, or a walk begins: x, y [m]."""
+    """Position of a fixed caller, or start of a walk: x, y [m]."""
     distance: Positive | None = None
-    """Else how far from the centre, the direction drawn [m]; else `scenario.beacon_distance`."""
+    """Distance from the centre if the position is drawn [m]; by default
+    `scenario.beacon_distance`."""
     course: Literal["circle", "walk", "mission"] | None = None
-    """It circles, from a place that is drawn, walks at random, or maps the world as the vehicle,
-    and calls through a piston like the vehicle's."""
+    """Motion of the caller: a `circle` from a drawn position, a random `walk`, or the `mission` of
+    another vehicle, which calls through a piston."""
     centre: Point | None = None
-    """Of the circle: x, y [m]; else the origin."""
+    """Centre of the circle: x, y [m]; by default the origin."""
     radius: Positive | None = None
-    """Of the circle [m]; else `scenario.beacon_distance`."""
+    """Radius of the circle [m]; by default `scenario.beacon_distance`."""
     waypoints: Annotated[tuple[Point, ...], Field(min_length=2)] | None = None
-    """Or a line from point to point, x, y [m], and from the last to the first, again and again."""
+    """Corners x, y [m] of a closed line that the caller follows repeatedly."""
     speed: Real | None = None
-    """Along circle or line [m/s]; below 0 the other way round; else `scenario.speed`."""
+    """Speed along circle or line [m/s]; negative reverses it; by default `scenario.speed`."""
     speed_std: Positive | None = None
-    """Of a walk: standard deviation of the velocity along each axis [m/s]; else 0.5."""
+    """Standard deviation of a walk's velocity along each axis [m/s]; by default 0.5."""
     memory: Positive | None = None
-    """Time after which 1/e of a walk's velocity is left [s]; else 10."""
+    """Time in which a walk's velocity decays to 1/e [s]; by default 10."""
     route: str | Annotated[tuple[RouteRow, ...], Field(min_length=2)] | None = None
-    """Or where it is when: a CSV file of `time,x,y`, or its rows [s, m, m]; else it stands. With a
-    fourth column, `heading` [rad], it is another vehicle, which calls through a piston."""
+    """Trajectory of the caller: a CSV file of `time,x,y`, or its rows [s, m, m]. With a fourth
+    column, `heading` [rad], the caller is another vehicle, which calls through a piston."""
     period: Annotated[float, Field(ge=0.05, le=LARGEST)] | None = None
-    """Time from one call to the next [s]; without any of these four it calls when the vehicle does,
-    with `offset` or `jitter` alone as often."""
+    """Time between two calls [s]; by default the vehicle's. Without `period`, `offset`, `jitter`
+    and `times` the caller calls at the same times as the vehicle."""
     offset: NonNegative | None = None
-    """Time of its first call [s]; else 0."""
+    """Time of the first call [s]; by default 0."""
     jitter: NonNegative | None = None
-    """Standard deviation of each call's time [s], at most a tenth of the period; else 0."""
+    """Standard deviation of each call's time [s], at most a tenth of the period; by default 0."""
     times: tuple[NonNegative, ...] | None = None
-    """Or the times of all its calls [s]."""
+    """Times of all calls [s], in place of a period."""
 
     @property
     def own_clock(self) -> bool:
-        """Whether it calls at times of its own, not when the vehicle does."""
+        """Whether it calls at other times than the vehicle."""
         return any(one is not None for one in (self.period, self.offset, self.jitter, self.times))
 
     @property
     def way(self) -> str:
-        """How it is where it is: route, waypoints, circle, walk, mission or stand."""
+        """Kind of motion: one of the keys of `_WAYS`."""
         if self.route is not None:
             return "route"
         return "waypoints" if self.waypoints is not None else self.course or "stand"
@@ -370,7 +380,7 @@ class CallerConfig(Section):
 
 
 def _check_times(caller: CallerConfig) -> None:
-    """Refuse times of calls beside a rule that makes them, and times that do not rise."""
+    """Raise if times of calls are given with a period, offset or jitter, or do not increase."""
     for key in _CLOCK[:-1]:
         if getattr(caller, key) is not None:
             raise ValueError(f"found times and {key}, expected one of them; leave one out")
@@ -380,7 +390,7 @@ def _check_times(caller: CallerConfig) -> None:
 
 
 def _check_rows(route: tuple[tuple[float, ...], ...]) -> None:
-    """Refuse rows of which one is not later than the one before, or only some have a heading."""
+    """Raise if the times of a route do not increase, or only some of its rows have a heading."""
     if len({len(row) for row in route}) > 1:
         raise ValueError("found headings in some rows of the route, expected one in all or in none")
     for row, ((before, *_), (time, *_)) in enumerate(pairwise(route), start=2):
@@ -392,15 +402,7 @@ def _check_rows(route: tuple[tuple[float, ...], ...]) -> None:
 
 
 def caller_names(callers: tuple[CallerConfig, ...]) -> tuple[str, ...]:
-    """Name callers: as the settings do, else by their place in the list.
-
-    Parameters
-    ----------
-    callers : tuple of CallerConfig
-
-    Returns
-    -------
-    tuple of str
+    """Return the names of callers; without a name `beacon` or the number in the list.
 
     Examples
     --------
@@ -420,7 +422,7 @@ MicrophoneRow = tuple[float, float, float, float, str]
 
 
 def _array(value: Any) -> Any:
-    """Refuse what names no array and holds no microphones."""
+    """Return the name of an array, or its microphones as rows; raise for any other value."""
     if isinstance(value, str) and value:
         return value
     rows = value if isinstance(value, list | tuple) else ()
@@ -444,44 +446,47 @@ Array = Annotated[
 
 
 class ReceiverConfig(Section):
-    """The microphones, four line arrays in a square or a file's, their sampling and their noise."""
+    """The microphones, their sampling and their noise."""
 
     array: Array = Field(SQUARE, json_schema_extra=ARRAY)
-    """The paper's square, or a file of microphones: `channel,x,y`, perhaps `z,face,gain_db`, in the
-    vehicle's frame [m], or Acoular's XML; results hold its rows, x, y, z, gain and face of each."""
+    """Microphones: the paper's `square` of four line arrays, or a file: CSV `channel,x,y`,
+    optionally `z,face,gain_db`, in the vehicle's frame [m], or Acoular's XML. Results hold its
+    rows."""
     elements: Annotated[int, Field(ge=2, le=64)] = 10
-    """Microphones of one array of the square."""
+    """Number of microphones of each array of the square."""
     spacing: Positive = 0.0049
     """Distance between two microphones of the square [m]: half a wavelength at 35 kHz."""
     sample_rate: Positive = 200e3
-    """Samples of a microphone in a second [Hz]."""
+    """Sampling rate of each microphone [Hz]."""
     noise_level_db: Level = 0.0
-    """Noise of one complex sample [dB], on the scale of the source levels."""
+    """Noise level of one complex sample, on the scale of the source levels [dB]."""
     engine: Literal["auto", "block", "dense"] = "auto"
-    """Sums over 0.2 ms blocks (exact, fast), every sample at the full rate (slow, the reference),
-    or blocks where rate, tones and pulse are whole ones and nobody sweeps, else samples."""
+    """Simulation of the samples: `block`, exact sums over 0.2 ms (fast), `dense`, every sample
+    (slow, the reference), or `auto`, blocks if all calls are tones and fit whole blocks."""
 
 
 class DetectionConfig(Section):
-    """From samples to bearings and ranges. All unreported."""
+    """The detector, from samples to bearings and ranges; the paper reports none of its settings."""
 
     false_alarm: Annotated[float, Field(ge=1e-100, lt=0.1)] = 1e-6
-    """Probability that noise alone passes one test of one tone."""
+    """Probability that noise without a call passes one test of one tone."""
     snapshots: Literal["maxima", "runs"] = "maxima"
-    """A snapshot: the loudest lag within half a call, or a whole run above the threshold."""
+    """Extent of a snapshot: the loudest lag within half a call (`maxima`), or a whole run of lags
+    above the threshold (`runs`)."""
     overlaps: Literal["merge", "resolve"] = "merge"
-    """Echoes that overlap in a snapshot: the peaks of one scan, or as many sources, up to three, as
-    explain it, each with its own deviations and time of arrival."""
+    """Treatment of echoes that overlap in a snapshot: `merge` takes the peaks of one beam scan,
+    `resolve` fits up to three sources, each with a time of arrival and standard deviations."""
     leakage_db: Level = -28.0
-    """A tone counts only above this level relative to the other tone's maximum nearby [dB]."""
+    """Least level of a detection relative to the maximum of other tones nearby [dB]."""
     peak_db: Annotated[float, Field(ge=-300, le=0)] = -8.0
-    """Peaks of a scan count down to this level under the strongest [dB]."""
+    """Least level of a peak of a beam scan relative to the strongest [dB]."""
     scan_limit_deg: Annotated[float, Field(gt=0, lt=90)] = 80.0
-    """Largest steering angle [deg]."""
+    """Largest steering angle of a beam [deg]."""
     angle_limit_deg: Annotated[float, Field(gt=0, lt=90)] = 75.0
-    """Largest angle off a face's normal that is kept [deg]."""
+    """Largest angle between a detection and its face's normal [deg]."""
     averaging: Literal["plain", "weighted"] = "plain"
-    """Mean over the faces: plain (the paper's) or by inverse variance at the array's angle."""
+    """Mean of a bearing over the faces: `plain` (the paper's) or `weighted` by the inverse variance
+    at each face's angle."""
 
     @model_validator(mode="after")
     def _of_one_lag(self) -> "DetectionConfig":
@@ -493,76 +498,78 @@ class DetectionConfig(Section):
 
 
 class MatchingConfig(Section):
-    """When a detection is of an arrival (known labels), or of the same echo as another face's."""
+    """Limits for matching detections with arrivals (known labels) and with other faces."""
 
     delay_gate: Positive = 0.25
-    """Largest error of the delay, as a share of the pulse."""
+    """Largest difference of the delays, as a share of the call's length."""
     bearing_gate: Positive = 0.1
-    """Largest error of the bearing [rad]."""
+    """Largest difference of the bearings [rad]."""
     margin_db: NonNegative = 6.0
-    """Arrivals expected further than this under the threshold cannot be matched [dB]."""
+    """Largest distance of a matched arrival's expected level below the threshold [dB]."""
 
 
 class AssociationConfig(Section):
-    """Data association: how the rows of a scan get the labels of landmarks."""
+    """Data association: the assignment of measurements to landmarks."""
 
     method: str = "known"
-    """The labels that came with the scans, in a simulation an oracle's (the paper's); "nearest",
-    the likeliest assignment of a scan's rows; "joint", the most that fit together; "marginal",
-    what is sure over all assignments; or module:Class, an association of your own."""
+    """Method of association: "known", the labels of the scans (the paper's); "nearest", the
+    likeliest assignment of a scan; "joint", the largest compatible set; "marginal", the pairs that
+    are probable over all assignments; or module:Class, an association of your own."""
     detection: Probability = 0.8
-    """Assumed probability that a landmark which can be heard is heard."""
+    """Assumed probability of detecting a landmark within the sensor's reach."""
     clutter: Positive = 0.06
-    """Assumed rows of clutter in a scan, per radian and metre."""
+    """Assumed number of clutter measurements in a scan, per radian and metre."""
     bearing_std: Positive = 0.05
-    """Rows whose bearing is measured less surely than this are left out [rad]."""
+    """Largest standard deviation of a bearing; less precise measurements are discarded [rad]."""
     way_std: Positive = 0.35
-    """The same of ranges and excess paths [m]."""
+    """Largest standard deviation of a range or an excess path; less precise ones are discarded
+    [m]."""
     max_range: Positive | None = None
-    """How far a sensor that tells no levels sees; unless it is known, nothing is missed [m]."""
+    """Largest range of a sensor without levels [m]; by default no landmark counts as missed."""
     field_of_view: Annotated[Positive, Field(le=2.0 * math.pi)] = 2.0 * math.pi
-    """Full angle that such a sensor sees, about its heading [rad]."""
+    """Full angle of view of a sensor without levels, around its heading [rad]."""
 
 
 class ListeningConfig(Section):
-    """What is taken of what was heard."""
+    """The quantities that estimators use of the detections."""
 
     timing: bool = False
-    """Of others' echoes also when: how much later than the call that came straight."""
+    """Use of excess paths: the delay of a caller's echo after its direct call."""
 
 
 class MotionConfig(Section):
-    """How the vehicle moves, the front wheel of a bicycle, and the noise of its controls."""
+    """The motion of the vehicle, by default a bicycle, and the noise of its controls."""
 
     model: Literal["bicycle", "unicycle"] = "bicycle"
-    """Commanded are speed and steering angle, or speed and angular rate."""
+    """Motion model: `bicycle`, commanded by speed and steering angle, or `unicycle`, by speed and
+    angular rate."""
     wheelbase: Positive = 0.2
-    """Distance between the axles [m]."""
+    """True distance between the axles [m]."""
     speed_std: NonNegative = 0.1
-    """Noise of the speed [m/s]."""
+    """Standard deviation of the speed's noise [m/s]."""
     steering_std: NonNegative = 0.03
-    """Noise of the steering angle of a bicycle [rad]."""
+    """Standard deviation of the noise of a bicycle's steering angle [rad]."""
     angular_rate_std: NonNegative = 0.1
-    """Noise of the angular rate of a unicycle [rad/s]."""
+    """Standard deviation of the noise of a unicycle's angular rate [rad/s]."""
     speed_bias: Real = 0.0
-    """What is added to every commanded speed, noise apart [m/s]."""
+    """Constant error added to every commanded speed [m/s]."""
     turn_bias: Real = 0.0
-    """The same of the steering angle [rad] or the angular rate [rad/s]."""
+    """Constant error added to every steering angle [rad] or angular rate [rad/s]."""
 
 
 class AssumedConfig(Section):
-    """What filters and front end believe otherwise than it is; unless given, the truth."""
+    """Values that estimators and detector assume; by default the true values."""
 
     wheelbase: Positive | None = None
-    """Distance between the axles [m]."""
+    """Assumed distance between the axles [m]."""
     speed_std: NonNegative | None = None
-    """Noise of the speed [m/s]."""
+    """Assumed standard deviation of the speed's noise [m/s]."""
     steering_std: NonNegative | None = None
-    """Noise of the steering angle of a bicycle [rad]."""
+    """Assumed standard deviation of the noise of a bicycle's steering angle [rad]."""
     angular_rate_std: NonNegative | None = None
-    """Noise of the angular rate of a unicycle [rad/s]."""
+    """Assumed standard deviation of the noise of a unicycle's angular rate [rad/s]."""
     speed_of_sound: Annotated[float, Field(ge=10, le=10_000)] | None = None
-    """By which delays become ranges, and phases bearings [m/s]."""
+    """Assumed speed of sound, which converts delays to ranges and phases to bearings [m/s]."""
 
 
 Parameter = Literal[
@@ -574,89 +581,102 @@ Parameter = Literal[
     "sensor_place",
     "time_offset",
 ]
-"""What the smoother may estimate of the vehicle itself."""
+"""Calibration parameters that the smoother can estimate."""
 PARAMETERS: tuple[Parameter, ...] = get_args(Parameter)
 
 
 class FilterConfig(Section):
-    """What the filters assume."""
+    """Measurement noise, outliers and start, as the estimators assume them."""
 
     noise: Literal["constant", "measured"] = "constant"
-    """The next three for every row (the paper's), or what the signal or a log tells of each."""
+    """Source of measurement noise: `constant` uses range_std, bearing_std and excess_path_std for
+    every measurement (the paper's); `measured` uses the standard deviation estimated for each."""
     range_std: DistanceStd = 0.2
-    """Noise of a range [m]."""
+    """Standard deviation of a range [m]."""
     bearing_std: AngleStd = 0.15
-    """Noise of a bearing [rad]."""
+    """Standard deviation of a bearing [rad]."""
     excess_path_std: DistanceStd = 0.4
-    """Noise of an excess path [m]: of a way, twice what the same delay is of a range."""
+    """Standard deviation of an excess path [m], by default twice a range's, because paths are not
+    halved."""
     caller_speed_std: Positive = 1.0
-    """Velocity along an axis of a caller that moves, before anything is known of it [m/s]."""
+    """Standard deviation of a moving caller's initial velocity along each axis [m/s]."""
     caller_walk_std: NonNegative = 0.2
-    """How far that velocity strays in a second, and in t seconds by sqrt(t) as much [m/s]."""
+    """Standard deviation of the change of a moving caller's velocity in a second [m/s]; it grows
+    with the square root of time."""
     initial_pose_std: tuple[NonNegative, NonNegative, NonNegative] = (0.05, 0.05, 0.0436)
-    """How unsure the start is: x, y [m], heading [rad]."""
+    """Standard deviations of the start pose: x, y [m], heading [rad]."""
     first_pose: Literal["exact", "drawn"] = "exact"
-    """The start that they are given: the true pose (the paper's), or one drawn with these."""
+    """Start pose of the estimators: `exact`, the true one (the paper's), or `drawn`, with the
+    standard deviations initial_pose_std."""
     gate: Gate = 1.0
-    """Measurements outside this share of their predicted distribution are dropped; 1: none; "auto":
-    as suits the estimator."""
+    """Share of the predicted distribution outside of which measurements are discarded; 1: none;
+    "auto": the share that suits the estimator."""
     robust: Literal["none", "huber"] = "none"
-    """Huber's, by EKFs and smoother: what surprises by more than 2 sigma counts less."""
+    """Robust loss of EKFs and smoother: `huber` reduces the weight of innovations beyond 2
+    sigma."""
     calibrate: tuple[Parameter, ...] = ()
-    """What the vehicle does not know of itself, and the smoother estimates (`prior`)."""
+    """Calibration parameters that the smoother estimates, from the standard deviations in
+    `prior`."""
     window: Positive | None = None
-    """Of the smoother: a landmark not heard for so long leaves what each scan works on, until it is
-    heard again [s]; else none does. For drives that lead on and on."""
+    """Time without measurements after which the smoother leaves a landmark out of its updates,
+    until its next measurement [s]; by default never. It bounds the cost of long missions."""
 
 
 class PriorConfig(Section):
-    """How unsure is what `filter.calibrate` names: standard deviations about what is assumed."""
+    """Standard deviations of the calibration parameters around their assumed values."""
 
     speed_scale_std: Positive = 0.1
-    """Of the true speed over the commanded one, or of the true way over that by the odometry."""
+    """Standard deviation of the ratio of true to commanded speed or of true to measured
+    distance."""
     turn_bias_std: Positive = 0.02
-    """Of what is added to every steering angle [rad] or angular rate [rad/s]."""
+    """Standard deviation of the constant error of steering angles [rad] or angular rates
+    [rad/s]."""
     wheelbase_std: Positive = 0.1
-    """Of a bicycle, as a share of what is assumed."""
+    """Standard deviation of a bicycle's wheelbase, as a share of the assumed one."""
     speed_of_sound_std: Positive = 10.0
-    """[m/s]; ranges and excess paths grow with it."""
+    """Standard deviation of the speed of sound [m/s]; it scales ranges and excess paths."""
     sensor_heading_std: AngleStd = 0.1
-    """Of the sensor's zero bearing from the vehicle's heading [rad]."""
+    """Standard deviation of the angle between the sensor's zero bearing and the heading [rad]."""
     sensor_place_std: DistanceStd = 0.1
-    """Of the sensor, ahead and to the left of the vehicle's point, each [m]."""
+    """Standard deviation of the sensor's position on the vehicle, forward and to the left [m]."""
     time_offset_std: Annotated[Positive, Field(le=10)] = 0.1
-    """Of the delay of the sensor's clock behind the odometry's [s]."""
+    """Standard deviation of the delay of the sensor's clock behind the odometry's [s]."""
 
 
 def _check_rising(near: float, far: float) -> None:
-    """Refuse bounds that do not rise."""
+    """Raise if the lower bound is not below the upper one."""
     if near >= far:
         raise ValueError(f"range_bounds must rise, found [{near}, {far}]")
 
 
 class RayConfig(Section):
-    """Passive landmarks as a ray of Gaussians (Table I; pruning and power unreported)."""
+    """Passive landmarks as rays of Gaussian members (Table I; pruning and power unreported)."""
 
     ratio: Annotated[float, Field(gt=0, lt=1)] = 0.3
-    """Standard deviation of a member as a share of its range (alpha)."""
+    """Standard deviation of a ray's member along the ray, as a share of its range (alpha)."""
     density: Annotated[float, Field(ge=1.001, le=10)] = 3.0
-    """Ratio of two successive ranges (beta); a large one leaves gaps, and reaches too far."""
+    """Ratio of the ranges of two successive members of a ray (beta); large ratios leave gaps."""
     range_bounds: tuple[Positive, Positive] = (0.5, 20.0)
-    """Nearest and farthest range covered [m]."""
+    """Nearest and farthest range of a ray's members [m]."""
     prune: Annotated[float, Field(ge=0, lt=1)] = 1e-5
-    """Members whose aggregated likelihood falls below this over their number are pruned (tau)."""
+    """Threshold of pruning (tau): a ray's member is removed if its aggregated likelihood is below
+    tau over the number of members."""
     power: Positive = 2.0
-    """Sharpening of the weights that share a measurement (n)."""
+    """Exponent of the weights by which a ray's members share a bearing (n)."""
     weights: Literal["instantaneous", "aggregated"] = "instantaneous"
-    """Share by this measurement's likelihoods (the paper's text) or by all so far (Sola's code)."""
+    """Weights by which a ray's members share a bearing: `instantaneous`, its likelihoods (the
+    paper's text), or `aggregated`, of all bearings so far (Sola's code)."""
     likelihood: Literal["normal", "printed"] = "normal"
-    """Of a member: the normal density, or 1/sqrt(2 pi S) inside the exponent, as Eq. (19) reads."""
+    """Likelihood of a bearing for a ray's member: `normal`, the density, or `printed`, with
+    1/sqrt(2 pi S) inside the exponent, as Eq. (19) reads."""
     spacing: Literal["paper", "auto"] = "paper"
-    """As above, or, by the EKFs, bearings too precise for such members wait to be crossed."""
+    """Rays of precise bearings: `paper`, members as given by ratio and density, or `auto`, delayed
+    initialization of bearings too precise for such members (EKFs only)."""
     merge: Annotated[float, Field(ge=0, le=10)] = 0.0
-    """Neighbours of a ray become one within so many standard deviations of each other; 0: none."""
+    """Distance in standard deviations below which neighbours of a ray are merged; 0: never."""
     ranged: Literal["anew", "heaviest", "reset", "corrected", "bearing", "others", "moved"] = "anew"
-    """How a range for a ray is read: it places the landmark anew, or as `estimation.rays` lists."""
+    """Update of a ray by a range: `anew` initialises the landmark at range and bearing;
+    `estimation.rays` describes the others."""
 
     @model_validator(mode="after")
     def _ordered(self) -> "RayConfig":
@@ -674,67 +694,70 @@ class RayConfig(Section):
 
 
 class FastSlamConfig(Section):
-    """The second filter: particles instead of one Gaussian (Table I)."""
+    """FastSLAM 2.0, the paper's second filter: particles instead of one Gaussian (Table I)."""
 
     particles: Count = 100
     """Number of particles."""
     resample_below: Annotated[float, Field(ge=0, le=1)] = 0.75
-    """Resample when fewer effective particles than this share are left."""
+    """Share of effective particles below which particles are resampled."""
     mixture: Literal["federated", "exact"] = "federated"
-    """Bearings shared among a ray's members (the paper's) or an exact Gaussian mixture."""
+    """Update of a ray by a bearing: `federated` shares it among the members (the paper's), `exact`
+    updates the Gaussian mixture."""
     weights: Literal["marginal", "sampled"] = "marginal"
-    """Weigh by the likelihood before the sample, or at it by prior x likelihood / proposal."""
+    """Weight of a particle: `marginal`, the likelihood before sampling, or `sampled`, prior x
+    likelihood / proposal at the sample."""
     estimate: Literal["mixture", "heaviest", "separate"] = "separate"
-    """Pose and map are the moments of all particles, those of the heaviest particle, or the pose of
-    all and the map of the heaviest."""
+    """Estimate of pose and map: `mixture`, the moments of all particles, `heaviest`, the heaviest
+    particle, or `separate`, the pose of all and the map of the heaviest."""
     resampled_rays: Literal["kept", "restart"] = "kept"
-    """Whether rays keep their members' weights at a resampling, or restart with equal ones."""
+    """Weights of a ray's members after resampling: `kept`, or `restart` with equal weights."""
 
 
 Topic = Annotated[str, Field(min_length=1)]
 
 
 class BagConfig(Section):
-    """How `slam` reads a ROS bag; nothing else reads these."""
+    """Reading of a ROS bag by `slam`; no other command uses these settings."""
 
     odometry: Topic | None = None
-    """Topic of the odometry; else the only one there is."""
+    """Topic of the odometry; by default the only one in the bag."""
     echoes: tuple[Topic, ...] = ()
-    """Topics of the echoes; else all whose type is known."""
+    """Topics of the echoes; by default all of known types."""
     truth: Topic | None = None
-    """Topic that tells where the vehicle truly was, for scoring and for the start; else none."""
+    """Topic of the true trajectory, for scores and for the start; by default none."""
     motion: Literal["poses", "twist"] = "poses"
-    """The ways between odometry's poses, or its velocities as controls."""
+    """Source of the motion: `poses`, differences of the odometry's poses, or `twist`, its
+    velocities as controls."""
     covariances: bool = True
-    """Whether the ways are as sure as the twist's covariance says, where it says something."""
+    """Use of the twist's covariance for the motion between poses, if it is given."""
     stamps: Literal["header", "received"] = "header"
-    """The times of messages: those of their headers, or when they were received."""
+    """Times of messages: `header`, from their headers, or `received`, the times of reception."""
     sensor_pose: tuple[Real, Real, Real] | None = None
-    """Pose of every sensor on the vehicle: x, y [m], heading [rad]; unless given, the bag's."""
+    """Pose of every sensor on the vehicle: x, y [m], heading [rad]; by default the bag's."""
     speed_of_sound: Annotated[float, Field(ge=10, le=10_000)] | None = None
-    """Where pings that tell travel times do not say it [m/s]."""
+    """Speed of sound for pings with travel times that do not contain it [m/s]."""
     step: Annotated[NonNegative, Field(le=LONGEST_STEP)] = 0.1
-    """Odometry is merged into steps of this length; 0: each message is one [s]."""
+    """Length of the steps into which odometry is merged; 0: each message is a step [s]."""
     time_offset: Annotated[Real, Field(ge=-LATEST, le=LATEST)] = 0.0
-    """How late the times of echoes are, by the odometry's clock [s]."""
+    """Delay of the echoes' clock behind the odometry's [s]."""
     initial_pose_std: tuple[NonNegative, NonNegative, NonNegative] = (0.05, 0.05, 0.0436)
-    """How unsure the start is: x, y [m], heading [rad]."""
+    """Standard deviations of the start pose: x, y [m], heading [rad]."""
     forward_std: NonNegative = 0.01
-    """Noise of the way of a step forwards, of poses [m]."""
+    """Standard deviation of a step's forward distance, with poses [m]."""
     sideways_std: NonNegative = 0.005
-    """The same to the left [m]."""
+    """Standard deviation of a step's distance to the left, with poses [m]."""
     turn_std: NonNegative = 0.015
-    """The same of its turn [rad]."""
+    """Standard deviation of a step's turn, with poses [rad]."""
     velocity_std: NonNegative = 0.1
-    """Noise of a twist's velocity in a step [m/s]."""
+    """Standard deviation of a step's velocity, with a twist [m/s]."""
     angular_rate_std: NonNegative = 0.15
-    """The same of its angular rate [rad/s]."""
+    """Standard deviation of a step's angular rate, with a twist [rad/s]."""
     range_std: DistanceStd = 0.2
-    """Noise of a range that does not say its own [m]."""
+    """Standard deviation of a range whose message gives none [m]."""
     bearing_std: AngleStd = 0.06
-    """The same of a bearing [rad]."""
+    """Standard deviation of a bearing whose message gives none [rad]."""
     range_bounds: tuple[Positive, Positive] = (0.5, 20.0)
-    """Nearest and farthest range of a passive landmark [m]."""
+    """Nearest and farthest range of a passive landmark in a bag [m]."""
 
     @model_validator(mode="after")
     def _ordered(self) -> "BagConfig":
@@ -743,18 +766,18 @@ class BagConfig(Section):
 
 
 class Config(Section):
-    """A whole mission. Each section is described in its own class."""
+    """All settings of a mission, in sections."""
 
     seed: Annotated[int, Field(ge=0, lt=2**63)] = 7
-    """Seed of every random stream."""
+    """Seed of all random streams."""
     settings: Annotated[str, Field(min_length=1)] | None = None
-    """Name of the settings that these lie over: `paper`, `physics` or `best`."""
+    """Preset that the other settings override: `paper`, `physics` or `best`."""
     own: dict[str, dict[str, dict[str, Any]]] | None = None
-    """What is one estimator's alone, over what all have: a table for each, as `own.iekf`."""
+    """Settings for only one estimator, e.g. `own.iekf`; they override the common ones."""
     callers: Annotated[tuple[CallerConfig, ...], Field(max_length=MAX_OTHERS)] | None = Field(
         None, json_schema_extra=TABLES
     )
-    """The callers besides the vehicle, a table each; the paper's beacon by default."""
+    """Callers besides the vehicle, a table each; by default the paper's beacon."""
     scenario: ScenarioConfig = ScenarioConfig()
     air: AirConfig = AirConfig()
     water: WaterConfig = WaterConfig()
@@ -786,11 +809,11 @@ class Config(Section):
 
     @property
     def medium(self) -> AirConfig | WaterConfig:
-        """The section of what the sound travels through."""
+        """The section of the chosen medium."""
         return self.water if self.scenario.medium == "water" else self.air
 
     @property
     def assumed_sound_speed(self) -> float:
-        """The speed of sound that the front end counts with [m/s]."""
+        """The speed of sound that the detector assumes [m/s]."""
         assumed = self.assumed.speed_of_sound
         return self.medium.sound_speed if assumed is None else assumed

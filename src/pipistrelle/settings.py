@@ -1,8 +1,8 @@
-"""Settings laid over each other: defaults < named settings < file < environment < flags.
+"""Merge settings from five sources: defaults < preset < file < environment < flags.
 
-Each place gives a `Layer`: its settings by their key, each with the words that say where it
-stands. Layers merge as dictionaries do, the right one wins, and whatever `resolve` refuses is
-still reported where its user wrote it:
+Each source gives a `Layer`: its settings by their key, each with its place in words. Layers merge
+like dictionaries, the right operand wins, and an error of `resolve` names the place where the user
+wrote the value:
 
     config = resolve(from_file(path) | from_environment(os.environ) | from_flags(flags))
 
@@ -42,16 +42,16 @@ from pipistrelle.refusals import expectation, meant, refusal, shown, values_expe
 
 PREFIX = "PIPISTRELLE_"
 NOT_SETTINGS = frozenset({"PIPISTRELLE_DATA"})
-"""Variables of the environment that share the prefix and set nothing."""
+"""Variables of the environment with the prefix that are no settings."""
 
 Key = tuple[str, ...]
 
 _MAX_DEPTH = 8
-"""Levels of tables and lists that a file may have."""
+"""Most levels of tables and lists in a file."""
 
 
 class Given(NamedTuple):
-    """A value and where it was given, in words."""
+    """A value, and its place in words."""
 
     value: Any
     where: str
@@ -83,18 +83,17 @@ def _marked(mark: Mark) -> Key:
 
 
 WORLD_KEY, RADIUS_KEY, CALLERS, ARRAY_KEY = map(_marked, (FOLDER, BEAM, TABLES, ARRAY))
-"""Settings that are treated in their own way: the world's folder, the piston, the callers, the
-array."""
+"""Settings with a special treatment: the world's folder, the piston, the callers, the array."""
 CALL_KEYS = tuple(key for key, it in known_settings().items() if it.json_schema_extra == CALL)
-"""Settings that may name the file of a call."""
+"""Settings that can name the file of a call."""
 SETTINGS: Key = ("settings",)
 OWN: Key = ("own",)
-"""Keys of what lies beneath (`experiments.named_settings`), and of what is one estimator's alone:
-``[own.iekf] rays.power`` of a file is ``("own", "iekf", "rays", "power")`` of a layer."""
+"""Keys of the preset (`experiments.named_settings`) and of settings for one estimator:
+``[own.iekf] rays.power`` in a file is ``("own", "iekf", "rays", "power")`` in a layer."""
 
 
 def derived(config: Config) -> dict[Key, Any]:
-    """Return the values of the settings that are derived unless given.
+    """Return the values of all settings that are derived if omitted.
 
     >>> derived(Config())
     {('air', 'speed_of_sound'): 343.0, ('water', 'speed_of_sound'): 1489.77}
@@ -121,7 +120,7 @@ def from_file(path: Path) -> Layer:
 
 
 def with_places(path: Path, layer: Layer) -> Layer:
-    """Resolve what a file's settings name, world, array, calls and routes, relative to the file."""
+    """Resolve the paths of world, array, calls and routes in a layer relative to its file."""
     for key, given in layer.items():
         if key == CALLERS:
             layer[key] = given._replace(value=beside(path, given.value))
@@ -135,7 +134,7 @@ def with_places(path: Path, layer: Layer) -> Layer:
 def beside(path: Path, callers: Any) -> Any:
     """Resolve the routes and calls of callers relative to a file.
 
-    `path`: of the file; `callers`: what it gives as callers, sound or not.
+    `path`: of the file; `callers`: its value of `callers`, valid or not.
 
     >>> beside(Path("there/plan.toml"), [{"route": "boat.csv"}, {"place": [1, 2]}])
     [{'route': 'there/boat.csv'}, {'place': [1, 2]}]
@@ -156,10 +155,10 @@ def beside(path: Path, callers: Any) -> Any:
 
 
 def from_table(values: Mapping[str, Any], where: str, above: str = "") -> Layer:
-    """Name the settings of a table in a file.
+    """Return the layer of a table of settings.
 
-    `values`: settings, and sections of settings; `where`: name of the file in refusals;
-    `above`: prefix of a setting's name there.
+    `values`: settings, and sections of settings; `where`: name of the file in messages;
+    `above`: prefix of a setting's name in the file.
 
     >>> from_table({"seed": 3}, "world.toml: ", "config.")
     {('seed',): Given(value=3, where='world.toml: config.seed')}
@@ -169,10 +168,10 @@ def from_table(values: Mapping[str, Any], where: str, above: str = "") -> Layer:
 
 
 def from_environment(environment: Mapping[str, str]) -> Layer:
-    """Read the settings among the variables of the environment.
+    """Return the layer of the variables of the environment.
 
-    `environment`: ``PIPISTRELLE_SECTION__FIELD`` is spelled as in a file, save that text needs no
-    quotes.
+    `environment`: the value of ``PIPISTRELLE_SECTION__FIELD`` is spelled as in a file, but text
+    needs no quotes.
 
     >>> layer = from_environment({"PIPISTRELLE_RAYS__RANGE_BOUNDS": "[1, 15]", "HOME": "/root"})
     >>> layer["rays", "range_bounds"].value
@@ -187,7 +186,7 @@ def from_environment(environment: Mapping[str, str]) -> Layer:
 
 
 def from_flags(values: Mapping[str, Any]) -> Layer:
-    """Name the settings that were given as flags.
+    """Return the layer of flags.
 
     `values`: settings, and sections of settings.
 
@@ -199,10 +198,10 @@ def from_flags(values: Mapping[str, Any]) -> Layer:
 
 
 def from_keywords(values: Mapping[str, Any], others: Iterable[str] = ()) -> Layer:
-    """Name the settings that were given as keywords of a call.
+    """Return the layer of the keywords of a call.
 
-    `values`: settings, and sections of settings; two underscores part a section from its settings;
-    `others`: what the call takes beside settings, which may have been meant.
+    `values`: settings, and sections of settings; two underscores separate a section and a setting;
+    `others`: further keywords of the call, for suggestions.
 
     >>> from_keywords({"rays__power": 8.0, "air": {"temperature_c": 5.0}})["rays", "power"]
     Given(value=8.0, where='rays__power')
@@ -215,9 +214,9 @@ def from_keywords(values: Mapping[str, Any], others: Iterable[str] = ()) -> Laye
 
 
 def spread(table: Mapping[str, Any], parts: str) -> dict[str, Any]:
-    """Convert names with parts to nested tables.
+    """Convert dotted names to nested tables.
 
-    `parts` separates two parts of a name.
+    `parts`: the separator of the parts of a name.
 
     >>> spread({"seed": 3, "rays.power": 8.0, "rays": {"prune": 0.1}}, ".")
     {'seed': 3, 'rays': {'power': 8.0, 'prune': 0.1}}
@@ -238,7 +237,7 @@ def spread(table: Mapping[str, Any], parts: str) -> dict[str, Any]:
 
 
 def resolve(layer: Layer) -> Config:
-    """Check the settings and complete them with the defaults.
+    """Validate a layer and complete it with the defaults.
 
     >>> resolve(from_flags({"seed": 3})).seed
     3
@@ -262,17 +261,17 @@ def resolve(layer: Layer) -> Config:
 
 
 def _plain(value: Any) -> Any:
-    """Convert settings and NumPy's numbers to values that JSON has, all else to text."""
+    """Convert settings and NumPy's numbers to values of JSON, other values to text."""
     if isinstance(value, BaseModel):
         return value.model_dump(mode="json", exclude_none=True)
     return value.tolist() if hasattr(value, "tolist") else str(value)
 
 
 def to_toml(config: BaseModel) -> str:
-    """Write settings as a TOML file, each with its meaning and unit.
+    """Return settings as the text of a TOML file, each with its meaning and unit.
 
-    `config`: all settings, or some sections of them. The text reads back as the same settings. A
-    setting that is derived unless it is given, and is not given, is a remark.
+    `config`: all settings, or some sections. The text reads back as the same settings; settings
+    without a value are comments.
 
     >>> tomllib.loads(to_toml(Config(seed=3)))["seed"]
     3
@@ -303,7 +302,7 @@ def to_toml(config: BaseModel) -> str:
     for name, sections in (getattr(config, "own", None) or {}).items():
         lines += [
             "",
-            f"# What {name} has alone.",
+            f"# Settings for {name} only.",
             f"[own.{name if name.isidentifier() else json.dumps(name)}]",
         ]
         lines += [
@@ -314,20 +313,20 @@ def to_toml(config: BaseModel) -> str:
 
 
 def _remarked(assignment: str, field: FieldInfo) -> str:
-    """Append a setting's meaning as a comment."""
+    """Append the meaning of a setting as a comment."""
     meaning = " ".join((field.description or "").split())
     return f"{assignment:<39} # {meaning}" if meaning else assignment
 
 
 def read_toml(path: Path) -> dict[str, Any]:
-    """Read a TOML file, or refuse it."""
+    """Read a TOML file."""
     return parse_toml(read_text(path), path)
 
 
 def parse_toml(text: str, where: object) -> dict[str, Any]:
-    """Read TOML of a few levels, whose integers have 64 bits, as the language says.
+    """Read TOML; raise above 64 bits in an integer or `_MAX_DEPTH` levels.
 
-    `where`: place of the text, for refusals.
+    `where`: place of the text, for messages.
 
     >>> parse_toml("rays.power = 3", "here")
     {'rays': {'power': 3}}
@@ -367,9 +366,9 @@ def parse_toml(text: str, where: object) -> dict[str, Any]:
 def leaves(
     values: Mapping[str, Any], whole: Container[Key] = (), above: Key = ()
 ) -> Iterator[tuple[Key, Any]]:
-    """Iterate over the values of nested tables; an empty table counts as a value.
+    """Yield key and value of each leaf of nested tables; an empty table is a leaf.
 
-    `whole`: values of these are taken as they are; `above`: of the table itself.
+    `whole`: keys of tables that are leaves; `above`: the key of the table.
 
     >>> list(leaves({"seed": 3, "air": {"pressure_kpa": 90.0}, "rays": {}}))
     [(('seed',), 3), (('air', 'pressure_kpa'), 90.0), (('rays',), {})]
@@ -388,7 +387,7 @@ def _layer(
     prefix: str = "",
     others: Iterable[str] = (),
 ) -> Layer:
-    """Attach to each value where it was given; refuse names that are no settings."""
+    """Return the layer of values, each with its place; raise for names that are no settings."""
     layer = {}
     for key, value in given:
         where = prefix + spell(key)
@@ -413,7 +412,7 @@ def _layer(
 
 
 def _own_layer(tables: Any, where: str) -> Layer:
-    """Attach to each setting that is one estimator's alone where it was given."""
+    """Return the layer of settings for one estimator each."""
     if not isinstance(tables, Mapping):
         expected = "a table for each estimator, as {iekf = {rays.power = 8.0}}"
         raise InputError(f"{where}: found {shown(tables)}, expected {expected}")
@@ -428,7 +427,7 @@ def _own_layer(tables: Any, where: str) -> Layer:
 
 
 def from_text(text: str) -> Any:
-    """Read a TOML value, or a number that TOML spells otherwise; anything else is text.
+    """Read a TOML value or a number in Python's spelling; return other text unchanged.
 
     >>> from_text("[{ frequency = 25e3 }]"), from_text("left")
     ([{'frequency': 25000.0}], 'left')
@@ -444,7 +443,7 @@ def from_text(text: str) -> Any:
 
 
 def _problem(error: Any, layer: Layer) -> str:
-    """Describe a refused value: where it stands, what was found and what was expected."""
+    """Return the message for a rejected value: its place, the value and the expected value."""
     if error["type"] == "json_invalid":
         value, where = next(given for given in layer.values() if not _is_text(given.value))
         fix = "rename the file or folder, or name a link to it"
@@ -466,7 +465,7 @@ def _problem(error: Any, layer: Layer) -> str:
 
 
 def _is_text(value: Any) -> bool:
-    """Return whether all text in a value is text that UTF-8 can hold."""
+    """Return whether all text in a value can be encoded as UTF-8."""
     try:
         json.dumps(value, default=_plain, ensure_ascii=False).encode()
     except UnicodeEncodeError:
@@ -475,7 +474,7 @@ def _is_text(value: Any) -> bool:
 
 
 def _caller_problem(error: Any, given: Given) -> str:
-    """Describe a refused value in the list of callers, which are counted from 1."""
+    """Return the message for a rejected value in the list of callers, counted from 1."""
     _, *inner = error["loc"]
     expected, where = expectation(error), given.where
     if not inner:

@@ -19,7 +19,7 @@ def test_every_strategy_has_a_colour_and_a_stranger_is_drawn_in_ink():
     assert strategy_colour("someone's own") == INK
 
 
-def test_strategies_are_told_apart_by_lightness_alone():
+def test_strategies_differ_in_lightness():
     steps = [
         abs(lightness(a) - lightness(b))
         for a, b in itertools.combinations(STRATEGY_COLOURS.values(), 2)

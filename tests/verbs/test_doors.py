@@ -34,7 +34,6 @@ COMMANDS = {
     "compare --output": ("compare", "one", "two", "-o", "d"),
     "array --output": ("array", "square", "-o", "d/debian.png"),
     "view --output": ("view", "one", "-o", "d/debian.html"),
-    "view --rerun": ("view", "one", "--rerun", "d/debian.rrd"),
 }
 CALLS = {
     "run": lambda o: pipistrelle.run(
@@ -50,7 +49,7 @@ CALLS = {
 ALWAYS = ("study --output", "report --output", "study", "report")
 """Those that go on with, or replace, their own like without being asked to."""
 NOTES = ("notes.txt", "sub/deep/b.txt")
-BY_NAME = (*ALWAYS, "array --output", "view --output", "view --rerun")
+BY_NAME = (*ALWAYS, "array --output", "view --output")
 """Those that have no --overwrite, or are told by it which file to replace."""
 
 
@@ -73,10 +72,9 @@ def made(tmp_path_factory):
 def users(made, monkeypatch, undrawn):
     """A user's folder of downloads beside them, with a list of sums as is usual; all it holds."""
     monkeypatch.setattr("pipistrelle.report.page.page._write_figure", lambda *_: None)
-    monkeypatch.setattr("pipistrelle.figures.player.rerun_file.check_there", lambda: None)
     shutil.copytree(made, ".", dirs_exist_ok=True)
     outside, folder = Path("outside"), Path("d")
-    for name in (*(f"debian.{end}" for end in ("iso", "html", "png", "rrd")), *NOTES):
+    for name in (*(f"debian.{end}" for end in ("iso", "html", "png")), *NOTES):
         (folder / name).parent.mkdir(parents=True, exist_ok=True)
         (folder / name).write_text(f"a user's {name}")
     outside.mkdir()
@@ -139,7 +137,7 @@ def test_a_call_from_python_loses_nothing_of_a_users(users, door, overwrite):
     assert contents("d") | contents("outside") == users
 
 
-@pytest.mark.parametrize("door", [door for door in COMMANDS if door != "view --rerun"])
+@pytest.mark.parametrize("door", COMMANDS)
 def test_a_door_replaces_what_it_wrote_itself_and_leaves_what_stands_beside(obey, users, door):
     shutil.rmtree("d")
     again = [] if door in ALWAYS else ["--overwrite"]

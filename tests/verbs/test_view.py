@@ -11,7 +11,6 @@ import pytest
 import pipistrelle
 from pipistrelle.__main__ import main
 from pipistrelle.config import InputError
-from pipistrelle.figures.player import rerun_file
 from pipistrelle.files import REPORT, OwnFiles
 from reference.command_line import SHORT
 
@@ -144,14 +143,14 @@ def test_a_page_is_never_written_through_a_link_or_over_a_users_partial(obey, fo
 
 
 def test_a_page_that_appeared_meanwhile_is_not_replaced(obey, folder, refused, monkeypatch):
-    from pipistrelle.figures.player import page
+    from pipistrelle.figures.player import playback
 
     def slow(*args):
         Path("page.html").write_text("mine")
         return page_of(*args)
 
-    page_of = page.page
-    monkeypatch.setattr(page, "page", slow)
+    page_of = playback.page
+    monkeypatch.setattr(playback, "page", slow)
     assert "page.html: could not be written (File exists)" in refused(
         "view", folder, "--quiet", "-o", "page.html"
     )
@@ -265,25 +264,3 @@ def test_an_estimator_from_outside_is_played_under_its_own_title(obey, undrawn):
     assert obey("view", "one", *words[:2], "--quiet") == (0, "one/view.html\n", "")
     page = Path("one/view.html").read_text()
     assert "fused \\u00b7 \\u003ci>Mine\\u003c/i>" in page
-
-
-def test_a_recording_needs_its_package_and_a_name_of_its_kind(folder, refused, monkeypatch):
-    monkeypatch.setattr(rerun_file, "find_spec", lambda _: None)
-    assert refused("view", folder, "--rerun", "x.rrd") == (
-        "--rerun: needs rerun-sdk, which is not installed; "
-        "python -m pip install 'pipistrelle[view]' installs it"
-    )
-    monkeypatch.setattr(rerun_file, "find_spec", lambda _: True)
-    said = refused("view", folder, "--rerun", "x.html")
-    assert said == "--rerun: found x.html, expected a name that ends in .rrd"
-    Path("x.rrd").write_text("mine")
-    assert "x.rrd: is there already" in refused("view", folder, "--rerun", "x.rrd")
-    assert not (folder / "view.html").exists()
-
-
-def test_a_recording_is_written_beside_the_page(obey, folder, monkeypatch):
-    monkeypatch.setattr(rerun_file, "find_spec", lambda _: True)
-    monkeypatch.setattr(rerun_file, "recording", lambda played: played.title.encode())
-    assert obey("view", folder, "--rerun", "x.rrd")[:2] == (0, "x.rrd\none/view.html\n")
-    assert Path("x.rrd").read_bytes() == b"Mission of seed 7"
-    assert is_page(folder / "view.html")

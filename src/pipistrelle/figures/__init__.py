@@ -1,8 +1,8 @@
-"""Numbers to pictures. Nothing is computed here that a result does not already say.
+"""Figures and films of results.
 
-`mission` draws one world as each strategy saw it, with the errors below; a `recorder` keeps what a
-filter believes while it runs and `animation` plays it back. Both put together the pieces of `maps`
-in the one look of `style`. `chart` says what a figure of a study holds, `chart_plot` prints it.
+`mission` draws the maps of a world and the errors below; `recorder` keeps the beliefs of a
+running estimator and `film` plays them. Both are built of `maps` in the style of `style`. `chart`
+holds and draws the figures of a study, `player` makes the page of a mission.
 """
 
 from lazy_loader import attach
@@ -10,7 +10,7 @@ from lazy_loader import attach
 __getattr__, __dir__, __all__ = attach(
     __name__,
     submod_attrs={
-        "animation": ["animate_mission"],
+        "film": ["animate_mission"],
         "mission": ["draw_mission"],
         "recorder": ["MissionRecorder"],
         "style": ["save_figure"],

@@ -1,50 +1,53 @@
-"""A chart as data: what is drawn, without how. The printed figure, the page and the CSV agree.
+"""Charts as data, drawn with matplotlib or by the report's page, and their numbers as CSV.
 
-A `Chart` holds panels, a `Panel` holds series over common axes. `chart_plot` draws charts with
-matplotlib, `report` draws the same ones as vectors on its page, `csv_text` writes their numbers.
-What a series can look like stands in `MARKS`, for both; another look is another row there.
+A `Chart` holds panels, a `Panel` holds series over common axes. `draw_chart` draws with matplotlib,
+`report` draws the same charts as vectors on its page, `csv_text` writes their numbers. `MARKS` are
+the styles of series for both; a new style is a new row.
 """
 
 import math
+import textwrap
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 from jaxtyping import Float
 
-from pipistrelle.figures.style import MAX_COLUMNS
+from pipistrelle.figures.style import INK, MAX_COLUMNS, STYLE, TRUTH, strategy_colour
 
 if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
     from matplotlib.ticker import Locator
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Mark:
-    """How the points of a series are shown."""
+    """The style of a series."""
 
     joined: bool = False
-    """By a line."""
+    """Whether a line joins the points."""
     spread: Literal["band", "bars"] = "band"
-    """What `low` and `high` are drawn as."""
+    """How `low` and `high` are drawn."""
     symbol: str = ""
-    """At each point, as matplotlib names it; none if empty."""
+    """Marker of matplotlib at each point; empty for none."""
     size: float = 5.0
     edge: float = 0.0
-    """0: it has none."""
+    """Width of the symbol's edge."""
     corners: tuple[tuple[float, float], ...] = ()
-    """Of the symbol on the page, about the point, y down; if there are none, it is a circle."""
+    """Corners of the symbol on the page around the point, y down; empty for a circle."""
     radius: float = 3.2
     pinned: bool = False
-    """Small and many, for single worlds: those above the panel stand at its edge."""
+    """Whether points above the panel are drawn at its edge: small marks of single worlds."""
     written: bool = False
-    """No symbol: what `tips` say stands at the points."""
+    """Whether `tips` are written at the points in place of symbols."""
     swatch: Literal["line", "dashed", "dot", "star"] = "line"
-    """Its sign in the page's legend."""
+    """Symbol in the page's legend."""
 
 
 def _star(outer: float, inner: float) -> tuple[tuple[float, float], ...]:
-    """Return the corners of a star of five points, one of them up."""
+    """Return the corners of a star with five points, the first upwards."""
     turn = np.pi * (np.arange(10) / 5.0 - 0.5)
     reach = np.where(np.arange(10) % 2, inner, outer)
     return tuple(zip((reach * np.cos(turn)).tolist(), (reach * np.sin(turn)).tolist(), strict=True))
@@ -61,52 +64,63 @@ MARKS = {
     "stars": Mark(symbol="*", size=13.0, edge=0.8, corners=_star(9.0, 3.6), swatch="star"),
     "text": Mark(written=True),
 }
-"""What a series can look like, by the name that the CSV gives it."""
+"""Styles of series by their names in the CSV."""
 MOST_NAMES = 6
-"""Most names of a legend."""
+"""Most entries of a legend."""
+WIDTH = {1: 6.0, 2: 9.0, 3: 12.0}
+"""Width of a figure by its number of columns [inch]."""
+ROW, REST = 3.3, 0.8
+"""Height of a row of panels, and of title and legend together [inch]."""
+TEXT = {"grid": "#8a8a8a"}
+"""Colours of text for roles whose colour is too faint."""
+PLAIN = {"text.parse_math": False}
+"""Names are not parsed as mathematics: they may contain dollar signs."""
+LETTER = 0.065
+"""Width of a letter of the legend [inch]."""
+BAND = 0.15
+"""Opacity of a band."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Series:
-    """Points that belong together."""
+    """Points of the same name and style."""
 
     name: str
     role: str
-    """What colours it: a strategy, "ink", "truth" or "grid"."""
+    """Name of the colour: a strategy, "ink", "truth" or "grid"."""
     x: Float[np.ndarray, " n"]
     y: Float[np.ndarray, " n"]
-    """Not finite: a gap."""
+    """Gaps are not finite."""
     low: Float[np.ndarray, " n"] | None = None
     high: Float[np.ndarray, " n"] | None = None
-    """Ends of a band, or of bars, about y."""
+    """Ends of a band or of bars around y."""
     style: str = "line"
-    """One of `MARKS`."""
+    """Key of `MARKS`."""
     filled: np.ndarray | None = None
-    """Which points are full; all of them if not said."""
+    """Mask of the filled points; by default all."""
     strength: float = 1.0
     """Opacity."""
     dashed: bool = False
     tips: tuple[str, ...] = ()
-    """What to say of each point, where the axes alone do not."""
+    """Texts of the points, besides their coordinates."""
     listed: bool = True
-    """Whether the legend and the CSV name it."""
+    """Whether legend and CSV contain the series."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Axis:
-    """One direction of a panel."""
+    """An axis of a panel."""
 
     label: str
     limits: tuple[float, float]
     log: bool = False
     ticks: tuple[tuple[float, str], ...]
     named: tuple[tuple[float, str], ...] = ()
-    """The places at which there is something to read out, as the page calls them; where there are
-    none, it takes the ticks."""
+    """Values with a text to read out on the page, and the texts; by default the ticks."""
     words: bool = False
-    """The numbers are no more than the order of those names: the CSV has the names."""
+    """Whether the numbers only order the names; the CSV then contains the names."""
     slanted: bool = False
-    """The ticks' words are written upwards, for they are too long to stand side by side."""
+    """Whether long texts of ticks are slanted."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -115,26 +129,26 @@ class Panel:
 
     title: str
     role: str = "ink"
-    """Colours the title."""
+    """Name of the title's colour."""
     x: Axis
     y: Axis
     series: tuple[Series, ...]
     span: tuple[float, float, str] | None = None
-    """A band across the panel: where y should be."""
+    """Band of expected y: low, high and its text."""
     rules: tuple[float, ...] = ()
-    """Where a thin line crosses the panel from left to right."""
+    """y of thin horizontal lines."""
     posts: tuple[float, ...] = ()
-    """Where one crosses it from bottom to top."""
+    """x of thin vertical lines."""
     equal: bool = False
-    """One unit is as long on both axes, which are not drawn."""
+    """Whether both axes have one scale and are hidden."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Chart:
-    """Panels that make one figure."""
+    """A figure as data."""
 
     name: str
-    """Of its files."""
+    """Name of its files."""
     title: str
     caption: str
     panels: tuple[Panel, ...]
@@ -142,11 +156,10 @@ class Chart:
 
 
 def ticks(low: float, high: float, log: bool = False) -> tuple[tuple[float, str], ...]:
-    """Round numbers along an axis, about five of them.
+    """Return about five round numbers along an axis, with their texts.
 
-    `low` and `high`: low below high; above 0 where the axis is logarithmic. `log`: powers of ten,
-    with 3 in between where there are fewer than three; numbers as along a linear axis where that
-    would leave one or none.
+    `low` is below `high`, and above 0 on a logarithmic axis. `log`: powers of ten, with 3 in
+    between if they are fewer than three; linear ticks if fewer than two remain.
 
     Examples
     --------
@@ -169,19 +182,9 @@ def ticks(low: float, high: float, log: bool = False) -> tuple[tuple[float, str]
 
 
 def linear_axis(label: str, values: Iterable[float], *, floor: float | None = None) -> Axis:
-    """Return an axis that holds some values, with a little room.
+    """Return a linear axis that contains all finite values, with a margin.
 
-    Parameters
-    ----------
-    label : str
-    values : iterable of float
-        Those that are not finite are left out.
-    floor : float, optional
-        Where the axis begins, else below the smallest value.
-
-    Returns
-    -------
-    Axis
+    `floor`: start of the axis; by default it starts below the smallest value.
 
     Examples
     --------
@@ -198,9 +201,7 @@ def linear_axis(label: str, values: Iterable[float], *, floor: float | None = No
 
 
 def log_axis(label: str, values: Iterable[float]) -> Axis:
-    """Return a logarithmic axis that holds some values.
-
-    `values`: those that are not finite and above 0 are left out.
+    """Return a logarithmic axis that contains all finite positive values.
 
     Examples
     --------
@@ -213,7 +214,7 @@ def log_axis(label: str, values: Iterable[float]) -> Axis:
 
 
 def ends(found: Iterable[Series]) -> list[float]:
-    """Return the numbers that an axis has to hold to show some series.
+    """Return all y values of some series, with the ends of their bands.
 
     Examples
     --------
@@ -230,10 +231,10 @@ def ends(found: Iterable[Series]) -> list[float]:
 
 
 def columns_of(count: int) -> int:
-    """Tell how many panels stand beside each other.
+    """Return the number of columns for a number of panels.
 
-    `count`: panels of the chart. Returns: all, up to `style.MAX_COLUMNS`; of more, as many
-    as that if they fill their rows, else two.
+    Up to `style.MAX_COLUMNS` panels are in a single row; more have that many columns if they fill
+    their rows, otherwise two.
 
     Examples
     --------
@@ -246,9 +247,7 @@ def columns_of(count: int) -> int:
 
 
 def legend_series(panels: Iterable[Panel]) -> dict[str, Series]:
-    """List what a legend over some panels explains.
-
-    Returns: by name, the last of each; empty where the names are many: there the caption tells.
+    """Return the series of a legend by name; empty for more than `MOST_NAMES` names.
 
     Examples
     --------
@@ -262,18 +261,15 @@ def legend_series(panels: Iterable[Panel]) -> dict[str, Series]:
 
 
 def explained(series: Series) -> bool:
-    """Tell whether a series has a sign in the legend, and is read out by its name.
-
-    Returns: not of single worlds, nor of what is written out.
-    """
+    """Return whether a series is in the legend: neither pinned nor written."""
     mark = MARKS[series.style]
     return not (mark.pinned or mark.written)
 
 
 def csv_rows(chart: Chart, **constant: str) -> list[list[str]]:
-    """Lay the numbers of a chart out, one row per point, to nine digits.
+    """Return the numbers of a chart with nine digits, a row per point.
 
-    `constant`: further columns, the same in each row, put first.
+    `constant`: first columns with the same value in all rows.
 
     Examples
     --------
@@ -301,16 +297,14 @@ def csv_rows(chart: Chart, **constant: str) -> list[list[str]]:
 
 
 def _place(axis: Axis, value: float) -> str:
-    """Write where a point stands: the name that is nearest, or the number."""
+    """Return the nearest name on an axis of words, otherwise the number."""
     if axis.words:
         return min(axis.named, key=lambda name: abs(name[0] - value))[1]
     return "" if math.isnan(value) else f"{value:.9g}"
 
 
 def csv_text(rows: Sequence[Sequence[str]]) -> str:
-    r"""Write rows as CSV.
-
-    Returns: fields with a comma, a quote or a line break are quoted.
+    r"""Return rows as CSV, with quotes around fields that need them.
 
     Examples
     --------
@@ -323,3 +317,136 @@ def csv_text(rows: Sequence[Sequence[str]]) -> str:
     text = io.StringIO()
     csv.writer(text, lineterminator="\n").writerows(rows)
     return text.getvalue()
+
+
+def draw_chart(chart: Chart) -> "Figure":
+    """Draw a chart; raise ValueError without panels.
+
+    Examples
+    --------
+    >>> draw_chart(Chart(name="", title="", caption="", panels=(), columns=("x", "y")))
+    Traceback (most recent call last):
+    ValueError: a chart's figure needs at least one panel
+    """
+    import matplotlib
+
+    from pipistrelle.figures.picture import picture
+
+    count = len(chart.panels)
+    if count == 0:
+        raise ValueError("a chart's figure needs at least one panel")
+    columns = columns_of(count)
+    rows = -(-count // columns)
+    height = ROW
+    if (first := chart.panels[0]).equal:
+        (left, right), (low, high) = first.x.limits, first.y.limits
+        height = WIDTH[columns] / columns * (high - low) / (right - left)
+    size = (WIDTH[columns], rows * height + REST)
+    with matplotlib.rc_context(STYLE | PLAIN):
+        figure = picture(*size)
+        figure.set_layout_engine("constrained", w_pad=0.1, h_pad=0.06)
+        figure.suptitle(chart.title, x=0.01, ha="left", fontsize=12, weight="bold")
+        for i, panel in enumerate(chart.panels):
+            axes = figure.add_subplot(rows, columns, i + 1)
+            _draw_panel(axes, panel)
+        if handles := [_handle(*named) for named in legend_series(chart.panels).items()]:
+            longest = max(len(handle.get_label()) for handle in handles)
+            fitting = max(1, int(size[0] / (0.5 + LETTER * longest)))
+            ncols = min(len(handles), 6, fitting)
+            figure.legend(handles=handles, loc="outside lower left", ncols=ncols)
+    return figure
+
+
+def _colour(role: str) -> str:
+    """Return the colour of a role."""
+    return {"ink": INK, "truth": TRUTH, "grid": "#d8d8d8"}.get(role) or strategy_colour(role)
+
+
+def _draw_panel(axes: "Axes", panel: Panel) -> None:
+    """Draw a panel: band and thin lines, then the series."""
+    from matplotlib.ticker import NullLocator
+
+    if panel.title:
+        axes.set_title(panel.title, color=_colour(panel.role), loc="left", weight="bold")
+    if panel.equal:
+        axes.set_aspect("equal")
+        axes.set_axis_off()
+    else:
+        axes.grid(True)
+    axes.set_axisbelow(True)
+    axes.set(xscale=_scale(panel.x), yscale=_scale(panel.y))
+    axes.set(xlim=panel.x.limits, ylim=panel.y.limits, xlabel=panel.x.label, ylabel=panel.y.label)
+    for axis, given in ((axes.xaxis, panel.x), (axes.yaxis, panel.y)):
+        axis.set_minor_locator(NullLocator())
+        axis.set_ticks([value for value, _ in given.ticks], [text for _, text in given.ticks])
+        if given.slanted:
+            for label in axis.get_ticklabels():
+                label.set(rotation=35, ha="right", rotation_mode="anchor")
+    if panel.span:
+        axes.axhspan(*panel.span[:2], color="#d0d0d0", alpha=0.55, lw=0, zorder=0.5)
+    for y in panel.rules:
+        axes.axhline(y, color=INK, lw=0.8, zorder=1)
+    for x in panel.posts:
+        axes.axvline(x, color=TRUTH, lw=0.8, ls=(0, (2, 3)), zorder=1)
+    for order, series in enumerate(panel.series):
+        _draw_series(axes, series, panel.y.limits[1], 2.0 + 0.01 * order)
+
+
+def _scale(axis: Axis) -> str:
+    return "log" if axis.log else "linear"
+
+
+def _draw_series(axes: "Axes", series: Series, top: float, order: float) -> None:
+    """Draw a series in the style of its mark."""
+    mark = MARKS[series.style]
+    colour, alpha = _colour(series.role), series.strength
+    given: dict[str, Any] = {"color": colour, "alpha": alpha, "zorder": order}
+    x, y = series.x, series.y
+    if mark.written:
+        for at, up, text in zip(x, y, series.tips, strict=True):
+            axes.text(at, up, text, color=TEXT.get(series.role, colour), ha="center", va="center",
+                      fontsize=8, zorder=order)  # fmt: skip
+        return
+    if mark.pinned:
+        inside = y <= top
+        given |= {"lw": 0, "mec": "none"}
+        axes.plot(x[inside], y[inside], mark.symbol, ms=mark.size, **given)
+        axes.plot(x[~inside], np.full(x[~inside].shape, 0.985 * top), "^", ms=3.4, **given)
+        return
+    if series.low is not None and series.high is not None:
+        if mark.spread == "bars":
+            axes.vlines(x, series.low, series.high, lw=1.6, **given)
+        else:
+            below = order - 0.5  # every band under every line
+            axes.fill_between(
+                x, series.low, series.high, color=colour, alpha=BAND, lw=0, zorder=below
+            )
+    if mark.joined:
+        axes.plot(x, y, lw=1.4, ls=(0, (4, 3)) if series.dashed else "-", **given)
+    if mark.symbol:
+        filled = np.ones(len(x), bool) if series.filled is None else series.filled
+        look: dict[str, Any] = {"ms": mark.size, "lw": 0, "mec": colour, "zorder": order + 0.005}
+        if mark.edge:
+            look |= {"mec": "white", "mew": mark.edge}
+        axes.plot(x[filled], y[filled], mark.symbol, mfc=colour, **look)
+        axes.plot(x[~filled], y[~filled], mark.symbol, mfc="white", **look)
+
+
+def _handle(name: str, series: Series) -> Any:
+    """Return the legend entry of a series."""
+    from matplotlib.lines import Line2D
+
+    mark, colour = MARKS[series.style], _colour(series.role)
+    hollow = series.filled is not None and not series.filled.any()
+    return Line2D(
+        [],
+        [],
+        color=colour,
+        alpha=series.strength if series.strength < 1.0 else None,
+        ls="--" if series.dashed else "-",
+        lw=1.4 if mark.joined or series.low is not None else 0.0,
+        marker=mark.symbol,
+        ms=min(mark.size, 10.0),
+        mfc="none" if hollow else colour,
+        label=textwrap.shorten(name, 60),
+    )

@@ -1,4 +1,4 @@
-"""A figure as it is handed out: it shows itself in a notebook."""
+"""Figures that a notebook displays."""
 
 from io import BytesIO
 
@@ -8,19 +8,17 @@ DPI = 80
 
 
 class _Picture(Figure):
-    """A figure that a notebook shows without pyplot, which would have to know it to do so."""
+    """A figure that a notebook displays although pyplot does not know it."""
 
     def _repr_png_(self) -> bytes:
-        """Draw it, as notebooks ask for."""
-        room = BytesIO()
-        self.savefig(room, format="png", dpi=DPI)
-        return room.getvalue()
+        """Return the figure as PNG, for notebooks."""
+        file = BytesIO()
+        self.savefig(file, format="png", dpi=DPI)
+        return file.getvalue()
 
 
 def picture(width: float, height: float) -> Figure:
-    r"""Return an empty figure that a notebook shows as it ends a cell.
-
-    `width` and `height` [inch].
+    r"""Return an empty figure of a width and a height [inch] that a notebook displays.
 
     Examples
     --------

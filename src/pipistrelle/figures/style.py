@@ -1,4 +1,4 @@
-"""One look for every picture: a colour for each strategy, type sizes, how a figure is saved."""
+"""The style of all figures: colours, sizes of type, and the saving of a figure."""
 
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -7,11 +7,11 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 STRATEGY_COLOURS = {"active": "#1f4e96", "fused": "#d1495b", "passive": "#d99a00"}
-"""Told apart by colour-blind readers and, by lightness alone (L* = 33, 51, 67), in print."""
+"""Distinct for colour-blind readers and, by lightness (L* = 33, 51, 67), in print."""
 INK = "#333333"
-"""Text, the beacon, and any strategy without a colour of its own."""
+"""Colour of text, beacon and strategies that are not in `STRATEGY_COLOURS`."""
 TRUTH = "#8a8a8a"
-"""What is true: the path and the landmarks."""
+"""Colour of the true path and landmarks."""
 PAGE = {
     "light": {
         "paper": "#fbfaf7",
@@ -52,9 +52,9 @@ PAGE = {
         "passive": "#f0bd45",
     },
 }
-"""Colours of a page, by the scheme that its reader prefers."""
+"""Colours of a page in its light and dark scheme."""
 MAX_COLUMNS = 3
-"""Most panels beside each other; further ones start a new row."""
+"""Most panels in a row."""
 
 STYLE = {
     "font.family": "DejaVu Sans",
@@ -79,11 +79,11 @@ STYLE = {
     "lines.solid_capstyle": "round",
     "pdf.fonttype": 42,
 }
-"""Matplotlib's settings, in force (`matplotlib.rc_context`) while a figure is made or saved."""
+"""Settings of matplotlib while a figure is made or saved."""
 
 
 def strategy_colour(strategy: str) -> str:
-    """Colour of a strategy, the same in every picture.
+    """Return the colour of a strategy, the same in every figure.
 
     Examples
     --------
@@ -94,9 +94,7 @@ def strategy_colour(strategy: str) -> str:
 
 
 def page_colours() -> str:
-    """Write the colours of a page as a style sheet's variables.
-
-    Returns: CSS: a variable for each name of `PAGE`, light unless the reader prefers dark.
+    """Return the colours of a page as CSS variables, light unless the reader prefers dark.
 
     Examples
     --------
@@ -114,7 +112,7 @@ def page_colours() -> str:
 def save_figure(figure: "Figure", folder: Path, name: str) -> tuple[Path, Path]:
     """Write a figure as ``name.png`` and ``name.pdf``, the same bytes for the same figure.
 
-    `folder`: made where it is missing. `name`: without ending.
+    `folder`: created if missing.
 
     Examples
     --------

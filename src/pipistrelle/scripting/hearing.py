@@ -85,7 +85,7 @@ class Heard:
 
     def figure(self) -> "Figure":
         """Draw the matched filter's output over the first calls, and what was taken for echoes."""
-        from pipistrelle.figures.hearing import draw_hearing
+        from pipistrelle.figures.sound import draw_hearing
 
         return draw_hearing(self.overview)
 

@@ -169,7 +169,7 @@ def drawn(mission: Mission) -> "Figure":
 
 def filmed(mission: Mission, watch: "MissionRecorder", path: Path) -> None:
     """Film a mission that a recorder has watched into a .gif or .mp4 file."""
-    from pipistrelle.figures.animation import animate_mission
+    from pipistrelle.figures.film import animate_mission
 
     animate_mission(
         watch.snapshots,

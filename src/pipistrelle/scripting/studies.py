@@ -83,7 +83,7 @@ class StudyResults:
 
     def figure(self) -> "Figure":
         """Draw the first figure of the report: what is asked, by what is varied."""
-        from pipistrelle.figures.chart_plot import draw_chart
+        from pipistrelle.figures.chart import draw_chart
         from pipistrelle.report.charts.results import study_charts
 
         answered_study = self._answered

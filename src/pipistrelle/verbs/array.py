@@ -62,7 +62,7 @@ def array(
         for line in _cannot(layout.name, patterns):
             put(line)
     if output is not None:
-        from pipistrelle.figures.array import draw_array
+        from pipistrelle.figures.sound import draw_array
 
         name = file if square else Path(file).name
         asked = {"name": name, "frequency": frequency, "speed_of_sound": c}

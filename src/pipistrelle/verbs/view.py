@@ -40,14 +40,6 @@ def view(
             help=f"Where the page goes. [default: FOLDER/{PAGE}]",
         ),
     ] = None,
-    rerun: Annotated[
-        Path | None,
-        Parameter(
-            metavar="FILE.rrd",
-            help="Write a recording for the Rerun viewer as well; needs the extra view. "
-            "[default: no]",
-        ),
-    ] = None,
     log: Annotated[
         Path | None,
         Parameter(
@@ -84,24 +76,13 @@ def view(
     read_summary(folder)
     target = folder / PAGE if output is None else output
     check_place(target, folder, ".html", "-o", overwrite)
-    if rerun is not None:
-        from pipistrelle.figures.player.rerun_file import check_there
-
-        check_there()
-        check_place(rerun, folder, ".rrd", "--rerun", overwrite)
-    from pipistrelle.figures.player.page import page
+    from pipistrelle.figures.player.playback import page
     from pipistrelle.scripting.arguments import named_filters
     from pipistrelle.verbs.streams import put
 
     trusted = (*(named_filters(estimator, "--filter") if estimator else ()), association or "")
     played = _play_again(folder, log, trusted, quiet)
-    if rerun is not None:
-        from pipistrelle.figures.player.rerun_file import recording
-
-        write_file(rerun, folder, recording(played), overwrite)
     write_file(target, folder, page(played).encode(), overwrite)
-    if rerun is not None and not quiet:
-        put(rerun)
     put(target)
 
 

@@ -9,8 +9,8 @@ import pytest
 
 from pipistrelle.estimation.beliefs import placed
 from pipistrelle.experiments.drives import NO_TRUTH
-from pipistrelle.figures.player.page import page as written_page
 from pipistrelle.figures.player.playback import Rows, playback
+from pipistrelle.figures.player.playback import page as written_page
 from reference.pages import contrasts
 
 CHROMIUM = Path("/usr/bin/chromium")
@@ -115,7 +115,7 @@ def estimate_of(played, strategy, estimator="ekf"):
     return found
 
 
-def test_it_loads_without_a_word_and_asks_for_itself_alone(opened, written):
+def test_the_page_loads_without_messages_or_other_requests(opened, written):
     page, noise = opened
     page.wait_for_load_state("networkidle")
     go(page, 40)
@@ -162,7 +162,7 @@ def test_the_slider_moves_the_robot(opened, played):
 
 
 @pytest.mark.parametrize("frame", [1, 12, 40])
-def test_the_map_is_that_of_the_frame(opened, watched, frame):
+def test_the_map_shows_the_current_frame(opened, watched, frame):
     page, _ = opened
     _, snapshots = watched
     go(page, frame)
@@ -258,7 +258,7 @@ def test_a_button_with_the_focus_is_not_pressed_twice_by_space(desk):
     assert desk.evaluate("state.playing")
 
 
-def test_one_may_be_left_alone_and_another_be_put_beside_it(desk):
+def test_estimates_are_shown_singly_or_side_by_side(desk):
     selects = desk.locator(".head select")
     assert [each.input_value() for each in selects.all()] == ["2", "0"]
     selects.nth(0).select_option(label="nothing")
@@ -272,7 +272,7 @@ def test_one_may_be_left_alone_and_another_be_put_beside_it(desk):
     assert left["x"] + left["width"] <= right["x"]
 
 
-def test_charts_say_the_errors_of_the_frame_and_go_where_they_are_clicked(desk, played):
+def test_charts_show_the_errors_and_move_to_a_clicked_frame(desk, played):
     go(desk, 25)
     estimate = estimate_of(played, "fused")
     off = np.hypot(*(estimate.pose[24] - played.true_pose[24])[:2])
@@ -293,7 +293,7 @@ def test_both_panels_have_one_scale(desk):
     assert maps[0] == maps[1]
 
 
-def test_a_landmark_is_chosen_on_the_map_and_its_story_told(desk, played):
+def test_a_selected_landmark_shows_its_details(desk, played):
     go(desk, 40)
     estimate = estimate_of(played, "fused")
     rows = slice(*estimate.mapped.first[39:41])
@@ -340,7 +340,7 @@ def test_a_landmarks_life_is_a_line_that_grows_thick_when_it_is_placed(desk, pla
     assert widths[0] < widths[1]
 
 
-def test_without_truth_no_error_is_told(browser, watched, tmp_path):
+def test_a_page_without_truth_shows_no_position_error(browser, watched, tmp_path):
     done, snapshots = watched
     drive = replace(done.drive, truth=NO_TRUTH)
     blind = replace(done, drive=drive, callers=(), beamwidth=None)
@@ -394,7 +394,7 @@ def test_a_mission_of_one_frame_is_shown(browser, watched, tmp_path):
     page.context.close()
 
 
-def test_a_path_that_was_revised_stands_beside_the_one_believed_then(browser, played, tmp_path):
+def test_a_revised_path_is_shown_with_the_online_path(browser, played, tmp_path):
     estimate = estimate_of(played, "fused")
     points = np.vstack([estimate.start, estimate.pose])[:, :2] + 3.0
     nobody = np.zeros(len(points), int)
@@ -414,7 +414,7 @@ def test_a_path_that_was_revised_stands_beside_the_one_believed_then(browser, pl
     page.context.close()
 
 
-def test_text_stands_out_from_its_ground(opened):
+def test_text_has_enough_contrast(opened):
     """At least 4.5 to 1, as the accessibility guidelines ask for."""
     page, _ = opened
     ratios = contrasts(page, "h1,h2,p,b,small,output,figcaption,label,button,.tick,.axis span")
@@ -445,7 +445,7 @@ def excess_paths_of(estimate, frame, label):
     return estimate.excess_paths.numbers[rows][estimate.excess_paths.landmark[rows] == label]
 
 
-def test_the_ellipses_of_a_frame_are_those_of_the_landmark_that_it_resolves(timing):
+def test_a_frame_shows_the_ellipses_of_its_resolved_landmark(timing):
     page, _, estimate = timing
     counts = set()
     for frame in range(1, 41, 3):
@@ -477,7 +477,7 @@ def test_an_ellipse_is_about_vehicle_and_caller_and_as_long_as_the_way(timing):
         assert way == pytest.approx(np.hypot(*(place - vehicle)) + excess_path, rel=5e-3)
 
 
-def test_a_chosen_landmark_shows_its_own_excess_paths(timing):
+def test_a_selected_landmark_shows_its_excess_paths(timing):
     page, _, estimate = timing
     labels = estimate.excess_paths.landmark[slice(*estimate.excess_paths.first[29:31])]
     other = next(label for label in labels if label != estimate.resolved[29])
@@ -520,9 +520,7 @@ def test_with_ellipses_nothing_is_wider_than_the_screen_and_all_callers_have_nam
     assert [(ratio, what) for ratio, what in ratios if ratio < 4.5] == []
 
 
-def test_callers_whose_place_nobody_knows_bear_their_names_where_they_are_believed(
-    browser, timed, tmp_path
-):
+def test_callers_without_truth_are_labelled_at_their_estimates(browser, timed, tmp_path):
     known = playback(*timed)
     nowhere = tuple((label, name, np.full(2, np.nan)) for label, name, _ in known.callers[:2])
     estimate = estimate_of(known, "fused")

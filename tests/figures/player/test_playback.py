@@ -1,5 +1,8 @@
-"""The numbers of a page are those that the filters had, frame by frame."""
+"""The arrays of a playback, and its page as a file: complete, self-contained, escaped."""
 
+import base64
+import json
+import re
 from dataclasses import replace
 from types import SimpleNamespace
 
@@ -18,10 +21,10 @@ from pipistrelle.detection.scans import rows_of as rows_of_scan
 from pipistrelle.estimation.beliefs import Gaussian
 from pipistrelle.experiments.drives import NO_TRUTH
 from pipistrelle.experiments.runs.trial import run_mission
-from pipistrelle.figures.animation import pruned
-from pipistrelle.figures.excess_paths import callers_at, resolved
-from pipistrelle.figures.player.playback import MAX_PARTICLES, playback
-from pipistrelle.figures.recorder import MissionRecorder
+from pipistrelle.figures.player.playback import MAX_PARTICLES, SCRIPTS, Rows, page, playback
+from pipistrelle.figures.recorder import MissionRecorder, callers_at, pruned, resolved
+
+BAD = "</script><script>alert('a')</script>\"'&"
 
 
 def rows_of(rows, frame):
@@ -72,7 +75,7 @@ def with_excess_path(scan):
     return more
 
 
-def test_times_are_those_since_the_start_and_the_truth_is_that_of_the_frames(watched, played):
+def test_times_and_truth_belong_to_the_frames(watched, played):
     done, _ = watched
     np.testing.assert_allclose(played.time, 0.5 * np.arange(1, 41))
     np.testing.assert_array_equal(played.true_pose, done.drive.truth.path[4::4])
@@ -84,14 +87,14 @@ def test_times_are_those_since_the_start_and_the_truth_is_that_of_the_frames(wat
     np.testing.assert_array_equal(place, done.drive.truth.landmarks[1][-1])
 
 
-def test_the_spread_is_that_of_the_pose(watched, played):
+def test_the_spread_is_the_covariance_of_the_pose(watched, played):
     _, snapshots = watched
     covariance = snapshots["fused", "ekf"][20].covariance
     expected = [covariance[0, 0], covariance[0, 1], covariance[1, 1], covariance[2, 2]]
     np.testing.assert_array_equal(of(played, "fused", "ekf").spread[20], expected)
 
 
-def test_what_is_pruned_is_shown_at_the_frame_that_pruned_it(watched, played):
+def test_pruned_members_belong_to_the_frame_without_them(watched, played):
     _, snapshots = watched
     frames, estimate = snapshots["passive", "ekf"], of(played, "passive", "ekf")
     assert len(rows_of(estimate.pruned, 0)[0]) == 0
@@ -145,7 +148,7 @@ def test_estimates_without_a_frame_are_left_out_and_none_at_all_is_refused(watch
         playback(failed, {})
 
 
-def test_without_truth_there_is_none_and_the_map_is_around_what_is_estimated(watched):
+def test_the_map_without_truth_contains_the_estimates(watched):
     done, snapshots = watched
     blind = playback(
         replace(done, drive=replace(done.drive, truth=NO_TRUTH), callers=()), snapshots
@@ -261,7 +264,7 @@ def test_the_longer_it_goes_on_the_longer_it_may_rest(watched):
     assert np.all(np.diff(gaps) >= 0)
 
 
-def test_paths_as_they_were_revised_stand_at_their_frames_and_the_last_is_the_tracks(watched):
+def test_revised_paths_have_their_frames_and_the_last_is_the_track(watched):
     done, _ = watched
     _, snapshots = revised(watched, 3)
     (trial,) = [t for t in done.trials if (t.strategy, t.filter) == ("fused", "ekf")]
@@ -278,7 +281,7 @@ def test_paths_as_they_were_revised_stand_at_their_frames_and_the_last_is_the_tr
     assert estimate.start[0] == trial.track.pose.mean[0, 0]
 
 
-def test_excess_paths_are_laid_out_with_where_their_callers_are_believed_to_be(timed):
+def test_excess_paths_have_the_estimated_positions_of_their_callers(timed):
     again, snapshots = timed
     shown = playback(again, snapshots)
     assert [place.ndim for *_, place in shown.callers] == [1, 1, 2]
@@ -302,7 +305,7 @@ def test_excess_paths_are_laid_out_with_where_their_callers_are_believed_to_be(t
             assert scan.caller[row] - 1 == caller
 
 
-def test_without_excess_paths_nothing_is_laid_out_for_them(played):
+def test_a_mission_without_excess_paths_has_no_rows_of_them(played):
     for estimate in played.estimates:
         assert estimate.callers is None
         assert len(estimate.excess_paths.landmark) == 0
@@ -319,7 +322,7 @@ def test_a_logs_callers_have_names_and_no_true_place(watched):
     assert np.isnan(place).all()
 
 
-def test_playback_names_landmarks_of_an_association_as_the_true_ones_they_stand_for():
+def test_associated_landmarks_have_the_labels_of_true_landmarks():
     config = Config(seed=7, scenario=ScenarioConfig(steps=160, landmarks=20))
     config = config.model_copy(
         update={
@@ -336,3 +339,112 @@ def test_playback_names_landmarks_of_an_association_as_the_true_ones_they_stand_
     assert len(off) == 3
     assert max(off) < 2.0
     assert {*estimate.heard.landmark.tolist()} & {*labels.tolist()}
+
+
+def numbers(text):
+    found = re.search(r'<script type="application/json" id="numbers">(.*?)</script>', text, re.S)
+    return json.loads(found[1])
+
+
+def unpacked(packed):
+    ((name, text),) = packed.items()
+    return np.frombuffer(base64.b64decode(text), {"float32": "<f4", "int32": "<i4"}[name])
+
+
+def test_the_numbers_are_the_missions(played):
+    held = numbers(page(played))
+    np.testing.assert_array_equal(unpacked(held["time"]), played.time.astype("f4"))
+    np.testing.assert_array_equal(unpacked(held["truePose"]), played.true_pose.astype("f4").ravel())
+    assert held["limits"] == [list(pair) for pair in played.limits]
+    assert [one["name"] for one in held["estimates"][:2]] == [
+        "active · EKF",
+        "active · FastSLAM 2.0",
+    ]
+    assert [one["calls"] for one in held["estimates"]] == [True, True, True, True, False, False]
+    for one, estimate in zip(held["estimates"], played.estimates, strict=True):
+        assert one["role"] == estimate.strategy
+        rows = one["mapped"]
+        np.testing.assert_array_equal(unpacked(rows["first"]), estimate.mapped.first)
+        np.testing.assert_array_equal(unpacked(rows["landmark"]), estimate.mapped.landmark)
+        shape = (-1, rows["columns"])
+        same = estimate.mapped.numbers.astype("f4")
+        np.testing.assert_array_equal(unpacked(rows["numbers"]).reshape(shape), same)
+    assert held["scales"]["placed"] == pytest.approx(np.sqrt(-2.0 * np.log(0.05)))
+    assert held["farthest"] == 20.0
+
+
+def test_a_page_speaks_of_excess_paths_only_where_some_were_heard(played, timed):
+    silent, told = page(played), page(playback(*timed))
+    for word in (
+        'ellipses" type',
+        "An ellipse of an excess path",
+        "E hides the ellipses of excess paths",
+    ):
+        assert word not in silent
+        assert word in told
+    for one in numbers(silent)["estimates"]:
+        assert not {"callers", "excessPaths", "resolved"} & one.keys(), "no number more than before"
+    active, fused = numbers(told)["estimates"]
+    assert "callers" in active
+    assert {"callers", "excessPaths", "resolved"} <= fused.keys()
+    assert "excessPaths" not in active
+
+
+def test_the_same_mission_gives_the_same_bytes(played):
+    assert page(played) == page(played)
+
+
+def test_nothing_in_it_is_anywhere_else(played):
+    text = page(played)
+    assert re.findall(r"https?://[^\s\"'<]+", text) == ["http://www.w3.org/2000/svg"]
+    assert not re.search(r"(?:src|href)=(?!\"data:)", text)
+    assert "url(" not in text
+    assert "@import" not in text
+    assert "default-src 'none'" in text
+
+
+def test_whatever_a_mission_is_called_is_text(played):
+    label, _, place = played.callers[0]
+    named = replace(
+        played,
+        title=BAD,
+        facts=(BAD,),
+        callers=((label, BAD, place),),
+        estimates=(replace(played.estimates[0], outcome=f"failed: {BAD}"),),
+    )
+    text = page(named)
+    assert "alert('a')" not in text.replace(numbers_text(text), "")
+    assert text.count("<script") == 2
+    held = numbers(text)
+    assert held["callers"][0]["name"] == BAD
+    assert held["estimates"][0]["outcome"] == f"failed: {BAD}"
+
+
+def numbers_text(text):
+    return re.search(r'id="numbers">(.*?)</script>', text, re.S)[1]
+
+
+def test_numbers_that_are_none_do_not_break_it(played):
+    estimate = played.estimates[1]
+    wild = np.full(estimate.mapped.numbers.shape, 1e300)
+    lost = replace(
+        estimate,
+        pose=np.full_like(estimate.pose, np.nan),
+        mapped=Rows(first=estimate.mapped.first, landmark=estimate.mapped.landmark, numbers=wild),
+    )
+    held = numbers(page(replace(played, estimates=(lost,))))["estimates"][0]
+    assert np.isnan(unpacked(held["pose"])).all()
+    assert np.isinf(unpacked(held["mapped"]["numbers"])).all()
+
+
+def test_a_strategy_without_a_colour_is_drawn_in_ink(played):
+    strange = replace(played.estimates[0], strategy="someone's own")
+    assert numbers(page(replace(played, estimates=(strange,))))["estimates"][0]["role"] == "ink"
+
+
+def test_every_script_is_in_it(played):
+    from importlib.resources import files
+
+    text, here = page(played), files("pipistrelle.figures.player")
+    assert {path.name for path in here.iterdir() if path.name.endswith(".js")} == set(SCRIPTS)
+    assert all((here / name).read_text(encoding="utf-8") in text for name in SCRIPTS)

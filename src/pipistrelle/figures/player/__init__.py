@@ -1,1 +1,1 @@
-"""A mission frame by frame: `playback` lays out its numbers, `page` and `rerun_file` show them."""
+"""The player of a mission: `playback` and its page, style and scripts."""

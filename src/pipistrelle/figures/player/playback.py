@@ -1,131 +1,143 @@
-"""A mission as flat arrays: of every frame what was heard and what was believed.
+"""A mission as flat arrays of all frames, and the page that plays it.
 
-A page and a recording for other viewers are both made of it. Numbers of all frames stand one after
-another, so that they can be packed; where those of a frame begin, `Rows.first` says.
+`playback` concatenates the numbers of all frames; `Rows.first` has the first row of each frame.
+`page` returns an HTML file without external resources: style, script and numbers (as base64) are
+embedded, and all text is escaped by the template. A script for another viewer is
+`examples/viewers/rerun_mission.py`.
 """
 
+import base64
+import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from importlib.resources import files
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float, Int
+from markupsafe import Markup
 
+from pipistrelle import __version__
 from pipistrelle.acoustics.paths import moves
 from pipistrelle.config import InputError
 from pipistrelle.detection.scans import UNLABELLED
 from pipistrelle.estimation.beliefs import Landmarks, some_of
+from pipistrelle.estimation.catalogue import title_of
 from pipistrelle.experiments.drives import LabelledPoints
 from pipistrelle.experiments.results.scores import TrialResult
 from pipistrelle.experiments.runs.heard_world import Mission
-from pipistrelle.figures.animation import pruned
-from pipistrelle.figures.excess_paths import (
+from pipistrelle.figures.maps import PLACED, RAY, view
+from pipistrelle.figures.mission import outcome
+from pipistrelle.figures.recorder import (
     MAX_ELLIPSES,
+    Snapshot,
     callers_at,
     callers_marked,
     excess_paths_at,
+    heard_from,
+    pruned,
     resolved,
 )
-from pipistrelle.figures.maps import view
-from pipistrelle.figures.mission import outcome
-from pipistrelle.figures.recorder import Snapshot, heard_from
-from pipistrelle.files import spelt
+from pipistrelle.figures.style import STRATEGY_COLOURS, page_colours
+from pipistrelle.files import spelt, upright
 
 MAX_FRAMES = 3000
-"""Of a longer recording so many are shown, evenly spaced."""
+"""Most frames of a playback; of more frames evenly spaced ones are kept."""
 MAX_PARTICLES = 200
-"""Of more particles every second, third, ... is shown."""
+"""Most particles of a playback."""
 POSE_STDS = 3.0
-"""Standard deviations of a pose that are shown."""
+"""Size of the pose's ellipse in standard deviations."""
 MAX_COORDINATE = 1000.0
-"""Farther from where coordinates begin [m], they are shown about another origin: packed numbers
-have seven digits."""
+"""Largest coordinate [m] without a shift of the origin, as packed numbers have seven digits."""
+SCRIPTS = ("numbers.js", "drawing.js", "map.js", "charts.js", "player.js")
+"""Scripts of the page, in order."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Rows:
-    """Rows of numbers, some for each frame."""
+    """Rows of numbers of all frames."""
 
     first: Int[np.ndarray, " n"]
-    """Those of frame i are the rows first[i] to first[i + 1]."""
+    """Frame i has the rows first[i] to first[i + 1]."""
     landmark: Int[np.ndarray, " h"]
-    """Label."""
+    """Label of each row."""
     numbers: Float[np.ndarray, "h c"]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Estimate:
-    """The measurements and beliefs of one strategy and filter, frame by frame."""
+    """Measurements and beliefs of a strategy and filter at all frames."""
 
     strategy: str
     filter: str
     outcome: str
-    """What came of it, in a line."""
+    """Errors and counts in a line."""
     start: Float[np.ndarray, "3"]
-    """[m, m, rad] Where it began."""
+    """Start pose [m, m, rad]."""
     pose: Float[np.ndarray, "n 3"]
     """[m, m, rad]"""
     spread: Float[np.ndarray, "n 4"]
-    """Of the pose's covariance xx, xy, yy and that of the heading."""
+    """Covariance xx, xy, yy of the position and variance of the heading."""
     heard: Rows
-    """Bearing [rad] and range [m], NaN where there is none."""
+    """Bearing [rad] and range [m], NaN without a range."""
     mapped: Rows
     """x, y [m], xx, xy, yy [m^2] and weight of each member."""
     pruned: Rows
-    """The same of what has no successor, at the frame that lacks it."""
+    """Pruned members at the frame that lacks them, with the columns of `mapped`."""
     cloud: Float[np.ndarray, "n p 3"] | None
-    """[m, m, rad] The particles' poses."""
+    """Poses of the particles [m, m, rad]."""
     revised_at: Int[np.ndarray, " j"]
-    """Frames at which the whole path so far is shown as revised."""
+    """Frames with a revised path."""
     revised: Rows
-    """For each of these the start, and each frame so far: x, y [m]."""
+    """Revised positions of the start and all frames so far, for each such frame: x, y [m]."""
     callers: Float[np.ndarray, "n c 5"] | None
-    """Where each caller of the playback is believed to be: x, y [m], xx, xy, yy [m^2], NaN where
-    that is not known. None where no picture marks it."""
+    """Estimated x, y [m], xx, xy, yy [m^2] of each caller, NaN if unknown; None if callers are not
+    marked."""
     excess_paths: Rows
-    """Those that make an ellipse, two of a landmark at most: whose call it was, by its place among
-    the callers, and how much longer its way [m]."""
+    """Index of the caller, without the vehicle, and excess path [m] of at most two ellipses of a
+    landmark."""
     resolved: Int[np.ndarray, " n"]
-    """Label of the landmark whose excess paths are shown, -1 for none."""
+    """Label of the landmark to show with its excess paths, -1 for none."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Playback:
-    """A mission's truth, and all that was heard and believed of it, frame by frame."""
+    """Truth, measurements and beliefs of a mission at all frames."""
 
     title: str
-    """What the mission is."""
+    """Title of the mission."""
     facts: tuple[str, ...]
-    """What else a reader should know of it."""
+    """Facts about the mission, in words."""
     time: Float[np.ndarray, " n"]
-    """[s] Of the frames, since the start."""
+    """Times of the frames since the start [s]."""
     origin: Float[np.ndarray, "2"]
-    """[m] Where the coordinates of everything here begin."""
+    """Origin of all coordinates in the playback [m]."""
     limits: tuple[tuple[float, float], tuple[float, float]]
-    """[m] Of a map that shows what matters."""
+    """Limits of the map [m]."""
     true_start: Float[np.ndarray, "3"] | None
     """[m, m, rad]"""
     true_pose: Float[np.ndarray, "n 3"] | None
-    """[m, m, rad] NaN where it is not known."""
+    """True poses [m, m, rad], NaN if unknown."""
     landmarks: LabelledPoints | None
     """[m]"""
     callers: tuple[tuple[int, str, np.ndarray], ...]
-    """Label, name and places, (2) or (n, 2) [m], of each. The label of one that stands is that of
-    the landmark which it is. Places are NaN where they are not known: of a log."""
+    """Label (of its landmark if it is fixed), name and positions, (2) or (n, 2) [m], of each
+    caller; NaN if unknown, as in logs."""
     beamwidth: float | None
     """[rad]"""
     farthest: float
-    """[m] That a landmark may be of which a bearing alone is known."""
+    """Largest range of a landmark without a range [m]."""
     estimates: tuple[Estimate, ...]
 
 
 def playback(
     done: Mission, snapshots: Mapping[tuple[str, str], Sequence[Snapshot]], most: int = MAX_FRAMES
 ) -> Playback:
-    """Lay out a mission that was done again while a recorder watched.
+    """Return a recorded mission as flat arrays.
 
-    `snapshots`: as a `MissionRecorder` keeps them. `most`: frames to be shown: evenly spaced, the
-    last among them. Returns: without the estimates that have no frame: of a filter that failed at
-    once. Raises InputError where no estimate has a frame.
+    `snapshots`: of a `MissionRecorder`. `most`: largest number of frames, evenly spaced, with the
+    last. Estimates without frames, of filters that failed at once, are omitted; raises InputError
+    if none remains.
     """
     trials = [t for t in done.trials if snapshots.get((t.strategy, t.filter))]
     if not trials:
@@ -143,7 +155,7 @@ def playback(
         frames = snapshots[trial.strategy, trial.filter]
         estimates.append(_estimate(trial, frames, time, steps, done, origin))
     true = done.drive.truth.path
-    title, facts = _told(done, len(longest), len(time))
+    title, facts = _title_and_facts(done, len(longest), len(time))
     return Playback(
         title=title,
         facts=facts,
@@ -160,8 +172,8 @@ def playback(
     )
 
 
-def _told(done: Mission, frames: int, shown: int) -> tuple[str, tuple[str, ...]]:
-    """Say what a mission is, and what a reader should know of it."""
+def _title_and_facts(done: Mission, frames: int, shown: int) -> tuple[str, tuple[str, ...]]:
+    """Return title and facts of a mission."""
     time = done.trials[0].track.time
     facts = [f"{time[-1] - time[0]:.1f} s", f"{frames} frames"]
     if shown < frames:
@@ -178,14 +190,14 @@ def _told(done: Mission, frames: int, shown: int) -> tuple[str, tuple[str, ...]]
 
 
 def _origin(trials: Sequence[TrialResult]) -> Float[np.ndarray, "2"]:
-    """Choose where coordinates begin: where they do, unless all is far from there."""
+    """Return the origin of coordinates: 0 unless the start is far from it."""
     start = trials[0].track.pose.mean[0, :2]
     far = np.isfinite(start) & (np.abs(start) > MAX_COORDINATE)
     return np.where(far, np.round(start, -2), 0.0)
 
 
 def _moved(poses: Float[np.ndarray, "*n d"], origin: Float[np.ndarray, "2"]) -> np.ndarray:
-    """Return poses, or points, about another origin."""
+    """Return poses or points relative to an origin."""
     shift = np.zeros(poses.shape[-1])
     shift[:2] = origin
     return poses - shift
@@ -206,14 +218,14 @@ def _limits(
 def _landmarks(
     landmarks: LabelledPoints | None, origin: Float[np.ndarray, "2"]
 ) -> LabelledPoints | None:
-    """Return the true landmarks about another origin."""
+    """Return the true landmarks relative to an origin."""
     return None if landmarks is None else (landmarks[0], landmarks[1] - origin)
 
 
 def _callers(
     done: Mission, steps: Int[np.ndarray, " n"], origin: Float[np.ndarray, "2"]
 ) -> tuple[tuple[int, str, np.ndarray], ...]:
-    """Return the callers with their labels, and of a path the places at the frames."""
+    """Return label, name and position, or positions at the frames, of each caller."""
     if done.log is not None:
         unknown = np.full(2, np.nan)
         return tuple((caller.landmark, caller.name, unknown) for caller in done.log.callers)
@@ -235,7 +247,7 @@ def _estimate(
     done: Mission,
     origin: Float[np.ndarray, "2"],
 ) -> Estimate:
-    """Lay out one estimate; at each time by the latest of its frames."""
+    """Return an estimate at each time, by the latest of its frames."""
     at = np.searchsorted([frame.scan.time for frame in frames], time, side="right") - 1
     at = np.maximum(at, 0)
     if len(time) == len(frames):  # scans may share a time
@@ -272,7 +284,7 @@ def _estimate(
 
 
 def _named(labels: Int[np.ndarray, " n"], trial: TrialResult) -> Int[np.ndarray, " n"]:
-    """Return labels as the true landmarks for which they stand; below -1 if they stand for none."""
+    """Return the labels of the corresponding true landmarks, below -1 without any."""
     if trial.mapped is None:
         return labels
     pairs = zip(
@@ -283,7 +295,7 @@ def _named(labels: Int[np.ndarray, " n"], trial: TrialResult) -> Int[np.ndarray,
 
 
 def _rows(landmarks: Sequence[np.ndarray], numbers: Sequence[np.ndarray], columns: int) -> Rows:
-    """Lay the rows of frames out one after another."""
+    """Return the rows of all frames, concatenated."""
     return Rows(
         first=np.cumsum([0, *map(len, numbers)]),
         landmark=np.concatenate([np.empty(0, int), *landmarks]),
@@ -292,7 +304,7 @@ def _rows(landmarks: Sequence[np.ndarray], numbers: Sequence[np.ndarray], column
 
 
 def _heard(frames: Sequence[Snapshot]) -> Rows:
-    """Lay out what was heard."""
+    """Return bearings and ranges of all frames."""
     scans = [heard_from(frame.scan) for frame in frames]
     numbers = [np.column_stack([scan.bearing, scan.range]) for scan in scans]
     return _rows([scan.landmark for scan in scans], numbers, 2)
@@ -301,7 +313,7 @@ def _heard(frames: Sequence[Snapshot]) -> Rows:
 def _callers_believed(
     frames: Sequence[Snapshot], origin: Float[np.ndarray, "2"]
 ) -> Float[np.ndarray, "n c 5"]:
-    """Lay out where the callers are believed to be, the vehicle left out."""
+    """Return mean and covariance of the callers' positions at all frames."""
     believed = [callers_at(frame) for frame in frames]
     return np.array(
         [
@@ -312,7 +324,7 @@ def _callers_believed(
 
 
 def _excess_paths(frames: Sequence[Snapshot]) -> Rows:
-    """Lay out the excess paths that make ellipses: callers are counted without the vehicle."""
+    """Return caller, without the vehicle, and excess path of the ellipses of all frames."""
     labels, numbers = [], []
     for frame in frames:
         rows = [
@@ -327,7 +339,7 @@ def _excess_paths(frames: Sequence[Snapshot]) -> Rows:
 
 
 def _mapped(maps: Sequence[Landmarks], origin: Float[np.ndarray, "2"]) -> Rows:
-    """Lay out maps, their members by mean, covariance and weight."""
+    """Return mean, covariance and weight of the members of all maps."""
     numbers = [
         np.column_stack([rows.mean - origin, rows.covariance[:, (0, 0, 1), (0, 1, 1)], rows.weight])
         for rows in maps
@@ -336,7 +348,7 @@ def _mapped(maps: Sequence[Landmarks], origin: Float[np.ndarray, "2"]) -> Rows:
 
 
 def _gone(before: Landmarks | None, after: Landmarks) -> Landmarks:
-    """Return the map members of a frame that the next frame does not have."""
+    """Return the members of a map that the next map lacks."""
     rows = after if before is None else before
     kept = np.zeros(len(rows.landmark), bool)
     if before is not None and before is not after:
@@ -347,7 +359,7 @@ def _gone(before: Landmarks | None, after: Landmarks) -> Landmarks:
 def _cloud(
     frames: Sequence[Snapshot], origin: Float[np.ndarray, "2"]
 ) -> Float[np.ndarray, "n p 3"] | None:
-    """Return the particles of all frames, a part of them where there are many."""
+    """Return at most MAX_PARTICLES particles of all frames."""
     clouds = [frame.cloud for frame in frames if frame.cloud is not None]
     if len(clouds) < len(frames) or len({len(cloud) for cloud in clouds}) != 1:
         return None
@@ -362,7 +374,7 @@ def _revised(
     steps: Int[np.ndarray, " n"],
     origin: Float[np.ndarray, "2"],
 ) -> tuple[Int[np.ndarray, " j"], Rows]:
-    """Return the revised paths, from the start to each such frame, and these frames."""
+    """Return the frames with a revised path, and the paths from the start to each."""
     revised = [(i, frame.path) for i, frame in enumerate(frames) if frame.path is not None]
     found = [(int(np.searchsorted(at, i)), path) for i, path in revised]
     found = [(shown, path) for shown, path in found if shown < len(at) - 1]
@@ -374,3 +386,115 @@ def _revised(
         points.append(path[so_far[so_far < len(path)]] - origin)
     nobody = [np.zeros(len(part), int) for part in points]
     return np.array([shown for shown, _ in found], dtype=int), _rows(nobody, points, 2)
+
+
+def page(playback: Playback) -> str:
+    """Return the HTML page that plays a mission."""
+    from jinja2 import Environment, StrictUndefined
+
+    here = files("pipistrelle.figures.player")
+    environment = Environment(
+        autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True
+    )
+    template = environment.from_string((here / "page.html").read_text(encoding="utf-8"))
+    script = "".join((here / name).read_text(encoding="utf-8") for name in SCRIPTS)
+    text = template.render(
+        title=playback.title,
+        excess_paths=any(len(estimate.excess_paths.landmark) for estimate in playback.estimates),
+        facts=playback.facts,
+        version=__version__,
+        colours=Markup(page_colours()),
+        style=Markup((here / "page.css").read_text(encoding="utf-8")),
+        script=Markup(script),
+        numbers=Markup(_json(_numbers(playback))),
+    )
+    return upright(text)
+
+
+def _numbers(playback: Playback) -> dict[str, Any]:
+    """Return the input of the page's script."""
+    landmarks, true = playback.landmarks, playback.true_pose
+    return {
+        "time": _packed(playback.time),
+        "origin": playback.origin.tolist(),
+        "limits": playback.limits,
+        "trueStart": None if playback.true_start is None else _packed(playback.true_start),
+        "truePose": None if true is None else _packed(true),
+        "landmarks": None
+        if landmarks is None
+        else {"label": _packed(landmarks[0]), "place": _packed(landmarks[1])},
+        "callers": [
+            {
+                "label": label,
+                "name": upright(name),
+                "moves": place.ndim == 2,
+                "place": _packed(place),
+            }
+            for label, name, place in playback.callers
+        ],
+        "beamwidth": playback.beamwidth,
+        "farthest": playback.farthest,
+        "scales": {"placed": _scale(PLACED), "ray": _scale(RAY), "pose": POSE_STDS},
+        "estimates": [_packed_estimate(estimate) for estimate in playback.estimates],
+    }
+
+
+def _packed_estimate(estimate: Estimate) -> dict[str, Any]:
+    """Return the input of the page's script for an estimate."""
+    known = estimate.strategy in STRATEGY_COLOURS
+    optional = {}
+    if estimate.callers is not None:
+        optional["callers"] = _packed(estimate.callers)
+    if len(estimate.excess_paths.landmark):
+        optional |= {
+            "excessPaths": _packed_rows(estimate.excess_paths),
+            "resolved": _packed(estimate.resolved),
+        }
+    return optional | {
+        "name": _name(estimate),
+        "role": estimate.strategy if known else "ink",
+        "calls": estimate.strategy != "passive",
+        "outcome": upright(estimate.outcome),
+        "start": _packed(estimate.start),
+        "pose": _packed(estimate.pose),
+        "spread": _packed(estimate.spread),
+        "heard": _packed_rows(estimate.heard),
+        "mapped": _packed_rows(estimate.mapped),
+        "pruned": _packed_rows(estimate.pruned),
+        "cloud": None
+        if estimate.cloud is None
+        else {"particles": estimate.cloud.shape[1], "pose": _packed(estimate.cloud)},
+        "revisedAt": _packed(estimate.revised_at),
+        "revised": _packed_rows(estimate.revised),
+    }
+
+
+def _name(estimate: Estimate) -> str:
+    """Return the title of an estimate."""
+    return f"{estimate.strategy} · {title_of(estimate.filter)}"
+
+
+def _packed_rows(rows: Rows) -> dict[str, Any]:
+    """Pack rows."""
+    columns = rows.numbers.shape[1]
+    packed = {"first": rows.first, "landmark": rows.landmark, "numbers": rows.numbers}
+    return {"columns": columns} | {name: _packed(part) for name, part in packed.items()}
+
+
+@np.errstate(over="ignore", invalid="ignore")
+def _packed(numbers: np.ndarray) -> dict[str, str]:
+    """Return numbers in base64, as little-endian int32 or float32."""
+    whole = np.issubdtype(numbers.dtype, np.integer)
+    name, kind = ("int32", "<i4") if whole else ("float32", "<f4")
+    return {name: base64.b64encode(numbers.astype(kind).tobytes()).decode("ascii")}
+
+
+def _scale(probability: float) -> float:
+    """Return the size, in standard deviations, of an ellipse that contains a probability."""
+    return float(np.sqrt(-2.0 * np.log1p(-probability)))
+
+
+def _json(value: Any) -> str:
+    """Return JSON without characters that could end its element of the page."""
+    text = json.dumps(value, allow_nan=False, separators=(",", ":"))
+    return text.replace("<", "\\u003c").replace("&", "\\u0026")

@@ -185,7 +185,7 @@ def _panel(panel: Panel) -> dict[str, Any]:
 
 def _write_figure(chart: Chart, folder: Path) -> None:
     """Draw a chart for paper."""
-    from pipistrelle.figures.chart_plot import draw_chart
+    from pipistrelle.figures.chart import draw_chart
     from pipistrelle.figures.style import save_figure
 
     save_figure(draw_chart(chart), folder, chart.name)

@@ -1,11 +1,17 @@
-"""The same frames as a recording for the Rerun viewer, by the extra ``view``.
+"""Convert a result folder to a recording for the Rerun viewer (https://rerun.io).
 
-The world lies in the plane z = 0, so that y goes up as everywhere here. What comes and goes is
-logged at every frame of the timeline ``time``, be it nothing.
+    python -m pip install rerun-sdk
+    python examples/viewers/rerun_mission.py RESULT MISSION.rrd
+    rerun MISSION.rrd
+
+RESULT is a folder of `pipistrelle run` or `slam`; the mission is run again from it, as
+`pipistrelle view` does. The world is the plane z = 0. All entities are logged at every frame of
+the timeline ``time``, empty ones too. This file is a start for other viewers: `playback` gives
+flat arrays of all frames.
 """
 
+import sys
 from collections.abc import Sequence
-from importlib.util import find_spec
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Any
@@ -13,12 +19,26 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from jaxtyping import Float, UInt8
 
-from pipistrelle.config import InputError
 from pipistrelle.estimation.beliefs import Landmarks, placed
 from pipistrelle.estimation.catalogue import short_name, title_of
-from pipistrelle.figures.maps import shades
-from pipistrelle.figures.outlines import PLACED, RAY, beam, ellipses, excess_path_ellipse, vehicle
-from pipistrelle.figures.player.playback import POSE_STDS, Estimate, Playback, Rows
+from pipistrelle.experiments.runs.rerun import rerun as rerun_folder
+from pipistrelle.figures.maps import (
+    PLACED,
+    RAY,
+    beam,
+    ellipses,
+    excess_path_ellipse,
+    shades,
+    vehicle,
+)
+from pipistrelle.figures.player.playback import (
+    POSE_STDS,
+    Estimate,
+    Playback,
+    Rows,
+    playback,
+)
+from pipistrelle.figures.recorder import MissionRecorder
 from pipistrelle.figures.style import INK, PAGE, TRUTH, strategy_colour
 from pipistrelle.geometry import wrap
 
@@ -26,43 +46,22 @@ if TYPE_CHECKING:
     import rerun
 
 VEHICLE, BEAM, THIN, THICK, DOT = 1.8, 14.0, 0.06, 0.2, 0.2
-"""Length of the vehicle and of its beam, breadth of lines and dots [m]."""
+"""Length of the vehicle and of its beam, widths of lines and radius of dots [m]."""
 HEIGHT = 1.1
-"""From which the map is seen, in its widths."""
+"""Height of the eye above the map, in widths of the map."""
 MAX_LEGS = 150
-"""Most legs of a path so far."""
+"""Most segments of a path."""
 
 
-def check_there() -> None:
-    """Refuse to write a recording where what writes it is not installed.
-
-    Raises InputError.
-    """
-    if find_spec("rerun") is None:
-        raise InputError(
-            "--rerun: needs rerun-sdk, which is not installed; "
-            "python -m pip install 'pipistrelle[view]' installs it"
-        )
+def played_again(folder: Path) -> Playback:
+    """Return the frames of a mission that is run again from its result folder."""
+    watch = MissionRecorder(rest=3)
+    mission = rerun_folder(folder, watch=watch)
+    return playback(mission, watch.snapshots)
 
 
 def recording(playback: Playback) -> bytes:
-    """Write a mission as the Rerun viewer reads it.
-
-    Parameters
-    ----------
-    playback : Playback
-
-    Returns
-    -------
-    bytes
-        What a file that ends in .rrd holds.
-
-    Raises
-    ------
-    InputError
-        As `check_there`.
-    """
-    check_there()
+    """Return the content of a .rrd file with all frames of a mission."""
     import rerun
 
     with TemporaryDirectory() as room:
@@ -81,7 +80,7 @@ def recording(playback: Playback) -> bytes:
 
 
 class _Log:
-    """A recording into which lines and dots of the plane are put."""
+    """A recording of lines and dots in the plane."""
 
     def __init__(self, stream: "rerun.RecordingStream") -> None:
         self.stream = stream
@@ -93,7 +92,7 @@ class _Log:
         colours: UInt8[np.ndarray, "*h 4"],
         breadth: float | Float[np.ndarray, " h"] = THIN,
     ) -> None:
-        """Put lines there, in place of what was."""
+        """Log lines under a name, in place of earlier ones."""
         import rerun
 
         strips = [_flat(line) for line in lines]
@@ -109,7 +108,7 @@ class _Log:
         labels: Sequence[str] | None = None,
         static: bool = False,
     ) -> None:
-        """Put dots there, in place of what was."""
+        """Log dots under a name, in place of earlier ones."""
         import rerun
 
         dots = rerun.Points3D(
@@ -118,32 +117,32 @@ class _Log:
         self.stream.log(name, dots, static=static)
 
     def numbers(self, name: str, *values: float) -> None:
-        """Note numbers of this time."""
+        """Log numbers at the current time."""
         import rerun
 
         self.stream.log(name, rerun.Scalars(list(values)))
 
 
 def _flat(points: Float[np.ndarray, "k 2"]) -> Float[np.ndarray, "k 3"]:
-    """Return points in the plane z = 0, those that are nowhere left out."""
+    """Return the finite points with z = 0."""
     known = points[np.isfinite(points).all(axis=-1)]
     return np.column_stack([known, np.zeros(len(known))])
 
 
 def _rgba(colour: str, weight: Float[np.ndarray, " h"] | None = None) -> UInt8[np.ndarray, "*h 4"]:
-    """Return a colour, or one for each weight, the more opaque the heavier."""
+    """Return a colour, or a colour for each weight, the more opaque the heavier."""
     opaque = shades(colour, np.ones(1) if weight is None else weight, least=0.2, most=1.0)
     whole = np.rint(255.0 * opaque).astype(np.uint8)
     return whole[0] if weight is None else whole
 
 
 def _name(estimate: Estimate) -> str:
-    """Name an estimate as its files are named."""
+    """Return the name of an estimate, as in its files."""
     return f"{estimate.strategy}_{short_name(estimate.filter)}"
 
 
 def _blueprint(playback: Playback) -> Any:
-    """Lay out a view of the world for each estimate, and the errors of all below."""
+    """Return the layout: a view of the world for each estimate, and the errors of all below."""
     import rerun.blueprint as rrb
 
     worlds = [
@@ -165,7 +164,7 @@ def _blueprint(playback: Playback) -> Any:
 
 
 def _from_above(playback: Playback) -> Any:
-    """Look down at the whole map."""
+    """Return the eye above the centre of the map."""
     import rerun.blueprint as rrb
 
     (left, right), (bottom, top) = playback.limits
@@ -178,7 +177,7 @@ def _from_above(playback: Playback) -> Any:
 
 
 def _log_still(log: _Log, playback: Playback) -> None:
-    """Log what does not move: what the mission is, where landmarks and callers truly are."""
+    """Log facts of the mission, true landmarks and fixed callers."""
     import rerun
 
     log.stream.log("/", rerun.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
@@ -197,7 +196,7 @@ def _log_still(log: _Log, playback: Playback) -> None:
 
 
 def _log_truth(log: _Log, playback: Playback, frame: int) -> None:
-    """Log where the vehicle and the callers that move truly are."""
+    """Log the true positions of the vehicle and of moving callers."""
     for _, name, place in playback.callers:
         if place.ndim == 2:
             log.dots(f"truth/{name}", place[[frame]], _rgba(INK), size=2.0 * DOT, labels=[name])
@@ -209,7 +208,7 @@ def _log_truth(log: _Log, playback: Playback, frame: int) -> None:
 
 
 def _log_estimate(log: _Log, playback: Playback, estimate: Estimate, frame: int) -> None:
-    """Log what an estimate heard and believed at a frame."""
+    """Log measurements and belief of an estimate at a frame."""
     name, colour = _name(estimate), _rgba(strategy_colour(estimate.strategy))
     pose = estimate.pose[frame]
     log.lines(
@@ -232,7 +231,7 @@ def _log_estimate(log: _Log, playback: Playback, estimate: Estimate, frame: int)
 
 
 def _log_heard(log: _Log, playback: Playback, estimate: Estimate, frame: int) -> None:
-    """Log ranges, as far as they go, and bearings alone, as far as the landmark may be."""
+    """Log ranges as lines of their length, bearings without range up to the farthest landmark."""
     pose, (_, heard) = estimate.pose[frame], _rows_of(estimate.heard, frame)
     angle, ranged = pose[2] + heard[:, 0], np.isfinite(heard[:, 1])
     reach = np.where(ranged, heard[:, 1], playback.farthest)
@@ -245,7 +244,7 @@ def _log_heard(log: _Log, playback: Playback, estimate: Estimate, frame: int) ->
 
 
 def _log_excess_paths(log: _Log, estimate: Estimate, frame: int) -> None:
-    """Log where callers are believed to be, and the ellipses of the landmark that is resolved."""
+    """Log estimated positions of callers, and the excess paths of the resolved landmark."""
     if estimate.callers is None:
         return
     name, places = _name(estimate), estimate.callers[frame, :, :2]
@@ -261,7 +260,7 @@ def _log_excess_paths(log: _Log, estimate: Estimate, frame: int) -> None:
 
 
 def _log_map(log: _Log, estimate: Estimate, frame: int) -> None:
-    """Log landmarks, the members of rays by their weights, and what was pruned of them."""
+    """Log landmarks, the members of rays by weight, and pruned members."""
     name, colour = _name(estimate), strategy_colour(estimate.strategy)
     labels, rows = _rows_of(estimate.mapped, frame)
     full = placed(_landmarks(labels, rows))
@@ -278,7 +277,7 @@ def _log_map(log: _Log, estimate: Estimate, frame: int) -> None:
 
 
 def _log_errors(log: _Log, playback: Playback, estimate: Estimate, frame: int) -> None:
-    """Log the errors, where the truth is known, and three standard deviations."""
+    """Log three standard deviations and, if the truth is known, the errors."""
     xx, _, yy, turn = np.maximum(estimate.spread[frame], 0.0).tolist()
     bounds = POSE_STDS * np.sqrt(xx + yy), POSE_STDS * np.degrees(np.sqrt(turn))
     for part, bound in zip(("position", "heading"), bounds, strict=True):
@@ -297,7 +296,7 @@ def _rows_of(rows: Rows, frame: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _landmarks(labels: np.ndarray, rows: Float[np.ndarray, "h 6"]) -> Landmarks:
-    """Return the rows of a map as estimators have them."""
+    """Return the rows of a map as `Landmarks`."""
     covariance = rows[:, [2, 3, 3, 4]].reshape(-1, 2, 2)
     return Landmarks(landmark=labels, mean=rows[:, :2], covariance=covariance, weight=rows[:, 5])
 
@@ -320,6 +319,13 @@ def _dart(pose: Float[np.ndarray, "3"]) -> Float[np.ndarray, "5 2"]:
 
 
 def _so_far(path: Float[np.ndarray, "k d"]) -> Float[np.ndarray, "_ 2"]:
-    """Return a path of so many legs at most, its end included."""
+    """Return a path of at most MAX_LEGS segments, with its end."""
     every = -(-len(path) // MAX_LEGS)
     return np.vstack([path[::every, :2], path[-1:, :2]])
+
+
+if __name__ == "__main__":
+    if len(sys.argv) != 3:
+        sys.exit(__doc__)
+    folder, target = map(Path, sys.argv[1:])
+    target.write_bytes(recording(played_again(folder)))

@@ -1,4 +1,4 @@
-"""Which excess paths a picture shows, and that their ellipses go through what they tell of."""
+"""The excess paths shown at a frame, and their ellipses through the landmark."""
 
 from dataclasses import replace
 
@@ -8,9 +8,10 @@ import pytest
 from pipistrelle.detection.scans import UNLABELLED, make_scan
 from pipistrelle.estimation.beliefs import some_of
 from pipistrelle.estimation.measurement import excess_path_of
-from pipistrelle.figures.excess_paths import (
+from pipistrelle.figures.recorder import (
     MAX_ELLIPSES,
     RECENT_FRAMES,
+    Snapshot,
     callers_at,
     callers_believed,
     callers_marked,
@@ -18,7 +19,6 @@ from pipistrelle.figures.excess_paths import (
     excess_paths_at,
     resolved,
 )
-from pipistrelle.figures.recorder import Snapshot
 from reference.missions import map_with
 
 CALLERS = {1: np.array([8.0, 1.0]), 2: np.array([-3.0, 6.0]), 3: np.array([-3.0, 6.5])}
@@ -57,7 +57,7 @@ def test_callers_are_believed_where_their_landmark_is_once_it_is_placed():
     assert np.isnan(known.mean[[0, 2, 3]]).all(), "the vehicle, a ray, and one never heard"
 
 
-def test_an_ellipse_goes_through_the_landmark_that_its_excess_path_tells_of():
+def test_an_excess_path_ellipse_passes_through_its_landmark():
     (ellipse,), (way,) = drawn_excess_paths(frame_of({5: 1}, [(5, 1)]), 5)
     caller = CALLERS[1]
     length = np.hypot(*(ellipse - caller).T) + np.hypot(*ellipse.T)
@@ -92,7 +92,7 @@ def test_an_excess_path_of_a_caller_that_is_not_placed_makes_no_ellipse():
     assert drawn_excess_paths(frame, 77) == ([], []), "a landmark that nobody knows"
 
 
-def test_what_is_placed_now_goes_before_a_ray_and_a_ray_before_what_was_placed():
+def test_new_landmarks_precede_rays_and_rays_precede_older_landmarks():
     heard = [(5, 1), (6, 1), (7, 1)]
     frames = [
         frame_of({5: 4, 6: 3, 7: 4}, heard),
@@ -117,7 +117,7 @@ def test_a_landmark_that_a_range_has_placed_is_none_that_excess_paths_resolve():
     assert resolved(frames[1:]) == [5], "else it is"
 
 
-def test_of_two_landmarks_alike_the_one_stays_that_was_shown_or_has_two_excess_paths():
+def test_between_equals_the_shown_or_doubly_measured_landmark_wins():
     one, both = [(5, 1), (6, 1)], [(5, 1), (6, 1), (6, 2)]
     assert resolved([frame_of({5: 2, 6: 2}, both), frame_of({5: 2, 6: 2}, one)]) == [6, 6]
     assert resolved([frame_of({5: 2, 6: 2}, one), frame_of({5: 2, 6: 2}, both)]) == [5, 5]
@@ -150,7 +150,7 @@ def test_ellipses_of_a_mission_pass_near_their_landmark(timed, strategy):
     assert set(counts) == ({0} if strategy == "active" else {1, 2})
 
 
-def test_one_that_moves_is_believed_where_it_is_followed():
+def test_a_tracked_caller_has_its_estimated_position():
     frame = frame_of({5: 1}, [(5, 1)])
     boat = map_with([91], [[2.0, -1.0]], [0.04 * np.eye(2)])
     still = replace(frame, landmarks=some_of(frame.landmarks, frame.landmarks.landmark != 91))
