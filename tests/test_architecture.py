@@ -105,7 +105,7 @@ AT_THE_DISK = {
     "detection/logs/bag.py": {"open"},  # of a compressed file that rosbags has opened
     "detection/logs/text_tables.py": {"loadtxt"},  # of lines that were read
     "figures/player/playback.py": {"read_text"},  # the package's own pages
-    "report/page/page.py": {"read_text"},
+    "report/page.py": {"read_text"},
     "files.py": {"read_bytes", "open", "unlink", "rmdir"},
     "kernel_linking.py": {"read_bytes", "unlink", "rmdir"},  # our own cache
     "kernel_folder.py": {"read_bytes", "rmtree", "open"},  # a file that is locked is opened

@@ -314,7 +314,7 @@ def test_the_guides_filter_goes_by_its_name(tmp_path, monkeypatch):
 
 def test_the_plans_of_the_page_on_robustness_have_the_truth_among_their_values(tmp_path):
     from pipistrelle.experiments.studies.plan import read_plan
-    from pipistrelle.report.reading import read_study
+    from pipistrelle.report.study import read_study
     from report.planted import write_planted
 
     page = DOCS / "robustness.md"
@@ -455,7 +455,7 @@ def also(entry):
 def test_page_and_docs_have_the_same_rule_for_absence():
     """It is undecided while the worlds are too few to see one standard deviation."""
     rule = "is not significant and the study could have seen one of one standard deviation, which"
-    page = (ROOT / "src/pipistrelle/report/page/page.html").read_text(encoding="utf-8")
+    page = (ROOT / "src/pipistrelle/report/page.html").read_text(encoding="utf-8")
     assert all(rule in text for text in (page, (DOCS / "study.md").read_text(encoding="utf-8")))
     worlds = [-0.1, 0.1, -0.05, 0.04]
     few, many = (

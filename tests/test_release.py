@@ -45,7 +45,7 @@ def package_files(root: Path) -> set[str]:
 def test_the_wheel_holds_every_file_of_the_package_and_none_beside_it(built):
     unpacked, wheel = built
     here = package_files(ROOT / "src" / "pipistrelle")
-    assert {"py.typed", "experiments/studies/paper.toml", "report/page/page.html"} <= here
+    assert {"py.typed", "experiments/studies/paper.toml", "report/page.html"} <= here
     names = zipfile.ZipFile(wheel).namelist()
     assert {name for name in names if ".dist-info/" not in name} == {
         f"pipistrelle/{name}" for name in here

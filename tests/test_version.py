@@ -122,14 +122,14 @@ def test_whoever_says_the_version_says_the_same(tmp_path):
     from pipistrelle.experiments.drives import NO_TRUTH
     from pipistrelle.experiments.results.writing import write_results
     from pipistrelle.files import RESULTS, OwnFiles
-    from pipistrelle.report.page import summary
+    from pipistrelle.report import page
 
     mission = {"command": "pipistrelle", "seed": 7, "trials": (), "ignored_rows": {}}
     write_results(OwnFiles(tmp_path, RESULTS), config=Config(), truth=NO_TRUTH, **mission)
     kept = json.loads((tmp_path / "summary.json").read_text())["version"]
     command = [sys.executable, "-m", "pipistrelle", "--version"]
     told = subprocess.run(command, check=True, capture_output=True, text=True).stdout.strip()
-    assert kept == told == find_version() == pipistrelle.__version__ == summary.__version__
+    assert kept == told == find_version() == pipistrelle.__version__ == page.__version__
     assert f"Pipistrelle {kept}, seed 7" in (tmp_path / "README.md").read_text()
 
 

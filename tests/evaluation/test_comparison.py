@@ -3,6 +3,7 @@
 import math
 
 import numpy as np
+import polars as pl
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
@@ -10,6 +11,7 @@ from scipy import stats
 
 from pipistrelle.evaluation.comparison import (
     Statement,
+    contrasts,
     holm,
     judge,
     pooled_std,
@@ -33,7 +35,7 @@ def drawn(rng, means, n):
 
 
 @given(SEED, st.integers(3, 60))
-def test_a_mean_alone_has_the_t_interval(seed, n):
+def test_a_single_mean_has_the_t_interval(seed, n):
     sample = np.random.default_rng(seed).normal(1.0, 2.0, n)
     (finding,) = judge(statements([sample]))
     known = stats.ttest_1samp(sample, 0.0).confidence_interval(0.95)
@@ -56,7 +58,7 @@ def test_a_difference_of_two_samples_has_the_interval_of_welch(seed, n, m):
     assert finding.n == min(n, m)
 
 
-def test_what_of_two_samples_has_no_spread_or_no_number_decides_nothing():
+def test_two_samples_without_spread_or_numbers_decide_nothing():
     some, none, one = np.array([1.0, 2.0, 4.0]), np.empty(0), np.array([3.0])
     for sample, against in ((some, none), (none, some), (some, one), (one, one), (some * 0, some)):
         (finding,) = judge([Statement(label="", sample=sample, against=against)])
@@ -65,7 +67,7 @@ def test_what_of_two_samples_has_no_spread_or_no_number_decides_nothing():
         assert finding.n == min(len(sample), len(against))
 
 
-def test_pairs_and_two_samples_stand_in_one_family():
+def test_pairs_and_two_samples_form_a_family():
     rng = np.random.default_rng(4)
     a, b, c = (rng.normal(level, 1.0, 30) for level in (0.0, 0.7, 0.6))
     family = [Statement(label="p", sample=b - a), Statement(label="u", sample=c, against=a)]
@@ -74,12 +76,12 @@ def test_pairs_and_two_samples_stand_in_one_family():
     assert together == pytest.approx(holm(np.array(alone)), rel=1e-9)
 
 
-def test_holms_adjustment_is_that_of_a_hand_worked_family():
+def test_holms_adjustment_agrees_with_a_hand_worked_family():
     assert holm(np.array([0.01, 0.04, 0.03, 0.005])) == pytest.approx([0.03, 0.06, 0.06, 0.02])
 
 
 @given(P_VALUES)
-def test_holm_keeps_the_order_and_lies_between_no_correction_and_bonferronis(p):
+def test_holm_keeps_the_order_between_no_correction_and_bonferronis(p):
     adjusted = holm(p)
     assert (adjusted >= p).all()
     assert (adjusted <= np.minimum(len(p) * p, 1.0)).all()
@@ -87,7 +89,7 @@ def test_holm_keeps_the_order_and_lies_between_no_correction_and_bonferronis(p):
 
 
 @given(P_VALUES, st.floats(0.001, 0.2))
-def test_holm_rejects_what_the_closed_test_of_bonferroni_rejects(p, alpha):
+def test_holm_rejects_the_same_as_the_closed_test_of_bonferroni(p, alpha):
     """Each hypothesis falls when every intersection that holds it does: Holm's shortcut."""
     p = p[:6]
     closed = np.ones(len(p), dtype=bool)
@@ -138,7 +140,7 @@ def test_the_unit_of_the_sample_does_not_matter(seed, unit):
     [np.zeros(8), np.full(8, 5.0), [0.0, 0.0, 0.0, 0.0, 3.0, 3.0, 0.6, -0.6]],
     ids=["nothing", "all large", "some"],
 )
-def test_all_intervals_of_a_family_hold_at_once_and_intervals_alone_do_not(means):
+def test_only_simultaneous_intervals_of_a_family_hold_at_once(means):
     rng = np.random.default_rng(11)
     runs, together, alone = 2000, 0, 0
     for _ in range(runs):
@@ -151,7 +153,7 @@ def test_all_intervals_of_a_family_hold_at_once_and_intervals_alone_do_not(means
     assert alone / runs < 0.95 - 6.0 * error, "the control: without correction they fail"
 
 
-def test_holm_finds_what_bonferroni_misses():
+def test_holm_finds_more_than_bonferroni():
     rng = np.random.default_rng(5)
     strong = list(drawn(rng, np.full(7, 4.0), 20))
     weak = rng.normal(size=20)
@@ -212,7 +214,7 @@ def test_absence_is_claimed_from_the_first_world_that_resolves_a_deviation(world
 
 
 @pytest.mark.parametrize(("worlds", "holds"), [(9, None), (10, True)])
-def test_a_statement_of_nearness_stands_twice_in_the_family_that_has_to_resolve(worlds, holds):
+def test_a_statement_of_nearness_counts_twice_in_its_family(worlds, holds):
     half_width = stats.t.ppf(1.0 - 0.025 / 3, worlds - 1) / math.sqrt(worlds)
     assert (half_width <= 1.0) == (holds is True)
     assert stats.t.ppf(1.0 - 0.025 / 2, worlds - 1) / math.sqrt(worlds) < 1.0
@@ -233,7 +235,7 @@ def test_the_confidence_asked_for_decides(confidence):
 
 
 @pytest.mark.parametrize("standing", [1, 2, 3])
-def test_the_interval_of_what_stands_shares_alpha_among_those_that_stand_alone(standing):
+def test_intervals_of_hypotheses_not_rejected_share_alpha(standing):
     shape, n = np.linspace(-1.0, 1.0, 20), 20
     weak = [shape + 0.01 * i for i in range(standing)]
     findings = judge(statements([*weak, *(shape + 9.0 for _ in range(8 - standing))]))
@@ -254,7 +256,7 @@ def test_slightly_above_is_above_in_the_sample_and_not_significant(shift, holds)
 
 @pytest.mark.parametrize("sample", [[], [1.0], [2.0, 2.0], [0.1 + 0.2] * 30])
 @pytest.mark.parametrize("relation", ["above", "not above", "slightly above", "within"])
-def test_what_has_no_spread_decides_nothing(sample, relation):
+def test_a_sample_without_spread_decides_nothing(sample, relation):
     (finding,) = judge(statements([np.array(sample)], relation, 0.5))
     assert finding.holds is None
     assert finding.interval == (-math.inf, math.inf)
@@ -316,3 +318,79 @@ def test_the_familys_intervals_are_as_wide_as_lets_all_of_them_hold_and_nothing_
             others = [other for other in samples if other is not sample]
             again, *_ = judge([Statement(label="", sample=one) for one in (moved, *others)])
             assert again.holds is (more > 0.0), "half the width is shown whatever the others are"
+
+
+def table(**columns):
+    """Rows of six worlds for each of the levels, repeated for each of the rooms."""
+    rng = np.random.default_rng(8)
+    frame = pl.DataFrame({"level": ["low", "high", "top"]}).join(
+        pl.DataFrame({"room": [1, 2]}), how="cross"
+    )
+    frame = frame.join(pl.DataFrame({"world": range(6)}), how="cross")
+    return frame.with_columns(value=pl.Series(rng.normal(size=len(frame))), **columns)
+
+
+def values_of(frame, **asked):
+    return frame.filter(*(pl.col(name) == value for name, value in asked.items()))["value"]
+
+
+def test_contrasts_compare_every_value_with_the_first_in_each_group():
+    frame = table()
+    found = contrasts(frame, "level", ["room"], family=["room"])
+    assert [(one.by["room"], one.a, one.b) for one in found] == [
+        (room, "low", level) for level in ("high", "top") for room in (1, 2)
+    ]
+    for room in (1, 2):
+        low = values_of(frame, room=room, level="low").to_numpy()
+        samples = [values_of(frame, room=room, level=b).to_numpy() - low for b in ("high", "top")]
+        expected = judge([Statement(label="", sample=sample) for sample in samples])
+        mine = [one.finding for one in found if one.by["room"] == room]
+        assert [f.p for f in mine] == [f.p for f in expected]
+        assert [f.family for f in mine] == [f.family for f in expected]
+
+
+def test_contrasts_average_over_columns_in_worlds_with_all_numbers():
+    spoilt = (pl.col("world") == 2) & (pl.col("room") == 1) & (pl.col("level") == "high")
+    frame = table().with_columns(value=pl.when(~spoilt).then("value"))
+    high, top = contrasts(frame, "level", over=["room"])
+    assert (high.worlds, top.worlds) == ((5, 5), (6, 6))
+    sides = [
+        values_of(frame, level=level).to_numpy().reshape(2, 6).mean(axis=0)
+        for level in ("top", "low")
+    ]
+    assert top.finding.mean == pytest.approx(np.mean(sides[0] - sides[1]), rel=1e-12)
+    assert top.means == pytest.approx((sides[1].mean(), sides[0].mean()), rel=1e-12)
+
+
+def test_contrasts_of_different_draws_are_not_paired():
+    frame = table(draw=pl.col("level") == "top").filter(pl.col("room") == 1)
+    high, top = contrasts(frame, "level", draw="draw")
+    assert (high.paired, top.paired) == (True, False)
+    low, other = (values_of(frame, level=level).to_numpy() for level in ("low", "top"))
+    samples = values_of(frame, level="high").to_numpy() - low
+    expected = judge(
+        [Statement(label="", sample=samples), Statement(label="", sample=other, against=low)]
+    )
+    assert [high.finding.p, top.finding.p] == [finding.p for finding in expected]
+
+
+@pytest.mark.parametrize(("aside", "count"), [(True, 1), (False, 2)])
+def test_equal_contrasts_may_leave_their_family(aside, count):
+    frame = table().filter(pl.col("room") == 1)
+    low = dict(frame.filter(pl.col("level") == "low").select("world", "value").iter_rows())
+    same = pl.col("world").replace_strict(low)
+    frame = frame.with_columns(
+        value=pl.when(pl.col("level") == "high").then(same).otherwise("value")
+    )
+    high, top = contrasts(frame, "level", set_same_aside=aside)
+    assert (high.same, top.same) == (True, False)
+    sample = values_of(frame, level="top").to_numpy() - np.array(list(low.values()))
+    (single,) = judge([Statement(label="", sample=sample)])
+    assert top.finding.p == pytest.approx(min(1.0, count * single.p))
+
+
+def test_a_contrast_without_worlds_in_common_decides_nothing():
+    frame = table().filter(pl.col("level") != "top")
+    shifted = pl.when(pl.col("level") == "high").then(pl.col("world") + 10).otherwise("world")
+    (one,) = contrasts(frame.with_columns(world=shifted), "level", over=["room"])
+    assert (one.worlds, one.finding.n, one.finding.holds) == ((0, 0), 0, None)

@@ -26,7 +26,7 @@ from pipistrelle.figures.chart import (
     ticks,
 )
 from pipistrelle.figures.style import save_figure, strategy_colour
-from pipistrelle.report.page.svg import legend, panel_svg
+from pipistrelle.report.svg import legend, panel_svg
 
 X = np.array([11.0, 33.0, 180.0])
 

@@ -10,8 +10,7 @@ from matplotlib import pyplot
 
 from pipistrelle.config import Config
 from pipistrelle.evaluation.scores import SCORES, heading, shown_in
-from pipistrelle.experiments.comparing.missions import compare_missions
-from pipistrelle.experiments.comparing.studies import compare_studies
+from pipistrelle.experiments.comparing import compare_missions, compare_studies
 from pipistrelle.experiments.drives import NO_TRUTH, Truth
 from pipistrelle.experiments.studies.plan import Plan
 from pipistrelle.figures.comparison import DASHES, RUNS, draw_comparison
@@ -51,7 +50,7 @@ def lines(axes, colour):
     return [line for line in axes.lines if line.get_color() == colour and line.get_ls() != "None"]
 
 
-def test_a_row_for_each_estimate_shows_paths_as_they_are_aligned_and_their_errors(tmp_path):
+def test_a_row_for_each_estimate_shows_raw_and_aligned_paths_and_their_errors(tmp_path):
     one = {("active", "ekf"): loop(), ("fused", "ekf"): OFF}
     two = {("active", "ekf"): OFF, ("fused", "ekf"): loop()}
     figure = draw_comparison(missions_of(tmp_path, one, two))
@@ -88,7 +87,7 @@ def test_without_truth_the_axes_speak_of_the_first(tmp_path):
     assert "true path" not in legend(figure)
 
 
-def test_folders_are_told_apart_by_colour_and_by_dashes(tmp_path):
+def test_folders_differ_in_colour_and_in_dashes(tmp_path):
     paths = {("fused", "ekf"): loop()}
     figure = draw_comparison(missions_of(tmp_path, paths, paths, paths))
     looks = {(line.get_color(), line.get_ls()) for line in figure.axes[2].lines}
@@ -142,7 +141,7 @@ def test_studies_have_a_panel_for_each_score_and_a_line_for_each_case(tmp_path):
     labels = [text.get_text() for text in figure.axes[0].get_yticklabels()]
     assert labels == ["active ekf, 33.0°", "active ekf, 33.0°", "passive ekf"]
     points = [line for line in figure.axes[0].lines if line.get_marker() == "o"]
-    found = [case.finding for case in compared.cases if case.score == "position_rmse_m"]
+    found = [case.contrast.finding for case in compared.cases if case.score == "position_rmse_m"]
     assert [line.get_xdata().item() for line in points] == [f.mean for f in found]
     assert [line.get_ydata().item() for line in points] == [0.0, 1.0, 2.0]
     assert all(line.get_mfc() == RUNS[1] for line in points), "all are significant"

@@ -181,7 +181,7 @@ def load_all() -> None:
     import pipistrelle.experiments.studies.study
     import pipistrelle.figures.mission
     import pipistrelle.figures.style
-    import pipistrelle.report.page.page
+    import pipistrelle.report.page
     import pipistrelle.verbs.delivery  # noqa: F401
     from pipistrelle.__main__ import main
     from pipistrelle.experiments.runs.compiling import compile_kernels
@@ -196,7 +196,7 @@ def undrawn() -> None:
     """Leave out the pictures, which are most of a short command's time."""
     from pipistrelle.experiments.runs import compiling
     from pipistrelle.figures import mission, style
-    from pipistrelle.report.page import page
+    from pipistrelle.report import page
 
     mission.draw_mission = lambda *_, **__: None
     style.save_figure = lambda *_: None

@@ -1,6 +1,6 @@
 """A report's pictures are most of its time: tests that do not look at them leave them out."""
 
-from pipistrelle.report.page import page
+from pipistrelle.report import page
 
 
 def draw_only(patch, word=None):

@@ -12,7 +12,7 @@ from pipistrelle.experiments.hearing.scenario import world_of
 from pipistrelle.experiments.studies.plan import cases_of, find_plan, read_plan
 from pipistrelle.experiments.studies.store import open_store
 from pipistrelle.experiments.studies.world import TABLES, with_sums, world_file, world_schemas
-from pipistrelle.report.studied import COMMON, READ, Study, Trials
+from pipistrelle.report.study import COMMON, READ, Study, Trials
 from pipistrelle.report.variables import beam_variable
 
 RADII = (

@@ -10,13 +10,11 @@ from types import ModuleType
 import numpy as np
 import pytest
 
-from pipistrelle.report.charts.results import CHARTS
-from pipistrelle.report.claims.contrasts import selections
-from pipistrelle.report.claims.statements import CLAIMS
-from pipistrelle.report.claims.verdicts import judge_claims, record
-from pipistrelle.report.page import page as module
-from pipistrelle.report.page.page import write_report
-from pipistrelle.report.studied import HEADING, RULES
+from pipistrelle.report import page as module
+from pipistrelle.report.charts import CHARTS
+from pipistrelle.report.claims import CLAIMS, judge_claims, record
+from pipistrelle.report.page import write_report
+from pipistrelle.report.study import HEADING, RULES, selections
 from report.drawing import draw_only
 from report.invented import BEAMWIDTH, changed, invent
 
@@ -88,7 +86,7 @@ def test_a_claim_given_to_the_report_is_judged_and_words_count_it(extended):
     assert summary["answer"][-1].startswith("Of the paper's nine claims, ")
 
 
-def test_a_claim_of_ones_own_can_be_refuted_and_leaves_the_others_as_they_are(guide):
+def test_an_added_claim_can_be_refuted_without_changing_the_others(guide):
     worse = changed(invent(60), ("ekf", "fused"), HEADING, lambda error: error + 0.02)
     *others, mine = judge_claims(selections(worse), (*CLAIMS, guide["headings"]))
     assert mine.verdict == "not-reproduced"
@@ -97,7 +95,7 @@ def test_a_claim_of_ones_own_can_be_refuted_and_leaves_the_others_as_they_are(gu
     assert [record(claim) for claim in others] == [record(claim) for claim in alone]
 
 
-def test_what_is_added_to_the_list_needs_no_other_place(guide, tmp_path, monkeypatch):
+def test_an_added_claim_needs_no_other_change(guide, tmp_path, monkeypatch):
     monkeypatch.setattr(module, "_write_figure", lambda *_: None)
     write_report(invent(2), tmp_path, claims=(guide["headings"],), charts=())
     page = Sections((tmp_path / "index.html").read_text(encoding="utf-8"))

@@ -15,7 +15,7 @@ from pipistrelle.report.variables import (
 )
 
 
-def test_numbers_rise_and_stand_where_they_are():
+def test_numbers_rise_and_are_their_positions():
     level = setting_variable("beacon.level_db", [48.8, 36.8, 42.8])
     assert level.given == (36.8, 42.8, 48.8)
     assert places(level).tolist() == [36.8, 42.8, 48.8]
@@ -32,7 +32,7 @@ def test_numbers_rise_and_stand_where_they_are():
         ("made.up", [3, "auto"], ("3", "auto")),
     ],
 )
-def test_what_is_no_number_keeps_its_order_and_is_counted_along_the_axis(setting, values, words):
+def test_words_keep_their_order_and_are_counted_along_the_axis(setting, values, words):
     variable = setting_variable(setting, values)
     assert (variable.words, variable.numbers) == (words, None)
     assert places(variable).tolist() == [0.0, 1.0]
@@ -40,7 +40,7 @@ def test_what_is_no_number_keeps_its_order_and_is_counted_along_the_axis(setting
     assert [word_of(variable, value) for value in values] == list(words)
 
 
-def test_a_unit_is_what_the_setting_says_and_a_range_is_none():
+def test_a_unit_is_read_from_the_setting_and_a_range_is_none():
     assert setting_variable("scenario.speed", [1, 2]).label == "scenario.speed [m/s]"
     assert setting_variable("air.relative_humidity", [0.1, 0.2]).label == "air.relative_humidity"
     assert setting_variable("scenario.steps", [100, 200]).label == "scenario.steps"
@@ -54,7 +54,7 @@ def test_values_are_written_so_that_they_differ(values):
     assert [float(word) for word in words] == pytest.approx(values, rel=1e-5)
 
 
-def test_beams_are_named_in_degrees_narrowest_first_and_told_apart():
+def test_beams_are_named_in_distinct_degrees_narrowest_first():
     beams = beam_variable("emitter.radius", [0.0025, 0.007, 0.025], [180.0, 42.5, 11.575])
     assert beams.words == ("11°", "42.5°", "180°")
     assert beams.given == (0.025, 0.007, 0.0025)
@@ -63,7 +63,7 @@ def test_beams_are_named_in_degrees_narrowest_first_and_told_apart():
 
 
 @given(st.floats(1e-6, 1e6), st.floats(1.3, 10.0), st.integers(3, 8))
-def test_a_geometric_row_is_known_and_an_arithmetic_one_is_not(first, ratio, count):
+def test_a_geometric_series_is_recognised_and_an_arithmetic_series_is_not(first, ratio, count):
     assert geometric(first * ratio ** np.arange(count))
     assert not geometric(first * (1.0 + (ratio - 1.0) * np.arange(count)))
 

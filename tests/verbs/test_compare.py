@@ -52,12 +52,13 @@ def rows(printed):
     return {line[0]: line[1:] for line in lines}
 
 
-def test_scores_stand_side_by_side_with_their_differences(obey, missions):
+def test_scores_are_printed_side_by_side_with_their_differences(obey, missions):
     status, printed, said = obey("compare", "one", "two")
     assert (status, said) == (0, "")
     blocks = printed.split("\n\n")
     assert blocks[0] == "A  one\nB  two"
-    found = rows(blocks[1])
+    assert re.fullmatch(r"B instead of A changes the position RMSE by −0\.\d+ m\.", blocks[1])
+    found = rows(blocks[2])
     assert found["fused"] == ["A", "B", "B - A"]
     assert found["ekf"] == ["smoother"]
     assert found["position RMSE, aligned [m]"] == ["0.000", "0.000", "-0.000"]
@@ -65,10 +66,10 @@ def test_scores_stand_side_by_side_with_their_differences(obey, missions):
     assert (float(off) > 0.5, exact) == (True, "0.000")
     assert float(less) == -float(off)
     assert found["landmarks placed"] == ["2", "2", "+0"]
-    assert rows(blocks[2]) == {
+    assert rows(blocks[3]) == {
         "settings that differ": ["A", "B"], "filter.noise": ["constant", "measured"],
     }  # fmt: skip
-    assert blocks[3] == "active ekf: only in A, not compared\n"
+    assert blocks[4] == "active ekf: only in A, not compared\n"
     assert sorted(path.name for path in Path().iterdir()) == ["one", "two"], "nothing is written"
 
 
@@ -80,17 +81,17 @@ def test_runs_and_their_log_are_compared_from_the_command_line(obey, undrawn):
     assert "The drives are not the same" not in printed
     assert "Settings of air, assumed, bag, beacon" in printed
     assert "rays.spacing" in printed
-    assert printed.splitlines()[4].split() == ["ekf", "iekf"]
+    assert printed.splitlines()[6].split() == ["ekf", "iekf"]
 
 
-def test_runs_that_agree_in_all_settings_say_so(obey, missions):
+def test_runs_with_equal_settings_are_reported_as_such(obey, missions):
     shutil.copytree("one", "again")
     _, printed, _ = obey("compare", "one", "again")
     assert "No setting differs.\n" in printed
-    assert len(printed.split("\n\n")) == 4, "two estimates, and no notes"
+    assert len(printed.split("\n\n")) == 5, "two estimates, and no notes"
 
 
-def test_a_run_that_was_lost_is_compared_by_what_it_has(obey, missions):
+def test_a_lost_run_is_compared_by_its_finite_scores(obey, missions):
     mission_folder(Path("lost"), {("fused", "ekf"): LOST})
     _, printed, _ = obey("compare", "one", "lost")
     found = rows(printed)
@@ -119,16 +120,19 @@ def test_studies_are_compared_case_by_case(obey, studies):
     assert (status, said) == (0, "")
     blocks = printed.split("\n\n")
     assert blocks[0] == "A  one: 4 worlds\nB  two: 4 worlds"
-    assert rows(blocks[2])["active"][:3] == ["4.500", "4.000", "-0.500"]
-    assert rows(blocks[2])["fused"][:3] == ["5.500", "4.500", "-1.000"]
-    assert rows(blocks[5])["filters"] == ['["ekf"]', '["iekf"]']
-    assert blocks[6].startswith(
+    assert blocks[1] == (
+        "B instead of A changes the position RMSE by −0.75 m in every world, averaged over 2 cases."
+    )
+    assert rows(blocks[3])["active"][:3] == ["4.500", "4.000", "-0.500"]
+    assert rows(blocks[3])["fused"][:3] == ["5.500", "4.500", "-1.000"]
+    assert rows(blocks[6])["filters"] == ['["ekf"]', '["iekf"]']
+    assert blocks[7].startswith(
         "Paired over the worlds that both have met.\n*: shown, as one of all cases"
     )
-    assert len(blocks) == 7
+    assert len(blocks) == 8
 
 
-def test_what_is_sure_is_marked_and_so_is_what_is_not_paired(obey, studies):
+def test_significant_and_unpaired_differences_are_marked(obey, studies):
     plan = Plan(
         name="three", iterations=4, strategies=("active", "fused"), filters=("ekf",),
         config=Config(), grid={},
@@ -146,7 +150,7 @@ def test_what_is_sure_is_marked_and_so_is_what_is_not_paired(obey, studies):
     marks = {
         words[0]: "".join(word for word in words if word in ("*", "~", "*~"))
         for words in (
-            re.split(r"\s{2,}", line) for line in printed.split("\n\n")[1].splitlines()[1:]
+            re.split(r"\s{2,}", line) for line in printed.split("\n\n")[2].splitlines()[1:]
         )
     }
     assert marks == {
@@ -154,7 +158,7 @@ def test_what_is_sure_is_marked_and_so_is_what_is_not_paired(obey, studies):
     }  # fmt: skip
 
 
-def test_what_the_gate_rejected_is_told_where_it_rejected_anything(obey, missions):
+def test_gated_measurements_are_printed_if_there_are_any(obey, missions):
     _, printed, _ = obey("compare", "one", "two")
     assert "rejected by the gate" not in printed
     mission_folder(Path("gated"), {("fused", "ekf"): OFF}, gated=3)
@@ -166,10 +170,10 @@ def test_a_difference_that_never_varies_has_no_interval(obey, studies):
     """No spread tells nothing of how surely it is known."""
     _, printed, _ = obey("compare", "one", "two")
     assert "inf" not in printed
-    assert rows(printed.split("\n\n")[3])["active"][3] == "-"
+    assert rows(printed.split("\n\n")[4])["active"][3] == "-"
 
 
-def test_worlds_that_diverged_are_left_out_where_that_is_asked(obey, studies):
+def test_diverged_worlds_are_left_out_on_request(obey, studies):
     plan = Plan(
         name="three", iterations=4, strategies=("active", "fused"), filters=("ekf",),
         config=Config(), grid={},
@@ -177,24 +181,24 @@ def test_worlds_that_diverged_are_left_out_where_that_is_asked(obey, studies):
     study_folder(Path("three"), plan, lambda case, world: np.nan if world == 1 else 2.0 + world**2)
     _, everything, _ = obey("compare", "one", "three")
     _, left, _ = obey("compare", "one", "three", "--drop-diverged")
-    first, second = (rows(text.split("\n\n")[1])["active ekf"] for text in (everything, left))
+    first, second = (rows(text.split("\n\n")[2])["active ekf"] for text in (everything, left))
     assert first[-2:] == ["4", "0 / 1"]
     assert second[-2:] == ["3", "0 / 1"]
     assert "Worlds in which a case diverged are left out." in left
 
 
-def test_several_folders_are_each_held_against_the_first(obey, missions):
+def test_several_folders_are_each_compared_with_the_first(obey, missions):
     shutil.copytree("one", "three")
     _, printed, _ = obey("compare", "one", "two", "three")
     assert rows(printed)["fused"] == ["A", "B", "C", "B - A", "C - A"]
     assert rows(printed)["filter.noise"] == ["constant", "measured", "constant"]
 
 
-def test_a_partial_study_says_how_far_it_is(obey, studies):
+def test_a_partial_study_is_printed_with_its_number_of_worlds(obey, studies):
     Path("two/trials/iteration_00003.parquet").unlink()
     _, printed, _ = obey("compare", "one", "two")
     assert printed.startswith("A  one: 4 worlds\nB  two: 3 worlds of 4\n")
-    assert rows(printed.split("\n\n")[1])["active"][-1] == "3"
+    assert rows(printed.split("\n\n")[2])["active"][-1] == "3"
 
 
 # What is refused
@@ -218,7 +222,7 @@ def test_a_partial_study_says_how_far_it_is(obey, studies):
         (("one", "two", "--seed", "3"), "Unknown option: --seed"),
     ],
 )
-def test_a_mistake_is_said_in_a_line_and_nothing_is_touched(refused, missions, words, told):
+def test_a_mistake_is_reported_in_a_line_and_nothing_is_touched(refused, missions, words, told):
     Path("mine").mkdir()
     Path("mine/notes.txt").write_text("mine")
     before = {name: contents(name) for name in ("one", "two", "mine")}
@@ -251,7 +255,7 @@ def test_a_figure_that_cannot_be_drawn_leaves_no_folder(obey, missions, monkeypa
     assert not Path("out").exists() or Path("out", SUMS).exists()
 
 
-def test_a_reader_who_leaves_early_is_no_mistake(missions):
+def test_a_reader_that_stops_early_is_no_mistake(missions):
     code = "from pipistrelle.__main__ import main; import sys; sys.exit(main(sys.argv[1:]))"
     words = [sys.executable, "-c", code, "compare", "one", "two"]
     with subprocess.Popen(words, stdout=subprocess.PIPE, stderr=subprocess.PIPE) as verb:

@@ -71,7 +71,7 @@ def made(tmp_path_factory):
 @pytest.fixture
 def users(made, monkeypatch, undrawn):
     """A user's folder of downloads beside them, with a list of sums as is usual; all it holds."""
-    monkeypatch.setattr("pipistrelle.report.page.page._write_figure", lambda *_: None)
+    monkeypatch.setattr("pipistrelle.report.page._write_figure", lambda *_: None)
     shutil.copytree(made, ".", dirs_exist_ok=True)
     outside, folder = Path("outside"), Path("d")
     for name in (*(f"debian.{end}" for end in ("iso", "html", "png")), *NOTES):

@@ -1,47 +1,51 @@
-r"""Comparison: what many worlds say about a statement, and how surely.
+r"""Statistics over worlds: paired differences, their intervals and families of tests.
 
-A world gives one number: how much better one case did there than another, or a statistic of one
-case. Worlds are independent and every case has met the same ones, so the differences of a pair
-carry none of what makes one world harder than the next: their mean has the t interval
+Each world gives a number: the difference of two cases, or a statistic of a case. Worlds are
+independent and all cases meet the same worlds, so paired differences do not depend on how hard a
+world is. Their mean has the t interval
 
 .. math:: \bar d \pm t_{1 - \alpha / 2, n - 1} \, s / \sqrt{n}.
 
-A claim is a family of m such means ("at every beamwidth"), and the more of them there are, the
-surer one looks extreme by luck. Holm's step-down procedure keeps the chance of any wrong
-rejection in a family at alpha: the p values are taken from the smallest; the one of rank r is
-held against alpha / (m - r + 1), and the first that fails ends it. The intervals given here
-belong to it. Statement i has an edge :math:`e_i` (0, or a margin); testing :math:`\theta_i \le
-e_i` one-sided at alpha / 2 leaves a set A of means whose hypotheses stand, and the lower bounds
-are
+A claim is a family of m such means ("at every beamwidth"). Holm's step-down procedure keeps the
+probability of any wrong rejection in a family at alpha: the p values are taken in rising order,
+the p value of rank r is compared with alpha / (m - r + 1), and the first failure ends the
+procedure. The intervals given here belong to it. Statement i has an edge :math:`e_i` (0, or a
+margin); testing :math:`\theta_i \le e_i` one-sided at alpha / 2 leaves a set A of means whose
+hypotheses are not rejected, and the lower bounds are
 
 .. math:: L_i = e_i \; (i \notin A \ne \emptyset), \qquad
           L_i = \bar d_i - t_{1 - \alpha / 2|A|} \, s_i / \sqrt{n_i} \; (i \in A), \qquad
           L_i = \max(e_i, \bar d_i - t_{1 - \alpha / 2m} \, s_i / \sqrt{n_i}) \; (A = \emptyset).
 
-So a bound passes its edge exactly where Holm rejects, and all lower bounds hold together with
-probability 1 - alpha / 2, whatever the dependence (Source: Strassburger & Bretz, Statistics in
-Medicine 27, 2008; Guilbaud, Biometrical Journal 50, 2008). Upper bounds are built alike, and
-both sides together hold with probability 1 - alpha. The price: of a rejected mean, while others
-stand, the bound says which side of the edge it is on, and no more. How large a mean is, is said
-by a wider interval, Bonferroni's,
+So a bound passes its edge exactly if Holm rejects, and all lower bounds hold together with
+probability 1 - alpha / 2 under any dependence (Source: Strassburger & Bretz, Statistics in
+Medicine 27, 2008; Guilbaud, Biometrical Journal 50, 2008). Upper bounds are built in the same way,
+and both sides together hold with probability 1 - alpha. While other hypotheses remain, the bound
+of a rejected mean only gives its side of the edge. The size of a mean is given by the wider
+interval of Bonferroni,
 
-.. math:: \bar d_i \pm t_{1 - \alpha / 2m} \, s_i / \sqrt{n_i},
+.. math:: \bar d_i \pm t_{1 - \alpha / 2m} \, s_i / \sqrt{n_i};
 
-of which all m hold together with probability 1 - alpha, too. What leaves its edge out is rejected
-by Holm; what Holm rejects may reach just beyond it.
+all m of them hold together with probability 1 - alpha. Holm rejects every mean whose interval
+excludes its edge, and some whose interval just includes it.
 
-Where two cases have not met the same worlds, nothing is paired and a difference is that of two
-means. Its standard error is :math:`\sqrt{s_1^2 / n_1 + s_2^2 / n_2}`, and its t distribution has
-the degrees of freedom of Welch (Source: Biometrika 34, 1947).
+Two cases that met different worlds are not paired: their difference of means has the standard
+error :math:`\sqrt{s_1^2 / n_1 + s_2^2 / n_2}` and a t distribution with the degrees of freedom of
+Welch (Source: Biometrika 34, 1947).
+
+`contrasts` compares the values of any factor of a table in this way.
 """
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Hashable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 from jaxtyping import Float
+
+if TYPE_CHECKING:
+    import polars as pl
 
 Relation = Literal["above", "not above", "slightly above", "within"]
 INTERVALS = (
@@ -49,33 +53,33 @@ INTERVALS = (
     "difference of half an interval's width would have been shown in any case. Holm's correction "
     "decides what is shown, now and then one whose interval just reaches zero."
 )
-"""Sentence for readers wherever `Finding.family` is printed beside a mean."""
+"""Explanation to be printed wherever `Finding.family` is."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Statement:
-    """One mean over worlds, and what is claimed of it."""
+    """A claim about the mean of a sample over worlds."""
 
     label: str
     sample: Float[np.ndarray, " n"]
-    """One number per world, in any unit."""
+    """A number per world, in any unit."""
     relation: Relation = "above"
-    """"above": the mean is above the margin. "not above": it is not seen to be. "slightly
-    above": it is above in this sample, but not seen to be. "within": it lies between minus
-    and plus the margin."""
+    """"above": the mean is above the margin. "not above": it is not significantly above. "slightly
+    above": it is above in this sample, but not significantly. "within": it is between minus and
+    plus the margin."""
     margin: float = 0.0
     sigma: float = math.nan
-    """How much one case varies over the worlds, in the sample's unit: a yardstick beside the
-    interval, which tells how surely a mean is known and not how large it is. NaN: none."""
+    """Standard deviation of a case over worlds, in the sample's unit: a scale for the mean. NaN:
+    none."""
     fitted: bool = False
-    """Whether settings were fitted to this number: that it holds then proves little."""
+    """Whether settings were fitted to this number, so that it is weak evidence."""
     against: Float[np.ndarray, " m"] | None = None
-    """Numbers of other worlds: what is stated is the mean of ``sample`` less theirs."""
+    """Numbers of other worlds, whose mean is subtracted from the mean of ``sample``."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Finding:
-    """Test result of one statement, as one of a family."""
+    """Test result of a statement within its family."""
 
     label: str
     relation: Relation
@@ -83,33 +87,167 @@ class Finding:
     sigma: float
     fitted: bool
     n: int
-    """Worlds; of two samples, those of the smaller."""
+    """Number of worlds, of two samples in the smaller."""
     mean: float
     std: float
-    """`mean` and `std`: of the sample; NaN where it is too small to have one. Of two samples the
-    difference of the means, and the standard deviation of one sample that would know it as
-    surely."""
+    """`mean` and `std`: of the sample; NaN if it is too small. Of two samples the difference of the
+    means, and the standard deviation of a single sample with the same standard error."""
     alone: tuple[float, float]
     """t interval of this mean by itself."""
     family: tuple[float, float]
-    """Bonferroni's interval: as wide as lets all of the family hold together."""
+    """Bonferroni's interval: those of a family hold together."""
     interval: tuple[float, float]
-    """Simultaneous interval, as the module says."""
+    """Simultaneous interval of Holm's procedure."""
     p: float
-    """Two-sided, Holm-adjusted: below 1 - confidence exactly where a bound passes its edge."""
+    """Two-sided, Holm-adjusted: below 1 - confidence exactly if a bound passes its edge."""
     holds: bool | None
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Contrast:
+    """Comparison of two values of a factor over worlds."""
+
+    by: Mapping[str, Any]
+    """Values of the columns that both have in common."""
+    a: Any
+    b: Any
+    paired: bool
+    """Whether both met the same worlds."""
+    worlds: tuple[int, int]
+    """Numbers of worlds that count."""
+    means: tuple[float, float]
+    """Over these worlds; NaN without any."""
+    same: bool
+    """Whether both are equal in every world."""
+    finding: Finding
+    """Test of b minus a."""
+
+
+def contrasts(
+    frame: "pl.DataFrame",
+    factor: str,
+    by: Sequence[str] = (),
+    *,
+    over: Sequence[str] = (),
+    family: Sequence[str] = (),
+    draw: str = "",
+    set_same_aside: bool = False,
+) -> tuple[Contrast, ...]:
+    """Compare every value of a factor with its first value, world by world.
+
+    Parameters
+    ----------
+    frame : polars.DataFrame
+        A row per number: columns `world`, `value` (null or NaN: does not count) and those named
+        below, without nulls.
+    factor : str
+        Column whose values are compared. The value of the first row of a group is the reference.
+    by : sequence of str
+        Columns that group the rows; values are compared within a group.
+    over : sequence of str
+        Columns over which differences are averaged in each world. A world counts if all of its
+        differences are finite.
+    family : sequence of str
+        Columns whose values, at the compared value, name the family of tests; none: a single one.
+    draw : str
+        Column of the draw of the worlds. Values of different draws are not paired. Empty: all
+        worlds are the same.
+    set_same_aside : bool
+        Whether contrasts that are equal in every world are left out of their family.
+
+    Returns
+    -------
+    tuple of Contrast
+        In the order of the rows.
+
+    Examples
+    --------
+    >>> import polars as pl
+    >>> frame = pl.DataFrame({
+    ...     "world": [1, 2, 3] * 2,
+    ...     "strategy": ["active"] * 3 + ["fused"] * 3,
+    ...     "value": [1.0, 2.0, 3.0, 0.5, 1.3, 2.4],
+    ... })
+    >>> (contrast,) = contrasts(frame, "strategy")
+    >>> contrast.a, contrast.b, round(contrast.finding.mean, 6), contrast.finding.holds
+    ('active', 'fused', -0.6, False)
+    """
+    import polars as pl
+
+    keys = [*by, factor]
+    rows = frame.with_row_index("_row").with_columns(pl.col("value").cast(float).fill_null(np.nan))
+    rows = rows.with_columns(
+        (pl.col(factor).first().over([*by]) if by else pl.col(factor).first()).alias("_a"),
+        (pl.col(draw) if draw else pl.lit(0)).alias("_draw"),
+    )
+    first = rows.filter(pl.col(factor) == pl.col("_a")).select(
+        *by, *over, "world", _first="value", _draw_a="_draw"
+    )
+    second = rows.filter(pl.col(factor) != pl.col("_a"))
+    change = pl.col("value") - pl.col("_first")
+    joined = second.join(first, on=[*by, *over, "world"]).sort("_row")
+    paired = _by_key(joined.with_columns(_change=change), keys, ["_change", "_first", "value"])
+    lone_a, lone_b = _by_key(first, [*by], ["_first"]), _by_key(second, keys, ["value"])
+    draws = {row[:-1]: row[-1] for row in first.select(*by, "_draw_a").iter_rows()}
+    judged: dict[Hashable, list[tuple[int, Statement]]] = {}
+    found: list[dict[str, Any]] = []
+    for row in second.unique(keys, keep="first", maintain_order=True).iter_rows(named=True):
+        group = tuple(row[column] for column in by)
+        key, label = (*group, row[factor]), f"{row[factor]}"
+        empty = np.empty(0)
+        if same_draw := draws.get(group) == row["_draw"]:
+            sample, a, b = paired.get(key, (empty,) * 3)
+            statement = Statement(label=label, sample=sample)
+        else:
+            (a,), (b,) = lone_a.get(group, (empty,)), lone_b.get(key, (empty,))
+            statement = Statement(label=label, sample=b, against=a)
+        same = same_draw and len(a) > 0 and not statement.sample.any()
+        head = {
+            "by": dict(zip(by, group, strict=True)),
+            "a": row["_a"],
+            "b": row[factor],
+            "paired": same_draw,
+            "worlds": (len(a), len(b)),
+            "means": tuple(float(np.mean(one)) if len(one) else math.nan for one in (a, b)),
+            "same": same,
+        }
+        name = tuple(row[column] for column in family)
+        name = (*name, len(found)) if same and set_same_aside else name
+        judged.setdefault(name, []).append((len(found), statement))
+        found.append(head)
+    for members in judged.values():
+        findings = judge([statement for _, statement in members])
+        for (place, _), finding in zip(members, findings, strict=True):
+            found[place]["finding"] = finding
+    return tuple(Contrast(**head) for head in found)
+
+
+def _by_key(
+    rows: "pl.DataFrame", keys: Sequence[str], columns: Sequence[str]
+) -> dict[tuple[Any, ...], tuple[Float[np.ndarray, " n"], ...]]:
+    """Average columns in each world and collect the finite worlds by key."""
+    import polars as pl
+
+    means = rows.group_by([*keys, "world"], maintain_order=True).agg(pl.col(*columns).mean())
+    means = means.filter(pl.col(columns[0]).is_finite())
+    samples = means.group_by([*keys], maintain_order=True).agg(*columns) if keys else None
+    if samples is None:
+        return {(): tuple(means[column].to_numpy() for column in columns)}
+    return {
+        row[: len(keys)]: tuple(np.array(one, dtype=float) for one in row[len(keys) :])
+        for row in samples.iter_rows()
+    }
 
 
 def judge(statements: Sequence[Statement], confidence: float = 0.95) -> tuple[Finding, ...]:
     """Judge a family of statements together.
 
-    A statement of absence ("not above", "slightly above") holds only where the family could have
-    seen a mean of one standard deviation of the sample: where half the width of its widest
-    interval, t / sqrt(n), is at most 1. A statement "within" stands in the family twice, since it
-    has two opposites.
+    A statement of absence ("not above", "slightly above") holds only if the family could have
+    detected a mean of one standard deviation of the sample: half the width of its widest interval,
+    t / sqrt(n), is at most 1. A statement "within" counts twice, since it has two opposites.
 
-    `confidence`: that all intervals hold their means. Where a sample has fewer than two
-    numbers, or no spread to measure, nothing is decided and the interval is infinite.
+    `confidence`: probability that all intervals hold their means. A sample of fewer than two
+    numbers, or without spread, decides nothing and has an infinite interval.
 
     >>> worlds = np.array([1.0, 2.0, 3.0, 2.0])
     >>> ours, theirs = judge(
@@ -163,8 +301,7 @@ def holm(p: Float[np.ndarray, " m"]) -> Float[np.ndarray, " m"]:
 
     .. math:: \tilde p_{(r)} = \min\bigl(1, \max_{s \le r} (m - s + 1) \, p_{(s)}\bigr)
 
-    The p-values stand in the order given; rejecting those up to alpha keeps the family's error at
-    alpha.
+    Rejecting p values up to alpha keeps the family's error at alpha.
 
     Source: Holm, Scandinavian Journal of Statistics 6, 1979.
 
@@ -179,7 +316,7 @@ def holm(p: Float[np.ndarray, " m"]) -> Float[np.ndarray, " m"]:
 
 
 def pooled_std(first: Float[np.ndarray, " n"], second: Float[np.ndarray, " m"]) -> float:
-    r"""Return the standard deviation common to two samples, by which they are compared.
+    r"""Return the pooled standard deviation of two samples of equal weight.
 
     .. math:: \sigma = \sqrt{(s_1^2 + s_2^2) / 2}
 
@@ -195,14 +332,14 @@ def pseudovalues(
     curves: Float[np.ndarray, "n k"],
     statistic: Callable[[Float[np.ndarray, "m k"]], Float[np.ndarray, " m"]],
 ) -> Float[np.ndarray, " n"]:
-    r"""Return what each world contributes to a statistic of the mean curve: the jackknife.
+    r"""Return jackknife pseudo-values of a statistic of the mean curve over worlds.
 
     .. math:: \theta_i = n \, T(\bar c) - (n - 1) \, T(\bar c_{-i})
 
-    Their mean is the statistic, freed of bias of order 1/n, and a t interval of theirs is one of
-    it. A linear statistic gives back its value in each world.
+    Their mean is the statistic without bias of order 1/n, and their t interval is an interval of
+    it. A linear statistic gives its value in each world.
 
-    `curves`: one row per world, at least two; `statistic`: t, of each row by itself.
+    `curves`: a row per world, at least two. `statistic`: T of each row.
 
     Source: Tukey, Annals of Mathematical Statistics 29, 1958.
 
@@ -216,16 +353,13 @@ def pseudovalues(
 
 
 def _worlds(statement: Statement) -> int:
-    """Return the number of worlds of a statement; of two samples the smaller number."""
+    """Return the number of worlds of a statement, of two samples in the smaller."""
     both = [statement.sample, *([] if statement.against is None else [statement.against])]
     return min(map(len, both))
 
 
 def _moments(statement: Statement) -> tuple[float, float, float]:
-    """Return number, mean and standard deviation of a statement's sample.
-
-    Of two samples those of one whose mean would be known as surely, by Welch.
-    """
+    """Return number, mean and standard deviation of a sample, or of Welch's equivalent of two."""
     n, mean, std = _sample_moments(statement.label, statement.sample)
     if statement.against is None:
         return n, mean, std
@@ -238,12 +372,11 @@ def _moments(statement: Statement) -> tuple[float, float, float]:
 
 
 def _sample_moments(label: str, numbers: Float[np.ndarray, " n"]) -> tuple[int, float, float]:
-    """Return number, mean and standard deviation of a sample; NaN where there is none."""
+    """Return number, mean and standard deviation of a sample; NaN if undefined."""
     sample = np.asarray(numbers, dtype=np.float64)
     if not np.all(np.isfinite(sample)):
         raise ValueError(f"{label}: found a number that is not finite")
     mean = float(np.mean(sample)) if len(sample) else math.nan
-    # What never varies says nothing of how much it varies.
     spread = len(sample) > 1 and np.ptp(sample) > 0.0
     return len(sample), mean, float(np.std(sample, ddof=1)) if spread else math.nan
 

@@ -1,4 +1,4 @@
-"""Results side by side: paths of several runs in one map, differences of studies by case."""
+"""Figures of comparisons: paths of several runs in a map, differences of studies by case."""
 
 from collections.abc import Sequence
 from textwrap import fill
@@ -8,9 +8,13 @@ import numpy as np
 
 from pipistrelle.estimation.catalogue import title_of
 from pipistrelle.evaluation.scores import heading, shown_in
-from pipistrelle.experiments.comparing.missions import ComparedEstimate, ComparedMissions
-from pipistrelle.experiments.comparing.studies import ComparedCase, ComparedStudies
-from pipistrelle.experiments.comparing.writing import lettered
+from pipistrelle.experiments.comparing import (
+    ComparedCase,
+    ComparedEstimate,
+    ComparedMissions,
+    ComparedStudies,
+)
+from pipistrelle.experiments.comparison_files import lettered
 from pipistrelle.figures.style import INK, STYLE, TRUTH
 from pipistrelle.files import spelt
 
@@ -20,25 +24,25 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 RUNS = ("#0b6e69", "#c8501e", "#6a3fa0", "#7d8a12", "#b03a7a", "#2f6db3")
-"""Colours of folders, which are none of the strategies'; told apart by their dashes, too."""
+"""Colours of folders, distinct from the strategies'."""
 DASHES: tuple[Any, ...] = ("-", (0, (5, 2)), (0, (1.2, 1.4)), (0, (6, 2, 1.2, 2)))
 WIDTH, ROW, REST = 12.0, 3.7, 0.75
-"""Of a figure of paths [inch]: its width, the height of an estimate, and what is left for words."""
+"""Width of a figure of paths, height of an estimate's row, and of the legend [inch]."""
 ACROSS, TITLE = 4, 22
-"""Of a figure of studies: most panels side by side, and most letters in a line of their titles."""
+"""Most panels side by side in a figure of studies, and most letters in a line of a title."""
 SIGNIFICANCE = 0.05
-"""A point is full where p is below, as one of all cases."""
+"""Points with a smaller p, corrected for all cases, are filled."""
 
 
 def draw_comparison(compared: ComparedMissions | ComparedStudies) -> "Figure":
-    """Draw missions or studies side by side.
+    """Draw a comparison of missions or studies.
 
-    Of missions a row for each estimate: the paths and the landmarks they place, as they are and
-    each after the rigid motion that brings it nearest to its truth; beside them the distance from
-    there over time. Of studies a panel for each score that is shown of them: a case's difference,
-    thick its interval by itself, thin that as one of all cases.
+    Missions have a row for each estimate: paths and landmarks as recorded, the same after a rigid
+    motion onto the truth, and the distance from it over time. Studies have a panel for each score
+    with the difference of each case: a thick line for its interval by itself, a thin line for its
+    interval within the family.
 
-    Returns: not known to pyplot: it is freed when it is let go.
+    Returns: a figure that pyplot does not keep.
     """
     import matplotlib
 
@@ -76,7 +80,7 @@ def _draw_missions(compared: ComparedMissions) -> "Figure":
 def _limits(
     compared: ComparedMissions, estimate: ComparedEstimate
 ) -> tuple[tuple[float, float], tuple[float, float]]:
-    """Return axis limits around the truth (or all paths) and what lies near it."""
+    """Return axis limits around the truths (or all paths) and the points near them."""
     truths = [truth.pose[:, :2] for truth in compared.truths if truth is not None]
     paths = [points for view in estimate.views for points in (view.raw, view.aligned)]
     marks = [points for view in estimate.views for points in (view.placed, view.placed_aligned)]
@@ -112,7 +116,7 @@ def _draw_paths(
 def _draw_errors(
     figure: "Figure", places: Sequence[Any], estimate: ComparedEstimate, *, known: bool
 ) -> None:
-    """Draw the distances over time, as the paths are and when each is aligned."""
+    """Draw the distances over time of the recorded and the aligned paths."""
     first: Axes | None = None
     for place, name in zip(places, ("as it is", "aligned"), strict=True):
         axes = figure.add_subplot(place, sharex=first)
@@ -144,7 +148,7 @@ def _look(i: int) -> dict[str, Any]:
 
 
 def _name_folders(figure: "Figure", compared: ComparedMissions) -> None:
-    """Say at the bottom which folder is which, and by what filter where that is not one."""
+    """Draw the legend of the folders and their filters."""
     from matplotlib.lines import Line2D
 
     handles: list[Artist] = []
@@ -206,8 +210,8 @@ def _draw_studies(compared: ComparedStudies) -> "Figure":
 
 
 def _draw_case(axes: "Axes", case: ComparedCase, place: float) -> None:
-    """Draw a difference with its intervals, as far as they are known."""
-    finding, colour = case.finding, RUNS[case.other % len(RUNS)]
+    """Draw a difference with its finite intervals."""
+    finding, colour = case.contrast.finding, RUNS[case.other % len(RUNS)]
     for bounds, width in ((finding.family, 0.9), (finding.alone, 2.6)):
         if np.isfinite(bounds).all():
             axes.hlines(place, *bounds, color=colour, lw=width, zorder=2)
@@ -216,7 +220,7 @@ def _draw_case(axes: "Axes", case: ComparedCase, place: float) -> None:
 
 
 def _name_studies(figure: "Figure", compared: ComparedStudies) -> None:
-    """Say at the bottom which folder is which, and what is thick, thin and full."""
+    """Draw the legend of the folders, lines and points."""
     from matplotlib.lines import Line2D
 
     handles: list[Artist] = [Line2D([], [], lw=0)]

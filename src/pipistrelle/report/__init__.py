@@ -1,7 +1,7 @@
-"""A study as one readable page: the answer, the paper's claims judged, its figures, its numbers.
+"""Reports of studies: a page with the answer, the paper's claims, figures and numbers.
 
-`reading` lays a study's folder out as the arrays of `studied`; `claims` selects the worlds that
-count, words and judges what the paper found; `charts` lays figures out; `page` writes it all.
+`study` holds a study as arrays, `effects` compares the values of its variables, `claims` judges the
+paper's claims, `charts` and `tables` prepare figures and tables, and `page` writes them.
 """
 
 from lazy_loader import attach
@@ -9,10 +9,8 @@ from lazy_loader import attach
 __getattr__, __dir__, __all__ = attach(
     __name__,
     submod_attrs={
-        "claims.contrasts": ["selections"],
-        "claims.verdicts": ["judge_claims"],
-        "page.page": ["write_report"],
-        "reading": ["read_study"],
-        "studied": ["Study"],
+        "claims": ["judge_claims"],
+        "page": ["write_report"],
+        "study": ["Study", "read_study", "selections"],
     },
 )

@@ -1,6 +1,7 @@
-"""What a study varies: settings with their values in order, named as a reader names them."""
+"""Variables of a study, and how values and numbers are written for readers."""
 
 import json
+import math
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -13,9 +14,15 @@ from pipistrelle.config import CallerConfig, caller_names
 from pipistrelle.settings import known_settings
 
 BEAM = "beamwidth"
-"""The name of the variable that the piston's radius is where it alone decides the beam."""
+"""Name of the variable if the piston's radius varies and only it decides the beam."""
 BEAMWIDTHS = (11.4, 14.2, 17.6, 21.8, 26.8, 33.2, 41.6, 51.4, 64.8, 83.0, 108.6, 180.0)
 """Bradley & Abaid, Appendix B [deg]."""
+UNITS = {"rad": (180.0 / math.pi, "°"), "m": (1.0, "m"), "landmarks": (1.0, ""), "": (1.0, "")}
+"""Factor and sign with which a number of a unit is shown."""
+NUMBERS = (
+    "none", "one", "two", "three", "four", "five", "six", "seven", "eight", "nine", "ten",
+    "eleven", "twelve",
+)  # fmt: skip
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -23,30 +30,28 @@ class Variable:
     """A setting that a study varies."""
 
     name: str
-    """As a reader calls it."""
+    """For readers: `BEAM`, or the setting."""
     setting: str
     """Dotted."""
     given: tuple[Any, ...]
-    """Its values, as the plan has them: rising where they are numbers, else as they are listed."""
+    """Values of the plan: rising numbers, or other values in the plan's order."""
     words: tuple[str, ...]
-    """How each is written."""
+    """The values as text."""
     numbers: tuple[float, ...] | None
-    """Of the axis; None where the values are no numbers."""
+    """Positions of the values along an axis; None if they are not numbers."""
     label: str
-    """Of the axis, with the unit."""
+    """Label of the axis, with the unit."""
     column: str
-    """Of a CSV."""
+    """Column name in a CSV."""
     meaning: str
-    """What the setting says of itself."""
+    """Description of the setting."""
     base: int = 0
-    """Which of the values the others are compared with: the truth, where the setting is what is
-    assumed of it and the truth is among them; else the first."""
+    """Index of the reference value: the truth if the setting is an assumption and the truth is
+    among its values; otherwise the first."""
 
 
 def setting_variable(setting: str, values: Sequence[Any]) -> Variable:
-    """Make a variable of a setting.
-
-    `setting`: dotted. `values`: as a plan's grid has them.
+    """Return the variable of a setting and its values in a plan's grid.
 
     Examples
     --------
@@ -72,7 +77,7 @@ def setting_variable(setting: str, values: Sequence[Any]) -> Variable:
 
 
 def beam_variable(setting: str, radii: Sequence[float], degrees: Sequence[float]) -> Variable:
-    """Make a variable of the beamwidth, narrowest first.
+    """Return the variable of the beamwidth, narrowest first.
 
     `setting`: of the radius. `radii` [m]. `degrees` [deg]: the half-power beamwidth of each.
 
@@ -99,9 +104,7 @@ def beam_variable(setting: str, radii: Sequence[float], degrees: Sequence[float]
 
 
 def width_name(beamwidth: float) -> str:
-    """Name a beamwidth of a study: by its three digits where it has no more, else as near.
-
-    `beamwidth` [deg]. Returns: what a paper's radius makes has the paper's name.
+    """Write a beamwidth [deg] in three digits, or as the paper does if it is one of the paper's.
 
     Examples
     --------
@@ -109,26 +112,30 @@ def width_name(beamwidth: float) -> str:
     ('11.5°', '11°', '42.1°')
     """
     short = f"{beamwidth:.3g}"
-    if abs(float(short) - beamwidth) > 1e-6 * beamwidth and _near(beamwidth):
+    if abs(float(short) - beamwidth) > 1e-6 * beamwidth and _papers_beamwidth(beamwidth):
         return beam_name(beamwidth)
     return f"{short}°"
 
 
 def beam_name(beamwidth: float) -> str:
-    """Name a beamwidth: as the paper does where it is one of the paper's, within 0.2 degrees.
-
-    `beamwidth` [deg].
+    """Write a beamwidth [deg] in whole degrees, rounded as in the paper if within 0.2 degrees.
 
     Examples
     --------
     >>> beam_name(11.575), beam_name(12.5)
     ('11°', '12°')
     """
-    return f"{_near(beamwidth) or beamwidth:.0f}°"
+    return f"{_papers_beamwidth(beamwidth) or beamwidth:.0f}°"
+
+
+def _papers_beamwidth(beamwidth: float) -> float | None:
+    """Return the paper's beamwidth [deg] within 0.2 degrees, if any."""
+    near = min(BEAMWIDTHS, key=lambda printed: abs(printed - beamwidth))
+    return near if abs(near - beamwidth) < 0.2 else None
 
 
 def written(values: Sequence[Any]) -> tuple[str, ...]:
-    """Write values as short as tells them apart.
+    """Write values in the shortest form that distinguishes all.
 
     Examples
     --------
@@ -146,11 +153,11 @@ def written(values: Sequence[Any]) -> tuple[str, ...]:
         short = tuple(map(words, values))
         if len(set(short)) == len(short):
             return short
-    return tuple(map(_whole, values))
+    return tuple(value if isinstance(value, str) else json.dumps(value) for value in values)
 
 
 def word_of(variable: Variable, value: Any) -> str:
-    """Write a value as its variable does.
+    """Return the text of one of a variable's values.
 
     Examples
     --------
@@ -161,9 +168,7 @@ def word_of(variable: Variable, value: Any) -> str:
 
 
 def places(variable: Variable) -> Float[np.ndarray, " k"]:
-    """Return where the values stand along an axis.
-
-    Returns: the numbers; of words, 0, 1, 2 and so on.
+    """Return the positions of the values along an axis: the numbers, or 0, 1, 2 of words.
 
     Examples
     --------
@@ -176,7 +181,7 @@ def places(variable: Variable) -> Float[np.ndarray, " k"]:
 
 
 def two_sided(variable: Variable) -> bool:
-    """Return whether the reference value lies between smaller and larger values.
+    """Return whether a variable has values below and above its reference value.
 
     Examples
     --------
@@ -188,11 +193,15 @@ def two_sided(variable: Variable) -> bool:
     return variable.numbers is not None and 0 < variable.base < len(variable.given) - 1
 
 
+def with_article(variable: Variable) -> str:
+    """Return a variable's name within a sentence: only the beamwidth takes an article."""
+    return f"the {variable.name}" if variable.name == BEAM else variable.name
+
+
 def geometric(numbers: Sequence[float]) -> bool:
     """Return whether rising numbers are nearer to a geometric than to an arithmetic series.
 
-    `numbers`: rising. Returns: three or more, above 0, whose ratios vary less than their
-    differences.
+    Returns: true of three or more, above 0, whose ratios vary less than their differences.
 
     Examples
     --------
@@ -205,21 +214,15 @@ def geometric(numbers: Sequence[float]) -> bool:
     return bool(np.std(ratios) / np.mean(ratios) < np.std(steps) / np.mean(steps))
 
 
-def _near(beamwidth: float) -> float | None:
-    """Find the paper's beamwidth that this one is, if it is one of them."""
-    near = min(BEAMWIDTHS, key=lambda printed: abs(printed - beamwidth))
-    return near if abs(near - beamwidth) < 0.2 else None
-
-
 def _callers(value: Any) -> tuple[CallerConfig, ...] | None:
-    """Return the callers that a value lists, if it is such a list."""
+    """Return the callers of a value; None if it is not a list of callers."""
     if not isinstance(value, list) or not all(isinstance(one, dict) for one in value):
         return None
     return tuple(CallerConfig(**one) for one in value)
 
 
 def _counted(value: Any) -> str:
-    """Write one caller by its name, or the way that it goes, several by their number."""
+    """Write a single caller by its name or course, several by their number."""
     callers = _callers(value)
     if callers is None:
         return _short(value)
@@ -230,7 +233,7 @@ def _counted(value: Any) -> str:
 
 
 def _calling(value: Any) -> str:
-    """Write a list of callers by their names and ways, and any other value in a few digits."""
+    """Write a list of callers by their names and courses."""
     callers = _callers(value)
     if callers is None:
         return _short(value)
@@ -239,10 +242,10 @@ def _calling(value: Any) -> str:
 
 
 def _short(value: Any) -> str:
-    """Write a value in a few digits."""
+    """Write a value in a few digits, the route of a caller by its number of rows."""
     if isinstance(value, (list, tuple)):
         return f"[{', '.join(map(_short, value))}]"
-    if isinstance(value, dict):  # a route is long
+    if isinstance(value, dict):
         value = {key: f"{len(one)} rows" if key == "route" else one for key, one in value.items()}
         return f"{{{', '.join(f'{key} = {_short(one)}' for key, one in value.items())}}}"
     if isinstance(value, str):
@@ -250,6 +253,64 @@ def _short(value: Any) -> str:
     return json.dumps(value) if isinstance(value, bool) else f"{value:g}"
 
 
-def _whole(value: Any) -> str:
-    """Write a value in all its digits."""
-    return value if isinstance(value, str) else json.dumps(value)
+def three_digits(value: float) -> str:
+    """Write a number in three digits.
+
+    Examples
+    --------
+    >>> [three_digits(value) for value in (0.12345, 43.71, -1234.5, float("inf"))]
+    ['0.123', '43.7', '−1234', '∞']
+    """
+    if not math.isfinite(value):
+        return "∞" if value > 0 else ("−∞" if value < 0 else "no number")
+    digits = max(0, 2 - math.floor(math.log10(abs(value)))) if value else 0
+    text = f"{value:.{min(digits, 4)}f}" if abs(value) < 1e5 else f"{value:.2e}"
+    text = text.rstrip("0").rstrip(".") if "." in text and "e" not in text else text
+    return text.replace("-", "−") if float(text) else "0"
+
+
+def amount(value: float, unit: str) -> str:
+    """Write a number with its unit, angles in degrees.
+
+    Examples
+    --------
+    >>> amount(0.34, "m"), amount(0.02, "rad"), amount(3.0, "landmarks")
+    ('0.34 m', '1.15°', '3')
+    """
+    factor, sign = UNITS[unit]
+    return three_digits(factor * value) + (f" {sign}" if sign not in ("", "°") else sign)
+
+
+def interval(ends: Sequence[float], unit: str) -> str:
+    """Write an interval without its unit.
+
+    Examples
+    --------
+    >>> interval((0.21, 0.47), "m")
+    '[0.21, 0.47]'
+    """
+    factor, _ = UNITS[unit]
+    return "[" + ", ".join(three_digits(factor * end) for end in ends) + "]"
+
+
+def number_word(count: int) -> str:
+    """Write a count up to twelve as a word.
+
+    Examples
+    --------
+    >>> number_word(0), number_word(8), number_word(30)
+    ('none', 'eight', '30')
+    """
+    return NUMBERS[count] if count < len(NUMBERS) else str(count)
+
+
+def listed(words: Sequence[str], last: str = "and") -> str:
+    """Join words with commas, the last two with a conjunction.
+
+    Examples
+    --------
+    >>> listed(["EKF"]), listed(["active", "fused", "passive"])
+    ('EKF', 'active, fused and passive')
+    """
+    *first, end = words
+    return f"{', '.join(first)} {last} {end}" if first else end

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     import polars as pl
     from matplotlib.figure import Figure
 
-    from pipistrelle.report.page.summary import Answered
+    from pipistrelle.report.page import Answered
 
 
 class StudyResults:
@@ -84,7 +84,7 @@ class StudyResults:
     def figure(self) -> "Figure":
         """Draw the first figure of the report: what is asked, by what is varied."""
         from pipistrelle.figures.chart import draw_chart
-        from pipistrelle.report.charts.results import study_charts
+        from pipistrelle.report.charts import study_charts
 
         answered_study = self._answered
         return draw_chart(study_charts(answered_study.selections[answered_study.rule])[0])
@@ -92,8 +92,8 @@ class StudyResults:
     @cached_property
     def _answered(self) -> "Answered":
         """The study, as the report reads it."""
-        from pipistrelle.report.page.summary import answered
-        from pipistrelle.report.reading import read_study
+        from pipistrelle.report.page import answered
+        from pipistrelle.report.study import read_study
 
         return answered(read_study(self.folder))
 
@@ -115,8 +115,8 @@ class StudyResults:
         InputError
             Where it cannot be written.
         """
-        from pipistrelle.report.page.page import write_report
-        from pipistrelle.report.reading import read_study
+        from pipistrelle.report.page import write_report
+        from pipistrelle.report.study import read_study
 
         target = self.folder / "report" if folder is None else Path(folder)
         write_report(read_study(self.folder), target, progress=lambda _: None)

@@ -12,12 +12,16 @@ from pipistrelle.verbs.streams import put
 from pipistrelle.verbs.text_tables import text_table
 
 if TYPE_CHECKING:
-    from pipistrelle.experiments.comparing.missions import ComparedEstimate, ComparedMissions
-    from pipistrelle.experiments.comparing.studies import ComparedCase, ComparedStudies
-    from pipistrelle.experiments.comparing.writing import Compared
+    from pipistrelle.experiments.comparing import (
+        Compared,
+        ComparedCase,
+        ComparedEstimate,
+        ComparedMissions,
+        ComparedStudies,
+    )
 
 SIGNIFICANCE = 0.05
-"""A difference is marked if its p, corrected for all cases, is below."""
+"""Differences with a smaller p, corrected for all cases, are marked."""
 
 
 def compare(
@@ -43,34 +47,61 @@ def compare(
 ) -> None:
     """Put results side by side, the first of them held against each other one."""
     from pipistrelle.config import InputError
-    from pipistrelle.experiments.comparing import missions, studies
-    from pipistrelle.experiments.comparing.folders import kind_of
+    from pipistrelle.experiments import comparing
 
     if output is None and (overwrite or quiet):
         flag = "--overwrite" if overwrite else "--quiet"
         raise InputError(f"{flag}: nothing is kept without -o DIR; add it, or leave the flag out")
     compared: Compared
-    if kind_of(folders) == "studies":
-        compared = studies.compare_studies(folders, drop_diverged=drop_diverged)
-        notes, shown = studies.notes_of(compared), _study_tables(compared)
+    if comparing.kind_of(folders) == "studies":
+        compared = comparing.compare_studies(folders, drop_diverged=drop_diverged)
+        shown = _study_tables(compared)
     elif drop_diverged:
         raise InputError("--drop-diverged: is for studies; a run is one world; leave it out")
     else:
-        compared = missions.compare_missions(folders)
-        notes, shown = missions.notes_of(compared), _mission_tables(compared)
+        compared = comparing.compare_missions(folders)
+        shown = _mission_tables(compared)
+    answer, notes = _answer(compared), comparing.notes_of(compared)
     if output is not None:
-        _keep(output, compared, notes, overwrite=overwrite, quiet=quiet)
+        _keep(output, compared, (*answer, *notes), overwrite=overwrite, quiet=quiet)
     if not quiet:
-        put("\n\n".join([_names(compared), *shown, _settings(compared), *_joined(notes)]))
+        blocks = [_names(compared), "\n".join(answer), *shown, _settings(compared)]
+        put("\n\n".join(block for block in [*blocks, "\n".join(notes)] if block))
     if output is not None:
         put(output)
+
+
+def _answer(compared: "Compared") -> list[str]:
+    """Return a sentence for each other folder: its position RMSE, averaged over the grid."""
+    from pipistrelle.experiments.comparing import LETTERS, POSITION, ComparedStudies
+    from pipistrelle.experiments.comparison_files import less
+    from pipistrelle.report.effects import headline
+    from pipistrelle.report.variables import amount
+
+    title, first = "position RMSE", LETTERS[0]
+    if isinstance(compared, ComparedStudies):
+        cases = sum(c.score == POSITION and c.other == 1 for c in compared.cases)
+        return [
+            headline(f"{LETTERS[one.b]} instead of {first}", title, "m", one, cases)
+            for one in compared.overall
+        ]
+    lines = []
+    for letter, i in zip(LETTERS[1:], range(1, len(compared.folders)), strict=False):
+        errors = [[one.scores[k].get(POSITION) for k in (0, i)] for one in compared.compared]
+        gaps = [gap for a, b in errors if (gap := less(b, a)) is not None]
+        if gaps:
+            mean, count = sum(gaps) / len(gaps), len(gaps)
+            size = "+" * (mean > 0.0) + amount(mean, "m")
+            mean_of = f", averaged over {count} estimates" * (count > 1)
+            lines.append(f"{letter} instead of {first} changes the {title} by {size}{mean_of}.")
+    return lines
 
 
 def _keep(
     output: Path, compared: "Compared", notes: Sequence[str], *, overwrite: bool, quiet: bool
 ) -> None:
-    """Write the comparison into its folder, or leave none."""
-    from pipistrelle.experiments.comparing.writing import write_comparison
+    """Write the comparison into its folder."""
+    from pipistrelle.experiments.comparison_files import write_comparison
     from pipistrelle.figures.comparison import draw_comparison
     from pipistrelle.figures.style import save_figure
     from pipistrelle.files import COMPARISON, claim
@@ -85,15 +116,10 @@ def _keep(
         write_comparison(own, compared, command=command_line(), notes=notes, draw=draw)
 
 
-def _joined(notes: Sequence[str]) -> list[str]:
-    """Return notes as one block, or none."""
-    return ["\n".join(notes)] if notes else []
-
-
 def _names(compared: "Compared") -> str:
-    """Say which folder is which."""
-    from pipistrelle.experiments.comparing.studies import ComparedStudies
-    from pipistrelle.experiments.comparing.writing import lettered
+    """Return the letter and path of each folder, and the worlds of studies."""
+    from pipistrelle.experiments.comparing import ComparedStudies
+    from pipistrelle.experiments.comparison_files import lettered
     from pipistrelle.files import spelt
 
     lines = [f"{letter}  {spelt(folder)}" for letter, folder in lettered(compared.folders)]
@@ -107,8 +133,8 @@ def _names(compared: "Compared") -> str:
 
 
 def _settings(compared: "Compared") -> str:
-    """Show the settings that differ."""
-    from pipistrelle.experiments.comparing.writing import lettered, settings_rows
+    """Format the settings that differ."""
+    from pipistrelle.experiments.comparison_files import lettered, settings_rows
 
     rows = settings_rows(compared)
     if not rows:
@@ -118,8 +144,8 @@ def _settings(compared: "Compared") -> str:
 
 
 def _mission_tables(compared: "ComparedMissions") -> Iterator[str]:
-    """Show each estimate's scores, and what they differ by."""
-    from pipistrelle.experiments.comparing.writing import lettered
+    """Format the scores of each estimate and their differences."""
+    from pipistrelle.experiments.comparison_files import lettered
 
     letters = [letter for letter, _ in lettered(compared.folders)]
     for estimate in compared.compared:
@@ -140,8 +166,8 @@ def _unlike(estimate: "ComparedEstimate", i: int) -> str:
 
 
 def _score_rows(estimate: "ComparedEstimate") -> Iterator[list[str]]:
-    """Return the rows of the scores that any folder has."""
-    from pipistrelle.experiments.comparing.writing import less, scores_of
+    """Yield the rows of the scores that any folder has."""
+    from pipistrelle.experiments.comparison_files import less, scores_of
 
     folders = [scores_of(scores) for scores in estimate.scores]
     for name, score in shown_in("missions").items():
@@ -157,7 +183,7 @@ def _score_rows(estimate: "ComparedEstimate") -> Iterator[list[str]]:
 
 
 def _study_tables(compared: "ComparedStudies") -> Iterator[str]:
-    """Show the means of each score by case, and their differences with intervals."""
+    """Format the means of each score by case, and their differences with intervals."""
     several = len(compared.folders) > 2
     for name, score in shown_in("studies").items():
         cases = [case for case in compared.cases if case.score == name]
@@ -172,38 +198,31 @@ def _study_tables(compared: "ComparedStudies") -> Iterator[str]:
 
 def _case_row(case: "ComparedCase", digits: int, several: bool) -> list[str]:
     """Return the row of a case for a score."""
-    from pipistrelle.experiments.comparing.folders import LETTERS
+    from pipistrelle.experiments.comparing import LETTERS
 
-    finding, means = case.finding, case.means
+    contrast, finding = case.contrast, case.contrast.finding
     low, high = (_signed(bound, digits) for bound in finding.family)
     known = all(abs(bound) < float("inf") for bound in finding.family)
-    worlds = dict.fromkeys(case.worlds)
+    worlds = dict.fromkeys(contrast.worlds)
     return [
         case.label + f", {LETTERS[case.other]}" * several,
-        *(_number(_known(mean), digits) for mean in means),
-        _signed(_known(finding.mean), digits),
+        *(_number(mean, digits) for mean in contrast.means),
+        _signed(finding.mean, digits),
         f"{low} to {high}" if known else "-",
-        "*" * (finding.p < SIGNIFICANCE) + "~" * (not case.paired),
+        "*" * (finding.p < SIGNIFICANCE) + "~" * (not contrast.paired),
         " / ".join(map(str, worlds)),
         " / ".join(map(str, case.diverged)) if any(case.diverged) else "",
     ]
 
 
-def _known(value: float) -> float | None:
-    """Return a number, and None of what is none."""
-    return value if value == value else None
-
-
 def _number(value: Any, digits: int) -> str:
-    """Print a number, a huge one in few digits."""
-    if value is None:
+    """Format a number, a huge one in few digits; a dash without one."""
+    if value is None or value != value:
         return "-"
     return f"{value:.{digits}f}" if abs(value) < 1e5 else f"{value:.3g}"
 
 
 def _signed(value: float | None, digits: int) -> str:
-    """Print a difference with its sign."""
-    if value is None:
-        return "-"
+    """Format a difference with its sign."""
     text = _number(value, digits)
     return text if text.startswith("-") else f"+{text}"

@@ -24,9 +24,9 @@ def report(
 ) -> None:
     """Answer a study's question on one page, with its figures; judge the paper's claims by it."""
     from pipistrelle.evaluation.comparison import INTERVALS
-    from pipistrelle.report.page.overview import not_the_papers_line
-    from pipistrelle.report.page.page import MIN_WORLDS, write_report
-    from pipistrelle.report.reading import read_study
+    from pipistrelle.report.page import MIN_WORLDS, write_report
+    from pipistrelle.report.study import read_study
+    from pipistrelle.report.tables import not_the_papers_line
     from pipistrelle.verbs.streams import put, say
 
     target = folder / "report" if output is None else output
@@ -53,7 +53,10 @@ def report(
         for claim in summary["claims"]:
             put(f"{claim['claim']}  {claim['verdict'].replace('-', ' '):<15} {claim['sentence']}")
             if claim["verdict"] == "open":
-                put(f"{'':<18} {_why(claim)}")
+                parts = claim["by_exclusion"]["world"]["parts"]
+                holds = [finding["holds"] for part in parts for finding in part["findings"]]
+                undecided = f"{holds.count(None)} of {len(holds)} statements"
+                put(f"{'':<18} {claim['rule']} Undecided: {undecided}.")
     put(target / "index.html")
 
 
@@ -61,7 +64,7 @@ _NOTHING: dict[str, Any] = {"text": "", "interval": "", "shown": False}
 
 
 def _effects(table: dict[str, Any]) -> str:
-    """Lay out what one variable changes: the position RMSE, and what else is shown to change."""
+    """Format the table of a variable: the change of the position RMSE, and others shown."""
     first, *others = table["measures"]
     rows = []
     for row in table["rows"]:
@@ -79,10 +82,3 @@ def _effects(table: dict[str, Any]) -> str:
             main["interval"], "; ".join(also[:3]) + "; ..." * (len(also) > 3),
         ])  # fmt: skip
     return text_table("", [[table["title"], first, "95 %", "also shown"]], rows)
-
-
-def _why(claim: dict[str, Any]) -> str:
-    """Say why a claim is open, and how much of it is undecided."""
-    parts = claim["by_exclusion"]["world"]["parts"]
-    answers = [finding["holds"] for part in parts for finding in part["findings"]]
-    return f"{claim['rule']} Undecided: {answers.count(None)} of {len(answers)} statements."

@@ -1,0 +1,696 @@
+"""Charts of a study's results: `CHARTS` of any study, `PAPERS` of the paper's cases.
+
+To add a figure, write a function from a selection to its charts and add it to a list: page, PNG,
+PDF and CSV follow. `evaluation.scores` lists the scores that are charted over a variable.
+"""
+
+import math
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+
+from pipistrelle.config import STRATEGIES
+from pipistrelle.evaluation.comparison import Finding
+from pipistrelle.evaluation.consistency import anees, anees_bounds_about
+from pipistrelle.evaluation.scores import Score, shown_in
+from pipistrelle.figures.chart import (
+    MARKS,
+    Axis,
+    Chart,
+    Panel,
+    Series,
+    ends,
+    linear_axis,
+    log_axis,
+)
+from pipistrelle.report.axes import (
+    Facet,
+    Line,
+    axis_of,
+    axis_of_words,
+    beside,
+    each_combination,
+    facets_of,
+    slug,
+)
+from pipistrelle.report.claims import (
+    FILTERS,
+    TABLE_II,
+    cell_of,
+    frame_time,
+    gains,
+    lap_time,
+    papers_cases,
+    row_name,
+)
+from pipistrelle.report.effects import (
+    Effect,
+    Measure,
+    compare,
+    effects_of,
+    families_of,
+    measures_of,
+)
+from pipistrelle.report.study import (
+    COMMON,
+    LANDMARKS,
+    MAP,
+    MAP_ALIGNED,
+    NEES,
+    POSITION,
+    POSITION_ALIGNED,
+    Selection,
+    Study,
+    Way,
+    along,
+    case_name,
+    combination_name,
+    filter_titles,
+    has_numbers,
+    kept,
+    mean_std,
+    own_cases,
+    samples,
+)
+from pipistrelle.report.variables import (
+    BEAM,
+    UNITS,
+    Variable,
+    listed,
+    places,
+    with_article,
+)
+
+EDGE = 1.08
+"""Position of single worlds of passive sensing, as a multiple of the widest beam."""
+WORLDS = "Mean ± σ over worlds; dots: single worlds above that"
+PASSIVE = " (passive's at the right edge, where they do not depend on the beam)"
+BOUND = (
+    "; dashed: the bound, the least root mean square of any estimator, with the noise as measured "
+    "in the signal (a mean of RMSEs may be a fifth below, and one world's farther)"
+)
+"""Parts of captions."""
+GAINS = (("position", POSITION), ("map", COMMON))
+DIFFERENCE = "active minus fused; open: not significant"
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Level:
+    """A chart of a score over a variable."""
+
+    name: str
+    """Name of the chart and its files."""
+    title: str
+    score: str
+    """One of `study.READ`, or `study.COMMON`."""
+    label: str
+    """Label of the vertical axis."""
+    column: str
+    """Column of the CSV."""
+    scale: float = 1.0
+    """Factor from the score to the axis."""
+    caption: str = WORLDS
+    more: str = ""
+    """End of the caption."""
+    beside: str = ""
+    """Score of a dashed line, if any."""
+    named: str = "bound"
+    """Name of the dashed line."""
+    worlds: bool = True
+    """Whether single worlds are shown."""
+    log: bool = False
+    """Whether the axis is logarithmic, with means and deviations of logarithms."""
+
+
+_OWN: dict[str, dict[str, Any]] = {
+    POSITION_ALIGNED: {
+        "more": ". Each path after the rigid motion that fits it best: without the one turn of "
+        "everything that is most of the raw error",
+    },
+    MAP: {"score": COMMON, "title": "Map RMSE of the landmarks that every strategy has placed"},
+    MAP_ALIGNED: {
+        "title": "Map RMSE of each strategy's own landmarks, aligned",
+        "more": ". Each map after the rigid motion that fits it best; strategies place different "
+        "landmarks",
+    },
+    LANDMARKS: {
+        "name": "landmarks",
+        "column": "landmarks",
+        "caption": "Fully initialised landmarks at the end, mean ± σ over worlds; dashed: fully "
+        "and partially initialised, mean",
+        "beside": "landmarks_total",
+        "named": "total",
+        "worlds": False,
+    },
+    NEES: {
+        "name": "nees",
+        "column": "nees",
+        "caption": "Geometric mean over worlds, within a factor of one σ either way; a consistent "
+        "filter's is 3, and less after a start that is exact and thought uncertain",
+        "worlds": False,
+    },
+}
+"""Attributes of single charts that the table of scores lacks."""
+
+
+def levels() -> tuple[Level, ...]:
+    """Return the charts of the scores that `evaluation.scores` shows over a variable."""
+    return tuple(_level(name, score) for name, score in shown_in("levels").items())
+
+
+def _level(name: str, score: Score) -> Level:
+    """Return the chart of a score."""
+    factor, sign = UNITS[score.unit]
+    stem = name.removesuffix(f"_{score.unit}")
+    drawn: dict[str, Any] = {
+        "name": stem,
+        "title": score.title[0].upper() + score.title[1:],
+        "score": name,
+        "label": f"{score.title} [{sign}]" if sign else score.title,
+        "column": f"{stem}_deg" if score.unit == "rad" else name,
+        "scale": factor,
+        "more": BOUND if score.bound else "",
+        "beside": score.bound,
+        "log": score.ratio,
+    }
+    return Level(**drawn | _OWN.get(name, {}))
+
+
+def error_charts(selection: Selection) -> list[Chart]:
+    """Chart each RMSE over the variables, a panel per filter, a colour per strategy.
+
+    Worlds more than σ above the mean are single marks. Bradley & Abaid, Secs. V-C, V-D and
+    Appendix A.
+    """
+    return _charts(selection, [one for one in levels() if "RMSE" in one.label])
+
+
+def landmark_charts(selection: Selection) -> list[Chart]:
+    """Chart the number of initialised landmarks over the variables (Bradley & Abaid, Sec. V-E)."""
+    return _charts(selection, [one for one in levels() if one.score == LANDMARKS])
+
+
+def level_charts(selection: Selection) -> list[Chart]:
+    """Chart every level over each variable, or over the filters without variables."""
+    return _charts(selection, levels())
+
+
+def _charts(selection: Selection, levels: Sequence[Level]) -> list[Chart]:
+    """Chart the levels that have numbers, over each variable."""
+    axes = selection.study.variables or (None,)
+    there = [what for what in levels if has_numbers(selection.study, what.score)]
+    return [_chart(selection, what, variable) for variable in axes for what in there]
+
+
+def _chart(selection: Selection, what: Level, variable: Variable | None) -> Chart:
+    """Chart one level over one variable."""
+    study = selection.study
+    axis = axis_of(variable) if variable else axis_of_words([*filter_titles(study).values()])
+    facets = facets_of(study, variable, axis)
+    found = [_drawn(selection, what, facet, axis) for facet in facets]
+    lines = [s for drawn in found for s in drawn if not MARKS[s.style].pinned]
+    room = 1.07 if what.worlds else 1.0
+    top = [room * end for end in ends(lines)]
+    vertical = (
+        log_axis(what.label, ends(lines)) if what.log else linear_axis(what.label, top, floor=0.0)
+    )
+    name, title = what.name, what.title
+    if variable and len(study.variables) > 1:
+        name, title = f"{name}_by_{slug(variable.name)}", f"{title}, over {with_article(variable)}"
+    return Chart(
+        name=name,
+        title=title,
+        caption=_many(study, what, variable)
+        if variable and facets[0].many
+        else _caption(what, variable),
+        panels=tuple(
+            Panel(title=facet.title, role=facet.role, x=axis, y=vertical, series=tuple(series))
+            for facet, series in zip(facets, found, strict=True)
+        ),
+        columns=(variable.column if variable else "filter", what.column),
+    )
+
+
+def _many(study: Study, what: Level, variable: Variable) -> str:
+    """Return the caption of a chart of many lines."""
+    mean = "Geometric mean" if what.log else "Mean"
+    dashed = f"; dashed: {'the bound' if what.named == 'bound' else what.named}"
+    more = "" if what.more == BOUND else what.more
+    lines = each_combination(study, variable)
+    return f"{mean} over worlds; {lines}{dashed if what.beside else ''}{more}"
+
+
+def _caption(what: Level, variable: Variable | None) -> str:
+    """Return the caption of a chart with a line per strategy."""
+    words = what.caption
+    if what.worlds:
+        words += PASSIVE if variable and variable.name == BEAM else ""
+        words += ", triangles: those beyond the panel"
+    return words + what.more
+
+
+def _drawn(selection: Selection, what: Level, facet: Facet, axis: Axis) -> list[Series]:
+    """Return the lines of a panel, single worlds above each, and the dashed bound."""
+    found, apart = [], axis.words and not facet.many
+    for line in facet.lines:
+        at = selection.study.trials[line.way].at[line.cells]
+        flat = len(at) > 1 and what.score != COMMON and bool(np.all(at == at[0]))
+        per_place = _samples(selection, line, what.score, what.scale)
+        style = "points" if apart else ("line" if flat else "dots")
+        mean = _mean_line(line, per_place, style, log=what.log)
+        found.append(replace(mean, low=None, high=None) if facet.many else mean)
+        if what.worlds and not facet.many:
+            found.append(_worlds_above(line, mean, per_place, flat=flat))
+        if what.beside:
+            found.append(_dashed(selection, line, what, apart=apart))
+    return found
+
+
+def _samples(
+    selection: Selection, line: Line, score: str, scale: float
+) -> list[Float[np.ndarray, " m"]]:
+    """Return a score's values over the worlds at each point of a line, times a factor."""
+    return [scale * samples(selection, score, [(*line.way, int(i))])[0] for i in line.cells]
+
+
+def _mean_line(
+    line: Line, per_place: Sequence[Float[np.ndarray, " m"]], style: str, *, log: bool
+) -> Series:
+    """Return mean ± σ along the axis; shifted points if the axis has words."""
+    with np.errstate(divide="ignore", invalid="ignore"):
+        values = [np.log(sample[sample > 0.0]) if log else sample for sample in per_place]
+    mean, std = np.array([mean_std(sample) for sample in values]).T
+    low, high = mean - std, mean + std
+    if log:
+        mean, low, high = np.exp(mean), np.exp(low), np.exp(high)
+    return Series(
+        name=line.name,
+        role=line.way[1],
+        x=line.aside if style == "points" else line.x,
+        y=mean,
+        low=low,
+        high=high,
+        style=style,
+        strength=line.strength,
+    )
+
+
+def _worlds_above(
+    line: Line, mean: Series, per_place: Sequence[Float[np.ndarray, " m"]], *, flat: bool
+) -> Series:
+    """Return the worlds above the band of a line."""
+    top = np.array([np.nan]) if mean.high is None else mean.high
+    above = [sample[sample > end] for sample, end in zip(per_place, top, strict=True)]
+    at = line.aside
+    if flat:
+        above, at = above[:1], EDGE * line.x[-1:]
+    return Series(
+        name=f"{line.name}, worlds above σ",
+        role=line.way[1],
+        x=np.repeat(at, [len(values) for values in above]),
+        y=np.concatenate(above),
+        style="marks",
+        strength=0.55,
+    )
+
+
+def _dashed(selection: Selection, line: Line, what: Level, *, apart: bool) -> Series:
+    """Return the dashed line of a level: the mean of its second score over the worlds."""
+    beneath = [mean_std(one)[0] for one in _samples(selection, line, what.beside, what.scale)]
+    return Series(
+        name=f"{line.name}, {what.named}",
+        role=line.way[1],
+        x=line.aside if apart else line.x,
+        y=np.array(beneath),
+        style="levels" if apart else "line",
+        strength=line.strength,
+        dashed=not apart,
+    )
+
+
+def effect_charts(selection: Selection) -> list[Chart]:
+    """Chart the effects of each variable with each filter, a panel per measure.
+
+    Returns: without variables, the effects of strategies and filters.
+    """
+    study, titles = selection.study, filter_titles(selection.study)
+    charts = []
+    for (factor, whose), family in families_of(study, effects_of(selection)).items():
+        variable = next((v for v in study.variables if v.name == factor), None)
+        first = family[0].pairing.before
+        words = (first, *dict.fromkeys(effect.pairing.after for effect in family))
+        words = variable.words if variable else words
+        axis = axis_of(variable) if variable else axis_of_words(words)
+        at = dict(zip(words, places(variable) if variable else range(len(words)), strict=True))
+        title = titles.get(whose, f"{whose} sensing")
+        mean = "averaged over the combinations of the rest, " if family[0].apart else ""
+        charts.append(
+            Chart(
+                name=f"effect_{slug(factor)}_{slug(whose)}",
+                title=f"What {'the ' * ('.' not in factor)}{factor} changes, {title}",
+                caption=f"Difference to {first} in the same world, {mean}mean over worlds and its "
+                "95 % interval as one of its family. Full: shown, by Holm's correction. Map: "
+                "landmarks that both have placed. NEES: the ratio",
+                panels=tuple(_panel(measure, family, axis, at) for measure in measures_of(study)),
+                columns=(variable.column if variable else factor, "change"),
+            )
+        )
+    return charts
+
+
+def gain_charts(selection: Selection) -> list[Chart]:
+    """Chart active minus fused over each variable, paired over worlds."""
+    study = selection.study
+    return [_gain_chart(selection, variable) for variable in study.variables]
+
+
+def about(
+    name: str,
+    role: str,
+    x: Float[np.ndarray, " n"],
+    mean: Float[np.ndarray, " n"],
+    edges: Float[np.ndarray, "n 2"],
+    filled: Sequence[bool],
+) -> Series:
+    """Return a series of points with error bars that end at `edges`."""
+    return Series(
+        name=name,
+        role=role,
+        x=x,
+        y=mean,
+        low=edges[:, 0],
+        high=edges[:, 1],
+        style="points",
+        filled=np.array(filled, dtype=bool),
+    )
+
+
+def _panel(
+    measure: Measure, family: Sequence[Effect], axis: Axis, at: Mapping[str, float]
+) -> Panel:
+    """Return the panel of the effects in one measure, a series per strategy."""
+    ways: dict[str, list[Effect]] = {}
+    for effect in family:
+        if effect.measure == measure:
+            ways.setdefault(effect.pairing.strategy, []).append(effect)
+    series = [_changes(list(ways), strategy, axis, at, one) for strategy, one in ways.items()]
+    sign = UNITS[measure.unit][1]
+    label = "ratio" if measure.ratio else f"change{f' [{sign}]' if sign else ''}"
+    still = 1.0 if measure.ratio else 0.0
+    shown = [still, *ends(series)]
+    return Panel(
+        title=measure.title,
+        x=axis,
+        y=log_axis(label, shown) if measure.ratio else linear_axis(label, shown),
+        series=tuple(series),
+        rules=(still,),
+    )
+
+
+def _changes(
+    among: Sequence[str],
+    strategy: str,
+    axis: Axis,
+    at: Mapping[str, float],
+    effects: Sequence[Effect],
+) -> Series:
+    """Return the differences of one strategy, with 0 at the reference value."""
+    measure, findings = effects[0].measure, [effect.finding for effect in effects]
+    mean, edges = _bars(findings)
+    mean, edges = np.append(0.0, mean), np.vstack(([np.nan, np.nan], edges))
+    if measure.ratio:
+        mean, edges = np.exp(mean), np.exp(edges)
+    else:
+        mean, edges = UNITS[measure.unit][0] * mean, UNITS[measure.unit][0] * edges
+    x = np.array([at[effects[0].pairing.before], *(at[e.pairing.after] for e in effects)])
+    shown = [True, *(finding.holds is not None for finding in findings)]
+    x = beside(axis, x.astype(np.float64), strategy, among, far=1.0 if axis.words else 3.0)
+    rising = np.argsort(x)
+    shown = [shown[i] for i in rising]
+    name, role = strategy or "difference", strategy or "ink"
+    return about(name, role, x[rising], mean[rising], edges[rising], shown)
+
+
+def _bars(findings: Iterable[Finding]) -> tuple[np.ndarray, np.ndarray]:
+    """Return the means of findings and the ends of their intervals; NaN if infinite."""
+    found = list(findings)
+    edges = np.array([finding.family for finding in found]).reshape(-1, 2)
+    edges[~np.isfinite(edges)] = np.nan
+    return np.array([finding.mean for finding in found]), edges
+
+
+def _gain_chart(selection: Selection, variable: Variable) -> Chart:
+    """Chart the gain of fused over active along one variable."""
+    study, axis = selection.study, axis_of(variable)
+    panels = []
+    for what, score in GAINS:
+        found = {
+            title: _gains(selection, name, score, variable)
+            for name, title in filter_titles(study).items()
+            if {(name, "active"), (name, "fused")} <= study.trials.keys()
+        }
+        shown = ends(one for series in found.values() for one in series)
+        vertical = linear_axis(f"{what} gain [m]", [0.0, *shown])
+        panels += [
+            Panel(title=f"{what}, {title}", x=axis, y=vertical, series=tuple(series), rules=(0.0,))
+            for title, series in found.items()
+        ]
+    several = len(study.variables) > 1
+    spread = "mean and its 95 % interval as one of its panel"
+    if several:
+        spread = f"mean; {each_combination(study, variable)}, points for their {spread}"
+    return Chart(
+        name=f"gain_by_{slug(variable.name)}" if several else "gain",
+        title="What listening to others adds to one's own calls"
+        + (f", over {with_article(variable)}" if several else ""),
+        caption=f"RMSE of active minus that of fused in the same world, {spread}; "
+        "above the line fused is better. Full: shown, by Holm's correction over the panel. Map: "
+        "landmarks that every strategy has placed",
+        panels=tuple(panels),
+        columns=(variable.column, "gain_m"),
+    )
+
+
+def _gains(selection: Selection, name: str, score: str, variable: Variable) -> list[Series]:
+    """Return a filter's gains along a variable: mean, and a series for each combination."""
+    study = selection.study
+    rows, judged = along(study, variable), gains(selection, name, score)
+    count, series = rows.shape[1], []
+    for j in range(count):
+        findings = [judged[i] for i in rows[:, j]]
+        mean, edges = _bars(findings)
+        shown = [finding.holds is not None for finding in findings]
+        one = about(DIFFERENCE, "fused", places(variable), mean, edges, shown)
+        if count > 1:
+            named = combination_name(study, int(rows[0, j]), [variable])
+            faint = 1.0 - 0.75 * j / (count - 1)
+            one = replace(one, name=named, style="dots", low=None, high=None, strength=faint)
+        series.append(one)
+    if count == 1:
+        return series
+    measure = Measure(title="", score=score, unit="m")
+    pairs = [[((name, "fused", i), (name, "active", i)) for i in row] for row in rows.tolist()]
+    findings = [one.finding for one in compare(selection, [(0, measure, row) for row in pairs])]
+    shown = [finding.holds is not None for finding in findings]
+    mean, edges = _bars(findings)
+    means = about(f"mean, {DIFFERENCE}", "ink", places(variable), mean, edges, shown)
+    return [means, *series]
+
+
+def anees_charts(selection: Selection) -> list[Chart]:
+    """Chart each filter's ANEES over time, a panel per strategy, a line per beamwidth.
+
+    Bradley & Abaid, Sec. V-B and Eqs. (24) and (25).
+    """
+    titles = filter_titles(selection.study)
+    return [_anees_chart(selection, name, title) for name, title in titles.items()]
+
+
+def _anees_chart(selection: Selection, name: str, title: str) -> Chart:
+    """Chart one filter's ANEES over time."""
+    study = selection.study
+    ways = [(name, strategy) for strategy in STRATEGIES if (name, strategy) in study.trials]
+    lines = {way: _anees_lines(selection, way) for way in ways}
+    lines = {way: series for way, series in lines.items() if series}
+    runs = min((_runs(selection, way) for way in lines), default=0)
+    alike = _drives_alike(study)
+    if runs and alike:
+        for way, of_way in lines.items():
+            of_way.insert(0, _ideal(study, way, runs))
+    vertical = log_axis("ANEES", ends(s for of_way in lines.values() for s in of_way) or [1.0, 9.0])
+    lap = lap_time(study) if alike else math.inf
+    panels = [
+        Panel(
+            title=way[1],
+            role=way[1],
+            x=linear_axis("time [s]", [max(s.x[-1] for s in series) / 1.05], floor=0.0),
+            y=vertical,
+            series=tuple(series),
+            posts=tuple(lap * k for k in range(1, int(series[0].x[-1] / lap) + 1)),
+        )
+        for way, series in lines.items()
+    ]
+    return Chart(
+        name=f"anees_{slug(name)}",
+        title=f"Consistency of {title}: average NEES over time",
+        caption=_anees_caption(study, runs, alike=alike),
+        panels=tuple(panels),
+        columns=("time_s", "anees"),
+    )
+
+
+def _anees_caption(study: Study, runs: int, *, alike: bool) -> str:
+    """Return the caption of an ANEES chart."""
+    clauses = []
+    if [variable.name for variable in study.variables] == [BEAM]:
+        clauses.append("The stronger a line, the narrower the beam")
+    elif study.variables:
+        which = "the lower" if study.variables[0].numbers else "the earlier listed"
+        of = listed([variable.name for variable in study.variables])
+        clauses.append(f"A line for each combination of {of}; the stronger, {which}")
+    if alike:
+        one = ", at one beamwidth or another" if BEAM in {v.name for v in study.variables} else ""
+        clauses.append(
+            "grey: where a consistent filter's ANEES over "
+            f"{runs} world{'' if runs == 1 else 's'} lies with 95 %, after a start that is exact "
+            f"and thought uncertain{one}"
+        )
+        clauses.append("dotted: the vehicle is back at its start")
+    words = "; ".join(clauses)
+    return words[:1].upper() + words[1:]
+
+
+def _runs(selection: Selection, way: Way) -> int:
+    """Return the smallest number of worlds of any case that has some."""
+    cases = own_cases(selection.study.trials[way])
+    counts = [int(np.sum(kept(selection, [(*way, int(i))]))) for i in cases]
+    return min((count for count in counts if count), default=0)
+
+
+def _drives_alike(study: Study) -> bool:
+    """Return whether all combinations have the same laps and times."""
+    frames = next(iter(study.trials.values())).nees.shape[2]
+    drives = {
+        (lap_time(study, i), *frame_time(study, frames, i)[-1:].tolist(), config.scenario.steps)
+        for i, config in enumerate(study.configs)
+    }
+    return len(drives) == 1
+
+
+def _ideal(study: Study, way: Way, runs: int) -> Series:
+    """Return the ANEES of a consistent filter over `runs` worlds, with the bounds of all cases."""
+    expected, variance = study.trials[way].consistent
+    low, high = anees_bounds_about(expected, variance, runs)
+    return Series(
+        name="a consistent filter",
+        role="ink",
+        x=frame_time(study, expected.shape[1]),
+        y=np.mean(expected, axis=0),
+        low=np.min(low, axis=0),
+        high=np.max(high, axis=0),
+        dashed=True,
+    )
+
+
+def _anees_lines(selection: Selection, way: Way) -> list[Series]:
+    """Return ANEES over time, the widest beam first and faintest."""
+    study = selection.study
+    nees = study.trials[way].nees
+    cases = own_cases(study.trials[way]).tolist() if nees.shape[2] else []
+    found = []
+    for column, i in reversed(list(enumerate(cases))):
+        counts = kept(selection, [(*way, i)])
+        if counts.any():
+            found.append(
+                Series(
+                    name=case_name(study, way, i) or way[1],
+                    role=way[1],
+                    x=frame_time(study, nees.shape[2], i),
+                    y=anees(nees[counts, column]),
+                    strength=1.0 - 0.75 * column / max(len(cases) - 1, 1),
+                )
+            )
+    return found
+
+
+def table_ii_charts(selection: Selection) -> list[Chart]:
+    """Chart the landmarks of the study and of the paper's Table II."""
+    panels = []
+    for kind, score in (("fully initialised", "landmarks_full"), ("total", "landmarks_total")):
+        found = {title: _counts(selection, name, score) for name, title in FILTERS.items()}
+        axis = linear_axis("landmarks", ends(s for _, drawn in found.values() for s in drawn))
+        for title, (rows, series) in found.items():
+            names = tuple((float(i), text) for i, text in enumerate(rows))
+            limits = (-0.6, len(rows) - 0.4)
+            if rows:
+                panels.append(
+                    Panel(
+                        title=f"{kind}, {title}",
+                        x=Axis(label="", limits=limits, ticks=names),
+                        y=axis,
+                        series=series,
+                    )
+                )
+    chart = Chart(
+        name="table_ii",
+        title="Landmarks as in Table II",
+        caption="Mean ± σ over worlds; fused sensing at three beamwidths, and passive",
+        panels=tuple(panels),
+        columns=("row", "landmarks"),
+    )
+    return [chart]
+
+
+Figure = Callable[[Selection], list[Chart]]
+CHARTS: tuple[Figure, ...] = (effect_charts, level_charts, gain_charts, anees_charts)
+"""Figures of any study, in the page's order."""
+PAPERS: tuple[Figure, ...] = (
+    gain_charts, anees_charts, error_charts, landmark_charts, table_ii_charts,
+)  # fmt: skip
+"""Figures of a study that holds the paper's cases."""
+
+
+def answers(name: str) -> bool:
+    """Return whether the chart of a name shows a score that the answer names.
+
+    Examples
+    --------
+    >>> answers("gain"), answers("nees_by_rays_power"), answers("anees_ekf")
+    (True, True, False)
+    """
+    answering = {level.name for level in levels()} - {"map_rmse_aligned"} | {"gain"}
+    return name.partition("_by_")[0] in answering or name.startswith("effect_")
+
+
+def study_charts(selection: Selection, charts: Sequence[Figure] | None = None) -> list[Chart]:
+    """Return the charts of a study's results, except empty ones.
+
+    `charts`: functions that each return the charts of a figure; by default `PAPERS` if the study
+    holds the paper's cases, otherwise `CHARTS`.
+    """
+    if charts is None:
+        charts = PAPERS if papers_cases(selection.study) else CHARTS
+    return [chart for drawn in charts for chart in drawn(selection) if chart.panels]
+
+
+def _counts(selection: Selection, name: str, score: str) -> tuple[list[str], tuple[Series, Series]]:
+    """Return the names of Table II's rows, the paper's counts and ours."""
+    rows, printed, ours = [], [], []
+    for row in TABLE_II:
+        cell = cell_of(selection.study, row) if row.filter == name else None
+        if cell is not None:
+            rows.append(row_name(row).split()[0])
+            printed.append(row.full if score == "landmarks_full" else row.total)
+            ours.append(mean_std(samples(selection, score, [cell])[0]))
+    at = np.arange(len(rows), dtype=np.float64)
+    series = []
+    for title, role, aside, pairs in (
+        ("the paper", "truth", -0.12, printed), ("this study", "fused", 0.12, ours),
+    ):  # fmt: skip
+        mean, std = np.array(pairs).reshape(-1, 2).T
+        ends = np.column_stack([mean - std, mean + std])
+        series.append(about(title, role, at + aside, mean, ends, [True] * len(rows)))
+    return rows, (series[0], series[1])

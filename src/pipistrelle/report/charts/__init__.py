@@ -1,1 +1,0 @@
-"""A study's figures as data: its `setting`, its `results`, its `timelines`."""

@@ -1,0 +1,545 @@
+"""Effects: changes of a score from one value of a variable to another, in the same world.
+
+Every value is compared with the reference: the least number, the first word, or the truth for
+assumed settings and biases. Differences are averaged over the other variables in each world, and
+judged at each combination as well. Strategies and filters are compared with the first of them in
+the same way. The contrasts of a variable with one filter in one measure are a family; the values
+between the ends of a number are another. Gains over active sensing are measures of their own.
+"""
+
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+
+from pipistrelle.config import STRATEGIES
+from pipistrelle.evaluation.comparison import (
+    Contrast,
+    Finding,
+    Statement,
+    contrasts,
+    judge,
+)
+from pipistrelle.evaluation.scores import shown_in
+from pipistrelle.report.study import (
+    MAP,
+    POSITION,
+    Cell,
+    Rule,
+    Selection,
+    Study,
+    Way,
+    along,
+    combination_name,
+    filter_titles,
+    has_numbers,
+    kept,
+    rmse_of,
+    samples,
+    values,
+)
+from pipistrelle.report.variables import (
+    Variable,
+    amount,
+    interval,
+    listed,
+    with_article,
+)
+
+STRATEGY, FILTER = "strategy", "filter"
+"""Factors of a study besides its variables."""
+HEADLINE: Rule = "none"
+"""Rule of the answer: divergence caused by a setting is part of its effect."""
+OTHERWISE: Rule = "case"
+"""Rule of the second row of an effect whose direction changes without diverged cases."""
+MOST_NAMES = 4
+"""Most filters and strategies that an answer names."""
+Pair = tuple[Cell, Cell]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Measure:
+    """A score that is compared, or the gain in it over active sensing."""
+
+    title: str
+    score: str
+    """One of `study.READ`, or `study.COMMON`."""
+    unit: str
+    """One of `variables.UNITS`."""
+    ratio: bool = False
+    """Whether cases are compared by the ratio of their numbers."""
+    over: str = ""
+    """For a gain, the strategy from whose score the case's score is subtracted."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Pairing:
+    """Cases that differ only in the value of one factor."""
+
+    factor: str
+    """Name of the variable, `STRATEGY` or `FILTER`."""
+    filter: str = ""
+    strategy: str = ""
+    """Empty if it is itself the factor."""
+    before: str
+    after: str
+    """The two values, as words."""
+    end: bool = True
+    """Whether the value is an end of a number, or a word."""
+    pairs: tuple[Pair, ...]
+    """A pair of cases for each combination of the other variables."""
+    names: tuple[str, ...]
+    """Names of these combinations."""
+    measures: tuple[Measure, ...]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Effect:
+    """A pairing judged in one measure over the worlds."""
+
+    pairing: Pairing
+    measure: Measure
+    finding: Finding
+    """Of the mean over the combinations; of a ratio's logarithm."""
+    untouched: bool
+    """Whether both cases are equal in every world."""
+    apart: tuple[Finding, ...]
+    """At each of several combinations, as a family."""
+
+
+def measures_of(study: Study) -> tuple[Measure, ...]:
+    """List the scores that are compared: position RMSE, then all that have numbers."""
+    return tuple(
+        Measure(title=score.title, score=name, unit=score.unit, ratio=score.ratio)
+        for name, score in shown_in("effects").items()
+        if name == POSITION or has_numbers(study, name)
+    )
+
+
+def gains_of(study: Study) -> tuple[Measure, ...]:
+    """List the gains over active sensing in each error; they are positive if listening helps."""
+    return tuple(
+        replace(one, title=f"gain in {one.title} over active", over="active")
+        for one in measures_of(study)
+        if one.unit in ("m", "rad")
+    )
+
+
+def is_first(measure: Measure) -> bool:
+    """Return whether a measure is the position RMSE, the subject of the answer."""
+    return measure.score == POSITION and not measure.over
+
+
+def measured(
+    selection: Selection, measure: Measure, before: Cell, after: Cell
+) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"]]:
+    """Return a measure of two cases in each world; NaN in worlds that do not count.
+
+    Ratios give logarithms. Map errors are taken over the landmarks that all cases with the same
+    landmarks have placed.
+    """
+    study, cells = selection.study, [before, after]
+    cells += [(name, measure.over, number) for name, _, number in cells if measure.over]
+    first, second, *over = _numbers(study, measure.score, cells)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        if over:
+            first, second = over[0] - first, over[1] - second
+        if measure.ratio:
+            first, second = np.log(first), np.log(second)
+    counts = kept(selection, cells)
+    return np.where(counts, first, np.nan), np.where(counts, second, np.nan)
+
+
+def _numbers(study: Study, score: str, cells: Sequence[Cell]) -> list[Float[np.ndarray, " n"]]:
+    """Return a score of cases; map errors over landmarks that all cases of a drawing placed."""
+    numbers: dict[Cell, Float[np.ndarray, " n"]] = {}
+    for drawing in {study.drawing[number] for _, _, number in cells}:
+        drawn = [cell for cell in cells if study.drawing[cell[2]] == drawing]
+        if score != MAP or len(drawn) < 2:
+            numbers |= {cell: values(study, score, cell) for cell in drawn}
+            continue
+        placed, off = [], []
+        for name, strategy, number in drawn:
+            trials = study.trials[name, strategy]
+            placed.append(trials.placed[:, trials.at[number]])
+            off.append(trials.off[:, trials.at[number]])
+        shared = np.all(placed, axis=0)
+        numbers |= {cell: rmse_of(one, shared) for cell, one in zip(drawn, off, strict=True)}
+    return [numbers[cell] for cell in cells]
+
+
+def compare(
+    selection: Selection,
+    rows: Sequence[tuple[Any, Measure, Sequence[Pair]]],
+    *,
+    apart: bool = False,
+    set_same_aside: bool = False,
+) -> tuple[Contrast, ...]:
+    """Compare pairs of cases, averaged over the pairs of a row in each world.
+
+    `rows`: family, measure and pairs. `apart`: each pair by itself instead. `set_same_aside`: as
+    for `contrasts`. Returns: a contrast per row, or per pair.
+    """
+    import polars as pl
+
+    if not any(pairs for _, _, pairs in rows):
+        return ()
+    world = selection.study.worlds
+    numbers: dict[Any, int] = {}
+    heads, columns = [], []
+    for row, (family, measure, pairs) in enumerate(rows):
+        number = numbers.setdefault(family, len(numbers))
+        for i, pair in enumerate(pairs):
+            for level, column in enumerate(measured(selection, measure, *pair)):
+                heads.append((row, number, i, level))
+                columns.append(column)
+    names = ("row", "family", "combination", "level")
+    index = np.repeat(np.array(heads), len(world), axis=0)
+    frame = pl.DataFrame(
+        {name: index[:, i] for i, name in enumerate(names)}
+        | {"world": np.tile(world, len(heads)), "value": np.concatenate(columns)}
+    )
+    by, over = (["row", "combination"], []) if apart else (["row"], ["combination"])
+    return contrasts(
+        frame, "level", by, over=over, family=["family"], set_same_aside=set_same_aside
+    )
+
+
+def pairings_of(study: Study) -> tuple[Pairing, ...]:
+    """List the comparisons of a study: its variables in order, then strategies, then filters."""
+    return (*_of_variables(study), *_of_strategies(study), *_of_filters(study))
+
+
+def _of_variables(study: Study) -> Iterator[Pairing]:
+    """Pair the values of each variable in every strategy, and in its gain over active."""
+    measures, gains = measures_of(study), gains_of(study)
+    for variable in study.variables:
+        for name in filter_titles(study):
+            ways = [(name, strategy) for strategy in STRATEGIES if (name, strategy) in study.trials]
+            for way in ways:
+                yield from _of_values(study, variable, [way], measures)
+            over = name, "active"
+            for way in ways:
+                if over in ways and way != over:
+                    yield from _of_values(study, variable, [way, over], gains)
+
+
+def _of_values(
+    study: Study, variable: Variable, ways: Sequence[Way], measures: tuple[Measure, ...]
+) -> Iterator[Pairing]:
+    """Pair every value of a variable with its reference in the first way.
+
+    Combinations whose cases are the same in all ways count once; a variable that changes no case,
+    as the beam of passive sensing, gives nothing.
+    """
+    rows, base = along(study, variable), variable.base
+    ends = range(len(rows)) if variable.numbers is None else (0, len(rows) - 1)
+    at = np.array([study.trials[way].at[rows] for way in ways])
+    if np.all(at == at[:, :1]):
+        return
+    for j in (j for j in range(len(rows)) if j != base):
+        cases = at[:, [base, j]].reshape(-1, rows.shape[1])
+        first = np.sort(np.unique(cases, axis=1, return_index=True)[1])
+        yield Pairing(
+            factor=variable.name,
+            filter=ways[0][0],
+            strategy=ways[0][1],
+            before=variable.words[base],
+            after=variable.words[j],
+            end=j in ends,
+            pairs=tuple(
+                ((*ways[0], int(rows[base, m])), (*ways[0], int(rows[j, m]))) for m in first
+            ),
+            names=tuple(combination_name(study, int(rows[base, m]), [variable]) for m in first),
+            measures=measures,
+        )
+
+
+def _of_strategies(study: Study) -> Iterator[Pairing]:
+    """Pair the first strategy of each filter with the others."""
+    for name in filter_titles(study):
+        first, *others = (way for way in STRATEGIES if (name, way) in study.trials)
+        for other in others:
+            ways = (name, first), (name, other)
+            yield _of_ways(study, *ways, factor=STRATEGY, filter=name, before=first, after=other)
+
+
+def _of_filters(study: Study) -> Iterator[Pairing]:
+    """Pair the first filter of each strategy with the others."""
+    titles = filter_titles(study)
+    for strategy in STRATEGIES:
+        names = [name for name in titles if (name, strategy) in study.trials]
+        for other in names[1:]:
+            words = {"before": titles[names[0]], "after": titles[other], "strategy": strategy}
+            ways = (names[0], strategy), (other, strategy)
+            yield _of_ways(study, *ways, factor=FILTER, **words)
+
+
+def _of_ways(study: Study, one: Way, other: Way, **fields: Any) -> Pairing:
+    """Pair the cases of two ways at every combination where they differ."""
+    at = np.array([study.trials[way].at for way in (one, other)])
+    numbers = np.sort(np.unique(at, axis=1, return_index=True)[1]).tolist()
+    return Pairing(
+        **fields,
+        pairs=tuple(((*one, i), (*other, i)) for i in numbers),
+        names=tuple(combination_name(study, i) for i in numbers),
+        measures=measures_of(study),
+    )
+
+
+def effects_of(selection: Selection) -> tuple[Effect, ...]:
+    """Judge every comparison of a study in every measure."""
+    families: dict[tuple[Any, ...], list[Pairing]] = {}
+    for pairing in pairings_of(selection.study):
+        name = pairing.factor, pairing.filter or pairing.strategy, pairing.end, pairing.measures
+        families.setdefault(name, []).append(pairing)
+    rows = [
+        ((number, measure), measure, pairing)
+        for number, family in enumerate(families.values())
+        for measure in family[0].measures
+        for pairing in family
+    ]
+    means = compare(
+        selection, [(name, m, pairing.pairs) for name, m, pairing in rows], set_same_aside=True
+    )
+    several = [
+        (name, m, pairing.pairs if len(pairing.pairs) > 1 else ()) for name, m, pairing in rows
+    ]
+    apart: dict[int, list[Finding]] = {}
+    for contrast in compare(selection, several, apart=True, set_same_aside=True):
+        apart.setdefault(contrast.by["row"], []).append(contrast.finding)
+    return tuple(
+        Effect(
+            pairing=pairing,
+            measure=measure,
+            finding=mean.finding,
+            untouched=mean.same,
+            apart=tuple(apart.get(row, ())),
+        )
+        for row, ((_, measure, pairing), mean) in enumerate(zip(rows, means, strict=True))
+    )
+
+
+def families_of(study: Study, effects: Sequence[Effect]) -> dict[tuple[str, str], list[Effect]]:
+    """Group effects by factor, and by filter (or strategy, if filters are compared).
+
+    Returns: only the variables if the study has any, otherwise strategies and filters.
+    """
+    families: dict[tuple[str, str], list[Effect]] = {}
+    for effect in effects:
+        pairing = effect.pairing
+        if not study.variables or pairing.factor not in (STRATEGY, FILTER):
+            family = pairing.factor, pairing.filter or pairing.strategy
+            families.setdefault(family, []).append(effect)
+    return families
+
+
+def variable_of(study: Study, effect: Effect) -> Variable | None:
+    """Return the variable of an effect; None for strategies and filters."""
+    return next((v for v in study.variables if v.name == effect.pairing.factor), None)
+
+
+def direction(finding: Finding) -> int:
+    """Return 1 for a significant rise, -1 for a significant fall, otherwise 0."""
+    return {True: 1, False: -1, None: 0}[finding.holds]
+
+
+def resolvable(finding: Finding) -> float:
+    """Return the smallest effect that would have been significant: half an interval's width."""
+    low, high = finding.family
+    return (high - low) / 2.0
+
+
+def record(by_rule: Mapping[Rule, Sequence[Effect]], headline: Rule) -> list[dict[str, Any]]:
+    """Return the rows of effects in ``summary.json``.
+
+    `by_rule`: the same effects under each exclusion rule. `headline`: the rule under which effects
+    at single combinations are given. Ratios replace logarithms; None replaces numbers that are not
+    finite.
+    """
+    return [
+        {
+            "variable": one[0].pairing.factor,
+            "filter": one[0].pairing.filter or None,
+            "strategy": one[0].pairing.strategy or None,
+            "from": one[0].pairing.before,
+            "to": one[0].pairing.after,
+            "measure": "gain_" * bool(one[0].measure.over) + one[0].measure.score,
+            "unit": "ratio" if one[0].measure.ratio else one[0].measure.unit,
+            "averaged_over": len(one[0].pairing.pairs),
+            "by_exclusion": {
+                rule: _plain_effect(effect) for rule, effect in zip(by_rule, one, strict=True)
+            },
+            "apart": [
+                {"at": name}
+                | json_finding(finding, effect=True, ratio=one[0].measure.ratio)
+                | {"shown": finding.holds is not None}
+                for name, finding in zip(
+                    one[0].pairing.names,
+                    dict(zip(by_rule, one, strict=True))[headline].apart,
+                    strict=False,
+                )
+            ],
+        }
+        for one in zip(*by_rule.values(), strict=True)
+    ]
+
+
+def _plain_effect(effect: Effect) -> dict[str, Any]:
+    """Return an effect under one exclusion rule as JSON values."""
+    ratio, finding = effect.measure.ratio, effect.finding
+    would = math.nan if finding.holds is not None or effect.untouched else resolvable(finding)
+    would = math.exp(would) if ratio and would < 700.0 else would
+    return {
+        **json_finding(finding, effect=True, ratio=ratio),
+        "shown": finding.holds is not None,
+        "untouched": effect.untouched,
+        "would_have_shown": would if math.isfinite(would) else None,
+    }
+
+
+def json_finding(finding: Finding, *, effect: bool = False, ratio: bool = False) -> dict[str, Any]:
+    """Return a finding as JSON values; None replaces numbers that are not finite.
+
+    `effect`: give Bonferroni's interval, not Holm's. `ratio`: convert logarithms to ratios.
+    """
+
+    def size(value: float) -> float | None:
+        return value if math.isfinite(value) else None
+
+    def finite(value: float) -> float | None:
+        return size(float(np.exp(value))) if ratio and math.isfinite(value) else size(value)
+
+    return {
+        "n": finding.n,
+        "mean": finite(finding.mean),
+        "std": size(finding.std),
+        "alone": [finite(bound) for bound in finding.alone],
+        "interval": [finite(bound) for bound in (finding.family if effect else finding.interval)],
+        "p": size(finding.p),
+    }
+
+
+def headline(subject: str, title: str, unit: str, contrast: Contrast, cases: int = 1) -> str:
+    """Return one sentence for one contrast: direction, size and interval of the change.
+
+    `subject`: the two values, as "B instead of A". `title` and `unit`: of the score. `cases`: over
+    which the change is averaged.
+    """
+    finding, mean_of = contrast.finding, f", averaged over {cases} cases" * (cases > 1)
+    begin = subject if "." in subject.split()[0] else subject[0].upper() + subject[1:]
+    if finding.n < 2:
+        left = "a single world is left" if finding.n else "no world is left"
+        return f"{begin}: not decided, {left}{mean_of}."
+    if contrast.same:
+        return f"{begin} leaves the {title} the same to the last digit{mean_of}."
+    if not finding.std > 0.0:
+        size = amount(finding.mean, unit)
+        return f"{begin} changes the {title} by {size} in every world{mean_of}."
+    sign = direction(finding)
+    low, high = sorted((sign or 1) * end for end in finding.family)
+    size = f"{amount((sign or 1) * finding.mean, unit)} {interval((low, high), unit)}"
+    if sign:
+        return f"{begin} {'raises' if sign > 0 else 'lowers'} the {title} by {size}{mean_of}."
+    return f"{begin} shows no effect on the {title}; the change is {size}{mean_of}."
+
+
+def question(study: Study) -> str:
+    """Return the question that a study answers."""
+    if study.variables:
+        verb = "do" if len(study.variables) > 1 else "does"
+        return f"What {verb} {listed([with_article(v) for v in study.variables])} change?"
+    titles = list(filter_titles(study).values())
+    ways = [way for way in STRATEGIES if any(way == strategy for _, strategy in study.trials)]
+    if len(ways) > 1:
+        return f"How do {listed(ways)} sensing compare?"
+    if len(titles) > 1:
+        return f"How do {listed(titles)} compare?"
+    return f"How well does {titles[0]} locate the vehicle by {ways[0]} sensing?"
+
+
+def answer(selection: Selection, effects: Sequence[Effect]) -> list[str]:
+    """Answer a study's question: a sentence per variable, else per strategy or filter.
+
+    `effects`: under the rule `HEADLINE`. Each sentence is the change of the position RMSE between
+    two values, averaged over everything else; of several values of a variable the largest shown.
+    """
+    study = selection.study
+    if study.variables:
+        return [_of_variable(selection, variable, effects) for variable in study.variables]
+    lines = []
+    for factor in (STRATEGY, FILTER):
+        rows = [e for e in effects if e.pairing.factor == factor and is_first(e.measure)]
+        lines += [sentence for _, sentence in _averaged(selection, rows)]
+    if lines:
+        return lines
+    (way,) = study.trials
+    (errors,) = samples(selection, POSITION, [(*way, 0)])
+    if not len(errors):
+        return ["Not decided: no world is left."]
+    (mean,) = judge([Statement(label="", sample=errors)])
+    size = interval(mean.alone, "m") if mean.n > 1 else "in the one world"
+    title = filter_titles(study)[way[0]]
+    return [f"{title}'s position RMSE is {amount(mean.mean, 'm')} {size} by {way[1]} sensing."]
+
+
+def _of_variable(selection: Selection, variable: Variable, effects: Sequence[Effect]) -> str:
+    """Return the sentence of a variable: of its values with the largest effect shown."""
+    first = [e for e in effects if e.pairing.factor == variable.name and is_first(e.measure)]
+    if not first:
+        return f"No measurement depends on {with_article(variable)}."
+    answers = [
+        _averaged(selection, [e for e in first if e.pairing.end is end], variable)
+        for end in (True, False)
+    ]
+    shown = [one for some in answers for one in some if direction(one[0])]
+    return max(shown or answers[0], key=lambda one: (one[0].n, abs(one[0].mean)))[1]
+
+
+def _averaged(
+    selection: Selection, effects: Sequence[Effect], variable: Variable | None = None
+) -> list[tuple[Finding, str]]:
+    """Return finding and sentence of each two values, averaged over filters and strategies.
+
+    The findings are a family. The sentence names the effects if they do not all agree with it.
+    """
+    groups: dict[tuple[str, str], list[Effect]] = {}
+    for effect in effects:
+        groups.setdefault((effect.pairing.before, effect.pairing.after), []).append(effect)
+    pairs = [[pair for e in group for pair in e.pairing.pairs] for group in groups.values()]
+    rows = [(0, effects[0].measure, some) for some in pairs]
+    answers = []
+    for ((before, after), group), some, contrast in zip(
+        groups.items(), pairs, compare(selection, rows), strict=True
+    ):
+        sensing = " sensing" * (group[0].pairing.factor == STRATEGY)
+        subject = f"{after} instead of {before}{sensing}"
+        if variable is not None:
+            subject = f"{with_article(variable)} from {before} to {after}"
+            if variable.numbers is None:
+                subject = f"{variable.name} = {after} instead of {before}"
+        sentence = headline(subject, group[0].measure.title, "m", contrast, len(some))
+        signs = {direction(effect.finding) for effect in group}
+        if len(group) > 1 and signs != {direction(contrast.finding)}:
+            sentence += f" {_shown_by(selection.study, group)}"
+        answers.append((contrast.finding, sentence))
+    return answers
+
+
+def _shown_by(study: Study, group: Sequence[Effect]) -> str:
+    """Return the sentence on the filters and strategies with which an effect is shown."""
+    titles, parts = filter_titles(study), []
+    for sign, verb in ((1, "rise"), (-1, "fall")):
+        shown = [e.pairing for e in group if direction(e.finding) == sign]
+        names = [
+            " ".join(filter(None, (p.strategy, titles.get(p.filter, "sensing")))) for p in shown
+        ]
+        if len(names) > MOST_NAMES:
+            names = [f"{len(names)} of {len(group)} filters and strategies"]
+        parts += [f"{verb} with {listed(names)}"] if names else []
+    if not parts:
+        return "With no filter and strategy by itself an effect is shown."
+    return f"It is shown to {listed(parts)}."

@@ -1,0 +1,173 @@
+"""Charts of a study's models: the emitter's beam patterns and an example world."""
+
+import math
+from collections.abc import Sequence
+
+import numpy as np
+from jaxtyping import Float
+
+from pipistrelle.acoustics.emitter import HALF_POWER, piston_directivity, piston_radius
+from pipistrelle.acoustics.paths import VEHICLE, Caller, moves
+from pipistrelle.config import Config
+from pipistrelle.experiments.hearing.scenario import Scenario
+from pipistrelle.figures.chart import Axis, Chart, Panel, Series
+from pipistrelle.report.study import Study, combination_name
+from pipistrelle.report.variables import listed, width_name
+
+
+def model_charts(study: Study) -> list[Chart]:
+    """Chart the study's emitters, and an example world if it can be drawn."""
+    maps = [] if study.example is None else [example_map(study, study.example)]
+    return [piston(study), *maps]
+
+
+def piston(study: Study) -> Chart:
+    """Chart the beam patterns of the study's emitters.
+
+    Bradley & Abaid, Eq. (1) and Appendix B.
+    """
+    series = _protractor()
+    widths, first = np.unique(study.beamwidth, return_index=True)
+    last = max(len(widths) - 1, 1)
+    for i in reversed(range(len(widths))):
+        config = study.configs[first[i]]
+        series += _beam(config, float(widths[i]), 1.0 - 0.75 * i / last)
+    panel = Panel(
+        title="",
+        x=Axis(label="", limits=(-1.15, 1.15), ticks=()),
+        y=Axis(label="", limits=(-0.12, 1.15), ticks=()),
+        series=tuple(series),
+        equal=True,
+    )
+    return Chart(
+        name="piston",
+        title="Beams of the vehicle's emitter",
+        caption="Pressure of a back-baffled piston over the angle off its axis, relative to the "
+        "axis (up); rings at 0.5, 0.71 (half power, the dots) and 1; the stronger a line, the "
+        "narrower",
+        panels=(panel,),
+        columns=("across", "along"),
+    )
+
+
+def example_map(study: Study, world: Scenario) -> Chart:
+    """Chart a world of the study: path, landmarks and callers (Bradley & Abaid, Sec. IV)."""
+    setup, circle, series = study.configs[0].scenario, "", _world(world)
+    if setup.field == "disc" and setup.world is None:
+        circle = f"; the dashed circle has a radius of {setup.radius:g} m"
+        turn = np.linspace(0.0, 2.0 * np.pi, 181)
+        x, y = setup.radius * np.cos(turn), setup.radius * np.sin(turn)
+        edge = Series(name="edge", role="grid", x=x, y=y, dashed=True, listed=False)
+        series = (edge, *series)
+    x, y = _square(series)
+    count, others = len(world.landmarks), [caller.name for caller in world.callers[VEHICLE + 1 :]]
+    shown = listed([f"{count} landmarks", *(f"the {name}" for name in others)])
+    where = f" where {combination_name(study, 0)}" if study.drawing.any() else ""
+    return Chart(
+        name="example_map",
+        title="A world of the study",
+        caption=f"World {study.worlds[0]}{where}: {shown}, and the vehicle's true path of "
+        f"{world.time[-1]:g} s{circle}",
+        panels=(Panel(title="", x=x, y=y, series=series, equal=True),),
+        columns=("x_m", "y_m"),
+    )
+
+
+def _square(series: Sequence[Series]) -> tuple[Axis, Axis]:
+    """Return axes of equal length with a margin around some series."""
+    places = np.array([[part(s.x), part(s.y)] for s in series for part in (np.min, np.max)])
+    low, high = places.min(axis=0), places.max(axis=0)
+    reach = 0.52 * float(np.max(high - low))
+    x, y = ((float(at) - reach, float(at) + reach) for at in (low + high) / 2.0)
+    return Axis(label="", limits=x, ticks=()), Axis(label="", limits=y, ticks=())
+
+
+def _beam(config: Config, width: float, strength: float) -> list[Series]:
+    """Return a beam's outline, and dots at half power labelled with its numbers."""
+    tone = {"frequency": config.emitter.centre, "speed_of_sound": config.medium.sound_speed}
+    half = np.radians(np.array([width])) / 2.0
+    radius = float(piston_radius(np.radians(width), **tone))
+    name, angle = width_name(width), np.radians(np.linspace(-90.0, 90.0, 361))
+    pressure, edge = (piston_directivity(at, radius=radius, **tone) for at in (angle, half))
+    ka = HALF_POWER / float(np.sin(half[0]))
+    tip = f"{name}\nradius: {1e3 * radius:.1f} mm\nka: {ka:.1f}"
+    look = {"name": name, "role": "active", "strength": strength}
+    return [
+        Series(x=pressure * np.sin(angle), y=pressure * np.cos(angle), **look),
+        Series(
+            x=edge * np.sin(half),
+            y=edge * np.cos(half),
+            style="marks",
+            tips=(tip,),
+            listed=False,
+            **look,
+        ),
+    ]
+
+
+def _protractor() -> list[Series]:
+    """Return the rings and spokes of a beam pattern, and their labels."""
+    angle = np.radians(np.linspace(-90.0, 90.0, 181))
+    spokes = np.radians(np.linspace(-90.0, 90.0, 7))
+    rings = (0.5, math.sqrt(0.5), 1.0)
+    arcs = [(ring * np.sin(angle), ring * np.cos(angle), ring < 1.0) for ring in rings]
+    lines = [(np.array([0.0, np.sin(s)]), np.array([0.0, np.cos(s)]), False) for s in spokes]
+    names = [f"{abs(degrees):.0f}°" for degrees in np.degrees(spokes)]
+    text = Series(
+        name="scale",
+        role="grid",
+        x=np.append(1.08 * np.sin(spokes), rings),
+        y=np.append(1.08 * np.cos(spokes), np.full(len(rings), -0.06)),
+        style="text",
+        tips=(*names, *(f"{ring:.2g}" for ring in rings)),
+        listed=False,
+    )
+    return [
+        *(
+            Series(name="scale", role="grid", x=x, y=y, dashed=dashed, listed=False)
+            for x, y, dashed in arcs + lines
+        ),
+        text,
+    ]
+
+
+def _world(world: Scenario) -> tuple[Series, ...]:
+    """Return the series of a world: path, landmarks and callers."""
+    start = world.path[:1, :2]
+    labels = [f"landmark {i}" for i in range(1, len(world.landmarks) + 1)]
+    return (
+        Series(name="true path", role="truth", x=world.path[:, 0], y=world.path[:, 1]),
+        Series(
+            name="start",
+            role="truth",
+            x=start[:, 0],
+            y=start[:, 1],
+            style="points",
+            tips=_places(["start"], start),
+        ),
+        Series(
+            name="landmark",
+            role="ink",
+            x=world.landmarks[:, 0],
+            y=world.landmarks[:, 1],
+            style="points",
+            filled=np.zeros(len(world.landmarks), bool),
+            tips=_places(labels, world.landmarks),
+        ),
+        *(_caller(caller) for caller in world.callers[VEHICLE + 1 :]),
+    )
+
+
+def _caller(caller: Caller) -> Series:
+    """Return the path of a moving caller, or a star at the position of another."""
+    place = np.reshape(np.asarray(caller.place), (-1, 2))
+    look = {"name": caller.name, "role": "fused", "x": place[:, 0], "y": place[:, 1]}
+    if moves(caller):
+        return Series(**look)
+    return Series(**look, style="stars", tips=_places([caller.name], place))
+
+
+def _places(names: list[str], points: Float[np.ndarray, "n 2"]) -> tuple[str, ...]:
+    return tuple(
+        f"{name}\nx: {x:.1f} m\ny: {y:.1f} m" for name, (x, y) in zip(names, points, strict=True)
+    )

@@ -1,0 +1,350 @@
+"""Reports: a page with the answer, figures and tables, and the same numbers for programs.
+
+The page is one file without outside requests: style, script and drawings are inside. The template
+escapes every text. The same folder gives the same bytes. A study that holds the paper's cases is
+asked the paper's question and its claims are judged; other studies are asked for the effects of
+their variables.
+"""
+
+import json
+import platform
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, dataclass
+from importlib.metadata import PackageNotFoundError, version
+from importlib.resources import files
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from markupsafe import Markup
+
+from pipistrelle import __version__
+from pipistrelle.evaluation.bound import IN_ONE_WORLD
+from pipistrelle.evaluation.comparison import INTERVALS, Finding
+from pipistrelle.evaluation.scores import shown_in
+from pipistrelle.figures.chart import Chart, columns_of, csv_rows, csv_text
+from pipistrelle.figures.style import page_colours
+from pipistrelle.files import REPORT, claim, drawn_files, upright
+from pipistrelle.report import claims as paper
+from pipistrelle.report import effects as changes
+from pipistrelle.report import tables
+from pipistrelle.report.charts import Figure, answers, study_charts
+from pipistrelle.report.claims import (
+    CLAIMS,
+    FILTERS,
+    WITHOUT,
+    Claim,
+    JudgedClaim,
+    judge_claims,
+    papers_cases,
+    tally,
+    with_everything,
+)
+from pipistrelle.report.effects import HEADLINE, OTHERWISE, Effect, effects_of, measures_of
+from pipistrelle.report.models import model_charts
+from pipistrelle.report.study import (
+    ONLINE_POSITION,
+    RULES,
+    Rule,
+    Selection,
+    Study,
+    filter_titles,
+    has_numbers,
+    selections,
+)
+from pipistrelle.report.svg import legend, panel_svg, readings
+from pipistrelle.report.variables import UNITS, number_word, three_digits
+from pipistrelle.settings import to_toml
+
+if TYPE_CHECKING:
+    from jinja2 import Template
+
+FORMAT = 1
+LIBRARIES = ("numpy", "scipy", "numba", "polars", "pydantic", "matplotlib", "jinja2")
+PAPERS_QUESTION = "Does listening to someone else’s calls as well as one’s own build a better map?"
+SPOKEN = {"reproduced": "Reproduced", "not-reproduced": "Not reproduced", "open": "Open"}
+MIN_WORLDS = 20
+"""Number of worlds below which a report warns that effects may be due to chance."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Answered:
+    """A study with its question, answer, effects and judged claims."""
+
+    study: Study
+    papers: bool
+    """Whether it holds the paper's cases and answers the paper's question."""
+    question: str
+    rule: Rule
+    """Exclusion rule of the answer."""
+    selections: Mapping[Rule, Selection]
+    effects: Mapping[Rule, tuple[Effect, ...]]
+    """Effects and selections under each rule."""
+    claims: tuple[JudgedClaim, ...]
+    answer: list[str]
+    """A headline, then further sentences."""
+    findings: list[dict[str, str]]
+    """Table of the answer to the paper's question; empty for other questions."""
+
+
+def answered(study: Study, claims: Sequence[Claim] | None = None) -> Answered:
+    """Answer a study's question; `claims` as in `write_report`."""
+    papers, by_rule = papers_cases(study), selections(study)
+    effects = {rule: effects_of(selection) for rule, selection in by_rule.items()}
+    asked = (CLAIMS if papers else ()) if claims is None else claims
+    judged = judge_claims(by_rule, asked)
+    return Answered(
+        study=study,
+        papers=papers,
+        question=PAPERS_QUESTION if papers else changes.question(study),
+        rule="world" if papers else HEADLINE,
+        selections=by_rule,
+        effects=effects,
+        claims=judged,
+        answer=paper.papers_answer(by_rule, judged)
+        if papers
+        else changes.answer(by_rule[HEADLINE], effects[HEADLINE]),
+        findings=paper.findings(by_rule) if papers else [],
+    )
+
+
+def summary(result: Answered) -> dict[str, Any]:
+    """Return the content of ``summary.json``."""
+    study, selection, rule = result.study, result.selections[result.rule], result.rule
+    effects = result.effects[rule], result.effects[OTHERWISE]
+    exclusions = tables.exclusion_rows(study)
+    return {
+        "format": FORMAT,
+        "version": __version__,
+        "versions": {"python": platform.python_version()} | _versions(),
+        "study": study.name,
+        "seed": study.config.seed,
+        "worlds_planned": study.planned,
+        "worlds_done": len(study.worlds),
+        "partial": len(study.worlds) < study.planned,
+        "trials": sum(trials.failed.size for trials in study.trials.values()),
+        "filters_cpu_s": study.cpu_s,
+        "variables": [
+            {"name": v.name, "setting": v.setting, "label": v.label, "values": [*v.words]}
+            for v in study.variables
+        ],
+        "not_the_papers": tables.not_the_papers(study),
+        "question": result.question,
+        "answer": result.answer,
+        "findings": result.findings,
+        "answered_by": result.rule,
+        "effect_tables": [] if result.papers else tables.effect_tables(selection, *effects),
+        "effects": changes.record(result.effects, result.rule),
+        "cases": tables.case_rows(selection),
+        "claims": [paper.record(claim) for claim in result.claims],
+        "exclusion_rules": dict(RULES),
+        "exclusions": exclusions,
+        "trials_failed": sum(row["failed"] for row in exclusions),
+        "table_ii": tables.table_ii_rows(selection) if result.papers else [],
+        "consistency": tables.consistency_rows(selection),
+        "failed": [asdict(failure) for failure in study.errors],
+    }
+
+
+def _versions() -> dict[str, str]:
+    """Return the versions of the libraries that numbers and figures depend on."""
+    versions = {}
+    for name in LIBRARIES:
+        try:
+            versions[name] = version(name)
+        except PackageNotFoundError:
+            versions[name] = "unknown"
+    return versions
+
+
+def write_report(
+    study: Study,
+    folder: Path,
+    *,
+    claims: Sequence[Claim] | None = None,
+    charts: Sequence[Figure] | None = None,
+    progress: Callable[[str], None] = lambda _: None,
+) -> dict[str, Any]:
+    """Answer a study's question and write its page, its figures and its summary.
+
+    `study`: as `read_study` gives it. `folder`: is made if missing; gets ``index.html``,
+    ``summary.json`` and ``figures``. `claims`: to be judged; by default the paper's if the study
+    holds its cases. `charts`: functions that return the charts of a figure, with distinct names; by
+    default as for `study_charts`. `progress`: is given the name of each figure before it is drawn.
+    Returns: the content of ``summary.json``. Raises InputError: as `pipistrelle.files.claim`;
+    only an earlier report is replaced.
+    """
+    own = claim(folder, REPORT, overwrite=True)
+    result = answered(study, claims)
+    rules = sorted(RULES, key=lambda rule: rule != result.rule)  # the rule of the answer is printed
+    by_rule = {rule: study_charts(result.selections[rule], charts) for rule in rules}
+    models = model_charts(study)
+    drawn, texts = [*_distinct(by_rule), *models], _csv_texts(result, by_rule, models)
+
+    def draw(room: Path) -> None:
+        for chart in drawn:
+            progress(chart.name)
+            _write_figure(chart, room)
+
+    numbers = summary(result)
+    written = drawn_files(draw, "figures/")
+    written |= {f"figures/{name}.csv": text.encode() for name, text in texts.items()}
+    written["index.html"] = page(result, by_rule, models, numbers).encode()
+    written["summary.json"] = (json.dumps(numbers, indent=1, allow_nan=False) + "\n").encode()
+    own.replace(written)
+    return numbers
+
+
+def page(
+    result: Answered,
+    by_rule: dict[Rule, list[Chart]],
+    models: list[Chart],
+    numbers: dict[str, Any],
+) -> str:
+    """Return the page as HTML; `numbers`: the content of ``summary.json``."""
+    here, study = files("pipistrelle.report"), result.study
+    figures = [_figure(chart.name, by_rule) for chart in _distinct(by_rule)]
+    text = _template().render(
+        study=study,
+        papers=result.papers,
+        headline=result.rule,
+        question=result.question,
+        claims=result.claims,
+        summary=numbers,
+        few=MIN_WORLDS,
+        intervals=INTERVALS,
+        tables=numbers["effect_tables"],
+        means=shown_in("cases"),
+        in_one_world=IN_ONE_WORLD,
+        online=has_numbers(study, ONLINE_POSITION),
+        measures=measures_of(study),
+        units=UNITS,
+        figures=_side_by_side([figure for figure in figures if answers(figure["name"])]),
+        further=_side_by_side([figure for figure in figures if not answers(figure["name"])]),
+        models=_side_by_side([_figure(chart.name, {"always": [chart]}) for chart in models]),
+        style=Markup((here / "page.css").read_text(encoding="utf-8")),
+        script=Markup((here / "page.js").read_text(encoding="utf-8")),
+        colours=Markup(page_colours()),
+        filters=filter_titles(study),
+        papers_filters=FILTERS,
+        number_word=number_word,
+        rules=RULES,
+        without=WITHOUT,
+        spoken=SPOKEN,
+        tally=tally,
+        with_everything=with_everything,
+        departures=tables.not_the_papers_line(numbers["not_the_papers"]) if result.papers else "",
+        consistency=tables.by_strategy(numbers["consistency"]),
+        config=to_toml(study.config),
+    )
+    return upright(text)
+
+
+def _template() -> "Template":
+    """Return the page's template, which escapes every text."""
+    from jinja2 import Environment, StrictUndefined
+
+    environment = Environment(
+        autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True
+    )
+    environment.filters |= {"number": three_digits, "p": _p, "finding": _shown}
+    text = (files("pipistrelle.report") / "page.html").read_text(encoding="utf-8")
+    return environment.from_string(text)
+
+
+def _side_by_side(figures: list[dict[str, Any]]) -> list[dict[str, Any]]:
+    """Mark figures of one panel as pairs, and the last of an odd number as single."""
+    single = [figure for figure in figures if figure["columns"] == 1]
+    for figure in single:
+        figure["place"] = "single"
+    if len(single) % 2:
+        single[-1]["place"] = "lone"
+    return figures
+
+
+def _distinct(by_rule: Mapping[Any, list[Chart]]) -> list[Chart]:
+    """Return each figure once, under the first rule that has it."""
+    charts: dict[str, Chart] = {}
+    for of_rule in by_rule.values():
+        for chart in of_rule:
+            charts.setdefault(chart.name, chart)
+    return list(charts.values())
+
+
+def _figure(name: str, by_rule: Mapping[Any, list[Chart]]) -> dict[str, Any]:
+    """Return a figure under all exclusion rules; None under rules without it."""
+    named = {rule: chart for rule, some in by_rule.items() for chart in some if chart.name == name}
+    views: dict[str, dict[str, Any] | None] = dict.fromkeys(by_rule)
+    for rule, chart in named.items():
+        panels = []
+        for panel in chart.panels:
+            numbers = readings(panel)
+            names = list(dict.fromkeys(name for _, _, texts in numbers for name, _ in texts))
+            parts = {"panel": panel, "svg": panel_svg(panel), "readings": numbers, "names": names}
+            panels.append(parts)
+        views[rule] = {"chart": chart, "panels": panels, "legend": legend(chart.panels)}
+    first = next(iter(named.values()))
+    count = len(first.panels)
+    columns = count if count <= 4 else columns_of(count)  # the style sheet has four as two by two
+    return {"name": name, "title": first.title, "by_rule": views, "columns": columns, "place": ""}
+
+
+def _write_figure(chart: Chart, folder: Path) -> None:
+    """Write a chart as PNG and PDF."""
+    from pipistrelle.figures.chart import draw_chart
+    from pipistrelle.figures.style import save_figure
+
+    save_figure(draw_chart(chart), folder, chart.name)
+
+
+def _csv_texts(
+    result: Answered, by_rule: dict[Rule, list[Chart]], models: list[Chart]
+) -> dict[str, str]:
+    """Return the numbers of each figure under all exclusion rules, as CSV."""
+    texts = {chart.name: csv_text(csv_rows(chart)) for chart in models}
+    for chart in _distinct(by_rule):
+        rows: list[list[str]] = []
+        for rule, of_rule in by_rule.items():
+            for other in of_rule:
+                if other.name == chart.name:
+                    new = csv_rows(other, exclusion=rule)
+                    rows += new[1:] if rows else new
+        texts[chart.name] = csv_text(rows)
+    if not result.papers:
+        return texts
+    table = []
+    for rule, selection in result.selections.items():
+        for row in tables.table_ii_rows(selection):
+            flat = {"exclusion": rule}
+            for key, value in row.items():
+                pair = isinstance(value, list)
+                flat |= {key: value[0], f"{key}_std": value[1]} if pair else {key: value}
+            table.append(flat)
+    header = list(dict.fromkeys(key for row in table for key in row))
+    cells = [["" if row.get(key) is None else str(row[key]) for key in header] for row in table]
+    return texts | {"table_ii": csv_text([header, *cells])}
+
+
+def _p(p: float, sentence: bool = False) -> str:
+    """Format a p value, within a sentence with its sign."""
+    if p < 1e-4:
+        return "< 0.0001"
+    return ("= " if sentence else "") + (f"{p:.2g}" if p < 0.1 else f"{p:.2f}")
+
+
+def _shown(finding: Finding, unit: str) -> dict[str, str]:
+    """Format a finding in its unit, angles in degrees."""
+    factor, sign = UNITS[unit]
+    end = f" {sign}" if sign not in ("", "°") else sign
+    edges = {finding.margin, -finding.margin} if finding.relation == "within" else {finding.margin}
+    low, high = finding.interval
+    words = (
+        ("above " if low in edges else "") + three_digits(factor * low),
+        ("below " if high in edges else "") + three_digits(factor * high),
+    )
+    margin = three_digits(factor * finding.margin) + (end if finding.margin else "")
+    return {
+        "mean": three_digits(factor * finding.mean) + end if finding.n else "none",
+        "interval": " to ".join(words),
+        "margin": f"± {margin}" if finding.relation == "within" else margin,
+        "sigmas": three_digits(finding.mean / finding.sigma) if finding.sigma > 0.0 else "",
+    }

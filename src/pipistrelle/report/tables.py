@@ -1,0 +1,380 @@
+"""Tables of a report: effects, cases, exclusions, Table II, consistency, unlike settings."""
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from pipistrelle.config import Config
+from pipistrelle.estimation.catalogue import CATALOGUE
+from pipistrelle.evaluation.comparison import Finding
+from pipistrelle.evaluation.consistency import anees, anees_bounds_about
+from pipistrelle.evaluation.scores import shown_in
+from pipistrelle.experiments.studies.plan import RADIUS, find_plan, read_plan
+from pipistrelle.report.claims import (
+    EXCLUDED,
+    TABLE_II,
+    WORLDS,
+    anees_departure,
+    cell_of,
+    row_name,
+)
+from pipistrelle.report.effects import (
+    STRATEGY,
+    Effect,
+    Pairing,
+    direction,
+    measures_of,
+    variable_of,
+)
+from pipistrelle.report.study import (
+    POSITION,
+    Selection,
+    Study,
+    case_name,
+    filter_titles,
+    kept,
+    lost_worlds,
+    mean_std,
+    own_cases,
+    samples,
+    times_the_bound,
+)
+from pipistrelle.report.variables import (
+    amount,
+    interval,
+    setting_variable,
+    three_digits,
+    two_sided,
+    width_name,
+    with_article,
+)
+from pipistrelle.settings import derived, known_settings
+
+MAX_COMBINATIONS = 6
+"""Most combinations with a row each; of more, only those with an opposite effect have one."""
+
+
+def effect_tables(
+    selection: Selection, effects: Sequence[Effect], otherwise: Sequence[Effect]
+) -> list[dict[str, Any]]:
+    """Return a table of effects for each variable, then for strategies and filters.
+
+    `otherwise`: the same effects without diverged cases. A table has name, title, meaning, whether
+    it is of a variable (`varied`), and rows: filter, strategy and value, with a cell per measure.
+    `end` is false between a number's ends. A `below` row gives the effect at one combination or
+    without diverged cases; it is `contrary` if the position RMSE changes in another direction.
+    """
+    study, measures = selection.study, measures_of(selection.study)
+    tables: dict[str, dict[str, Any]] = {}
+    rows: dict[Pairing, list[tuple[Effect, Effect]]] = {}
+    for pair in zip(effects, otherwise, strict=True):
+        rows.setdefault(pair[0].pairing, []).append(pair)
+    for pairing, pairs in rows.items():
+        if pairing.factor not in tables:
+            tables[pairing.factor] = _heading(study, pairs[0][0]) | {
+                "measures": [measure.title for measure in measures],
+                "rows": [],
+            }
+        found = [effect for effect, _ in pairs]
+        cells = [
+            (
+                _label(study, found[0]),
+                {e.measure.score: _cell(e, e.finding, e.untouched) for e in found},
+                False,
+            )
+        ]
+        cells += _apart(found)
+        changed = {
+            less.measure.score: _cell(less, less.finding, less.untouched)
+            for effect, less in pairs
+            if not effect.untouched and direction(less.finding) != direction(effect.finding)
+        }
+        cells += [("without diverged cases", changed, POSITION in changed)] if changed else []
+        tables[pairing.factor]["rows"] += [
+            {
+                "label": name,
+                "strategy": pairing.strategy,
+                "end": pairing.end,
+                "below": below > 0,
+                "contrary": contrary,
+                "cells": [by_score.get(measure.score) for measure in measures],
+            }
+            for below, (name, by_score, contrary) in enumerate(cells)
+        ]
+    for cell in (c for t in tables.values() for row in t["rows"] for c in row["cells"] if c):
+        if 1 < cell["n"] < len(study.worlds):
+            cell["text"] += f" ({cell['n']} of {len(study.worlds)} worlds)"
+    return list(tables.values())
+
+
+def _heading(study: Study, effect: Effect) -> dict[str, Any]:
+    """Return name, title and meaning of the table of an effect."""
+    pairing, variable = effect.pairing, variable_of(study, effect)
+    if variable is None:
+        title = "Strategies" if pairing.factor == STRATEGY else "Filters"
+        return {"name": pairing.factor, "title": title, "meaning": "", "varied": False}
+    ends = f", {pairing.after} instead of {pairing.before}" * (len(variable.words) == 2)
+    if variable.numbers is not None:
+        ends = f", from {pairing.before} to {variable.words[0 if variable.base else -1]}"
+    if two_sided(variable):
+        ends = f", against {pairing.before}"
+    title = with_article(variable) + ends
+    return {
+        "name": variable.name,
+        "title": title[0].upper() + title[1:] if title.startswith("the ") else title,
+        "meaning": variable.meaning,
+        "varied": True,
+    }
+
+
+def _label(study: Study, effect: Effect) -> str:
+    """Return the name of an effect's row."""
+    pairing, variable = effect.pairing, variable_of(study, effect)
+    titles = filter_titles(study)
+    if variable is None:
+        whose = titles.get(pairing.filter, f"{pairing.strategy} sensing")
+        return f"{whose}: {pairing.after} instead of {pairing.before}"
+    whose = f"{pairing.strategy} {titles[pairing.filter]}"
+    if effect.measure.over:
+        whose = f"gain of {whose} over {effect.measure.over}"
+    if variable.numbers is not None and not two_sided(variable):
+        return whose if pairing.end else f"{whose}, to {pairing.after}"
+    if len(variable.words) == 2:
+        return whose
+    return f"{whose}: {pairing.after} instead of {pairing.before}"
+
+
+def _apart(effects: Sequence[Effect]) -> list[tuple[str, dict[str, Any], bool]]:
+    """Return rows of single combinations: all if few, otherwise opposite effects.
+
+    `effects`: of one pairing in every measure. Returns: label, cells by score, and whether the
+    effect on the position RMSE is opposite.
+    """
+    rows = []
+    for i, name in enumerate(effects[0].pairing.names if effects[0].apart else ()):
+        opposite = any(
+            direction(e.apart[i]) and direction(e.apart[i]) != direction(e.finding)
+            for e in effects
+            if e.measure.score == POSITION
+        )
+        if len(effects[0].apart) <= MAX_COMBINATIONS or opposite:
+            cells = {e.measure.score: _cell(e, e.apart[i]) for e in effects}
+            rows.append((f"at {name}", cells, opposite))
+    return rows
+
+
+def _cell(effect: Effect, finding: Finding, untouched: bool = False) -> dict[str, Any]:
+    """Return the text and interval of a finding on an effect."""
+    measure = effect.measure
+    cell = {"shown": direction(finding) != 0, "n": finding.n, "interval": ""}
+    if untouched:
+        return cell | {"text": "same"}
+    if finding.n < 2:
+        return cell | {"text": "?"}
+    low, high = finding.family
+    if measure.ratio:
+        mean, low, high = np.exp(np.clip([finding.mean, low, high], -700.0, 700.0)).tolist()
+        text, ends = f"× {three_digits(mean)}", interval((low, high), "")
+    else:
+        text = "+" * (finding.mean > 0.0) + amount(finding.mean, measure.unit)
+        ends = interval((low, high), measure.unit)
+    return cell | {"text": text, "interval": ends if finding.std > 0.0 else "in every world"}
+
+
+def case_rows(selection: Selection) -> list[dict[str, Any]]:
+    """Return a row of numbers for each case, as in ``summary.json``.
+
+    A row has filter, strategy, values of the variables, number of worlds, mean and standard
+    deviation of each measure (of NEES geometric mean and factor), the means of further scores,
+    the multiple of the bound, and the share of diverged trials.
+    """
+    study, rows = selection.study, []
+    for way, trials in study.trials.items():
+        for column, i in enumerate(own_cases(trials).tolist()):
+            cell = (*way, i)
+            row: dict[str, Any] = {
+                "filter": way[0],
+                "strategy": way[1],
+                "at": case_name(study, way, i),
+            }
+            for measure in measures_of(study):
+                (sample,) = samples(selection, measure.score, [cell])
+                row["n"] = row.get("n", len(sample))
+                row[measure.score] = _moments(sample, ratio=measure.ratio)
+            for name in shown_in("cases"):
+                (sample,) = samples(selection, name, [cell])
+                row[name] = float(np.mean(sample)) if len(sample) else None
+            row["times_the_bound"] = times_the_bound(selection, cell)
+            row["diverged"] = float(np.mean(trials.diverged[:, column]))
+            rows.append(row)
+    return rows
+
+
+def _moments(sample: np.ndarray, *, ratio: bool) -> list[float] | None:
+    """Return mean and standard deviation; of a ratio geometric mean and factor."""
+    if ratio:
+        sample = np.log(sample[sample > 0.0])
+    if len(sample) == 0:
+        return None
+    mean, std = mean_std(sample)
+    return [float(np.exp(mean)), float(np.exp(std))] if ratio else [mean, std]
+
+
+def exclusion_rows(study: Study) -> list[dict[str, Any]]:
+    """Return the excluded worlds and trials of each filter.
+
+    A row has finished worlds, worlds with a diverged or failed case, the paper's count, diverged
+    trials per strategy, failed trials, and the NEES limit; None for unknown limits and counts.
+    """
+    rows = []
+    for name in filter_titles(study):
+        ways = {strategy: t for (other, strategy), t in study.trials.items() if other == name}
+        rows.append(
+            {
+                "filter": name,
+                "limit": CATALOGUE[name].nees_limit if name in CATALOGUE else None,
+                "worlds": len(study.worlds),
+                "excluded": int(np.sum(lost_worlds(study, name))),
+                "paper": EXCLUDED.get(name),
+                "paper_worlds": WORLDS,
+                "diverged": {way: int(np.sum(t.diverged & ~t.failed)) for way, t in ways.items()},
+                "trials": {way: int(t.failed.size) for way, t in ways.items()},
+                "failed": int(sum(np.sum(t.failed) for t in ways.values())),
+            }
+        )
+    return rows
+
+
+def not_the_papers(study: Study) -> list[dict[str, Any]]:
+    """Return the settings, strategies and filters that differ from the plan `paper`.
+
+    Returns: name, value here and value of the paper. Seed and number of worlds are ignored.
+    """
+    paper = read_plan(find_plan("paper"))
+    theirs = _asked(paper.config, paper.grid) | {
+        "strategies": sorted(paper.strategies),
+        "filters": sorted(paper.filters),
+    }
+    ours = _asked(study.config, study.grid) | {
+        "strategies": sorted({strategy for _, strategy in study.trials}),
+        "filters": sorted({name for name, _ in study.trials}),
+    }
+    return [
+        {"setting": name, "here": ours[name], "paper": value}
+        for name, value in theirs.items()
+        if ours[name] != value
+    ]
+
+
+def not_the_papers_line(rows: list[dict[str, Any]]) -> str:
+    """Format the rows of `not_the_papers` in a line; empty without rows.
+
+    Examples
+    --------
+    >>> not_the_papers_line([{"setting": "scenario.steps", "here": 200, "paper": 1500}])
+    "Not the paper's study: scenario.steps 200 (paper 1500)"
+    """
+    parts = [f"{r['setting']} {_worded(r['here'])} (paper {_worded(r['paper'])})" for r in rows]
+    return f"Not the paper's study: {', '.join(parts)}" if parts else ""
+
+
+def _asked(config: Config, grid: Mapping[str, Sequence[Any]]) -> dict[str, Any]:
+    """Return every setting except the seed by its dotted name, with all values of the grid."""
+    asked: dict[str, Any] = {}
+    table = config.model_dump(mode="json")
+    for key in known_settings():
+        value: Any = table
+        for part in key:
+            value = value[part]
+        asked[".".join(key)] = value
+    asked |= {".".join(key): value for key, value in derived(config).items()}
+    del asked["seed"]
+    varied = {name: setting_variable(name, values).given for name, values in grid.items()}
+    return asked | {RADIUS: [asked[RADIUS]]} | {name: [*given] for name, given in varied.items()}
+
+
+def _worded(value: Any) -> str:
+    """Write a setting's value, a long list by its ends."""
+    if isinstance(value, list):
+        if len(value) > 3:
+            return f"{len(value)} values from {_worded(value[0])} to {_worded(value[-1])}"
+        *first, last = map(_worded, value)
+        return f"{', '.join(first)} and {last}" if first else last
+    return f"{value:.12g}" if isinstance(value, float) else str(value)
+
+
+def table_ii_rows(selection: Selection) -> list[dict[str, Any]]:
+    """Return the rows of Table II: the paper's means and deviations, and ours.
+
+    None if the study has no such case. With FastSLAM 2.0 `full` counts the particle of highest
+    weight and `full_mean` is the weighted mean over the particles.
+    """
+    rows = []
+    for printed in TABLE_II:
+        cell = cell_of(selection.study, printed)
+        row: dict[str, Any] = {
+            "filter": printed.filter,
+            "beamwidth": row_name(printed),
+            "paper_full": list(printed.full),
+            "paper_total": list(printed.total),
+        }
+        for kind in ("full", "total", "full_mean"):
+            count = f"landmarks_{kind}"
+            sample = np.empty(0) if cell is None else samples(selection, count, [cell])[0]
+            row["n"] = len(sample)
+            row[kind] = list(mean_std(sample)) if len(sample) else None
+        rows.append(row)
+    return rows
+
+
+def consistency_rows(selection: Selection) -> list[dict[str, Any]]:
+    """Return the consistency of each case.
+
+    A row has the case, the number of worlds, the time means of ANEES, of a consistent filter's and
+    of its 95 % bounds, the shares of time inside and above them, and its `anees_departure`.
+
+    Bradley & Abaid, Eqs. (24) and (25).
+    """
+    rows, study = [], selection.study
+    for (name, strategy), trials in study.trials.items():
+        for i, number in enumerate(own_cases(trials).tolist()):
+            counts = kept(selection, [(name, strategy, number)])
+            frames = np.isfinite(trials.consistent[0, i])
+            nees = trials.nees[:, i, frames]
+            counts &= np.all(np.isfinite(nees), axis=1)
+            if not counts.any() or not nees.shape[1]:
+                continue
+            mean = anees(nees[counts])
+            expected, variance = trials.consistent[:, i, frames]
+            low, high = anees_bounds_about(expected, variance, int(counts.sum()))
+            width = width_name(float(study.beamwidth[number]))
+            rows.append(
+                {
+                    "filter": name,
+                    "strategy": strategy,
+                    "beamwidth": None if strategy == "passive" else width,
+                    "at": case_name(study, (name, strategy), number),
+                    "n": int(counts.sum()),
+                    "anees": float(np.mean(mean)),
+                    "expected": float(np.mean(expected)),
+                    "bounds": [float(np.mean(low)), float(np.mean(high))],
+                    "inside": float(np.mean((mean >= low) & (mean <= high))),
+                    "above": float(np.mean(mean > high)),
+                    "departure": float(anees_departure(mean, expected)),
+                }
+            )
+    return rows
+
+
+def by_strategy(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
+    """Average `consistency_rows` over the combinations."""
+    groups: dict[tuple[str, str], list[dict[str, Any]]] = {}
+    for row in rows:
+        groups.setdefault((row["filter"], row["strategy"]), []).append(row)
+    keys = ("anees", "expected", "inside", "above", "departure")
+    return [
+        {"filter": name, "strategy": strategy, "n": min(row["n"] for row in group)}
+        | {key: float(np.mean([row[key] for row in group])) for key in keys}
+        for (name, strategy), group in groups.items()
+    ]

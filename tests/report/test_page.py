@@ -1,0 +1,381 @@
+"""The report as files: the same bytes, whole, closed, and harmless whatever a study holds."""
+
+import csv
+import json
+import re
+import shutil
+from dataclasses import replace
+from html.parser import HTMLParser
+
+import numpy as np
+import polars as pl
+import pytest
+
+from pipistrelle.__main__ import main
+from pipistrelle.config import InputError
+from pipistrelle.experiments.studies.plan import cases_of, find_plan, read_plan
+from pipistrelle.experiments.studies.world import TABLES, done_worlds, with_sums, world_file
+from pipistrelle.files import LOG, REPORT, RESULTS, OwnFiles
+from pipistrelle.report.claims import TABLE_II
+from pipistrelle.report.page import write_report
+from pipistrelle.report.study import RULES, Failure, read_study
+from pipistrelle.report.variables import setting_variable
+from pipistrelle.settings import from_flags
+from report.drawing import draw_only
+from report.invented import STRATEGIES, invent, narrowed, with_third, write_store
+
+FIGURES = [
+    "anees_ekf", "anees_fastslam", "example_map", "gain", "heading_rmse", "landmarks", "map_rmse",
+    "map_rmse_aligned", "piston", "position_rmse", "position_rmse_aligned", "table_ii",
+]  # fmt: skip
+BAD = "<script>alert('a')</script>\"'&"
+
+
+class Reader(HTMLParser):
+    """Collect elements and check that they close in order."""
+
+    VOID = frozenset({"meta", "link", "input", "br", "img"})
+
+    def __init__(self):
+        super().__init__()
+        self.open, self.found = [], []
+
+    def handle_starttag(self, tag, attrs):
+        self.found.append((tag, dict(attrs)))
+        if tag not in self.VOID:
+            self.open.append(tag)
+
+    def handle_startendtag(self, tag, attrs):
+        self.found.append((tag, dict(attrs)))
+
+    def handle_endtag(self, tag):
+        assert self.open.pop() == tag
+
+    def of(self, tag):
+        return [attrs for found, attrs in self.found if found == tag]
+
+
+def read(folder):
+    reader = Reader()
+    reader.feed((folder / "index.html").read_text(encoding="utf-8"))
+    assert reader.open == []
+    return reader
+
+
+@pytest.fixture(scope="module")
+def store(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("report") / "store"
+    write_store(folder, invent(6), iterations=115, failed=((1, 4),))
+    return folder
+
+
+@pytest.fixture(scope="module")
+def reported(store):
+    """What `pipistrelle report` writes of a partial study with a failed trial."""
+    assert main(["report", str(store), "--quiet"]) == 0
+    return store / "report"
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory):
+    """The page of a study of two worlds, all there are, without its figures for paper."""
+    folder = tmp_path_factory.mktemp("whole")
+    with pytest.MonkeyPatch.context() as patch:
+        draw_only(patch)
+        write_report(invent(2), folder)
+    return (folder / "index.html").read_text(encoding="utf-8")
+
+
+@pytest.fixture(scope="module")
+def small():
+    """Two worlds at two of their beamwidths: a page that is soon written."""
+    return narrowed(invent(2), [0, 11])
+
+
+@pytest.fixture
+def undrawn(monkeypatch):
+    draw_only(monkeypatch)
+
+
+def test_everything_is_there(reported):
+    assert sorted(path.name for path in reported.iterdir()) == [
+        "SHA256SUMS", "figures", "index.html", "summary.json",
+    ]  # fmt: skip
+    names = sorted(path.name for path in (reported / "figures").iterdir())
+    assert names == sorted(f"{name}.{kind}" for name in FIGURES for kind in ("csv", "pdf", "png"))
+
+
+@pytest.mark.parametrize("name", ["index.html", "summary.json", "figures/gain.csv"])
+def test_a_users_file_in_the_place_of_the_reports_is_refused_by_name(
+    small, tmp_path, undrawn, name
+):
+    site = tmp_path / "site"
+    (site / name).parent.mkdir(parents=True)
+    (site / name).write_text("mine")
+    with pytest.raises(InputError, match="site: is not empty and holds no report of Pipistrelle"):
+        write_report(small, site)
+    assert [path for path in site.rglob("*") if path.is_file()] == [site / name]
+    shutil.rmtree(site)
+    OwnFiles(site, REPORT).replace({"figures/other.png": "an earlier report's"})
+    (site / name).write_text("mine")
+    with pytest.raises(InputError, match=f"{name}: is not Pipistrelle's, so it is not replaced"):
+        write_report(small, site)
+    assert (site / name).read_text() == "mine"
+    assert (site / "figures" / "other.png").exists()
+
+
+def test_a_report_replaces_an_earlier_report(small, tmp_path, undrawn):
+    write_report(small, tmp_path / "report")
+    before = sorted((tmp_path / "report").rglob("*"))
+    (tmp_path / "report" / "notes.txt").write_text("mine")
+    write_report(small, tmp_path / "report")
+    after = sorted((tmp_path / "report").rglob("*"))
+    assert after == sorted([*before, tmp_path / "report" / "notes.txt"])
+
+
+def assert_same_bytes(reported, again, kinds):
+    """Files of some kinds are the same in both folders; there are some."""
+    found = [path for path in sorted(reported.rglob("*")) if path.suffix in kinds]
+    assert {path.suffix for path in found} == kinds
+    for path in found:
+        assert path.read_bytes() == (again / path.relative_to(reported)).read_bytes(), path.name
+
+
+def test_the_same_folder_gives_the_same_page_and_numbers(store, reported, tmp_path, undrawn):
+    write_report(read_study(store), tmp_path)
+    assert_same_bytes(reported, tmp_path, {".html", ".json", ".csv"})
+
+
+@pytest.mark.slow
+def test_the_same_folder_gives_the_same_figures(store, reported, tmp_path):
+    write_report(read_study(store), tmp_path)
+    assert_same_bytes(reported, tmp_path, {".png", ".pdf"})
+
+
+def test_the_page_asks_for_nothing_outside(reported):
+    reader = read(reported)
+    for tag in ("script", "img", "link", "iframe", "use", "image"):
+        for attrs in reader.of(tag):
+            for name in ("src", "href", "xlink:href", "srcset"):
+                assert attrs.get(name, "data:,").startswith("data:")
+    text = (reported / "index.html").read_text(encoding="utf-8")
+    assert re.findall(r"url\(|@import|https?://", text) == []
+
+
+def test_links_lead_to_files_that_are_there_and_to_places_on_the_page(reported):
+    reader = read(reported)
+    places = {attrs.get("id") for _, attrs in reader.found}
+    for attrs in reader.of("a"):
+        target = attrs["href"]
+        if target.startswith("#"):
+            assert target[1:] in places
+        else:
+            assert (reported / target).is_file()
+
+
+def test_identities_are_given_once(reported):
+    given = [attrs["id"] for _, attrs in read(reported).found if "id" in attrs]
+    assert len(given) == len(set(given))
+
+
+def test_the_eight_verdicts_are_on_the_page_and_in_the_summary(reported):
+    summary = json.loads((reported / "summary.json").read_text())
+    sections = [attrs for attrs in read(reported).of("section") if "data-claim" in attrs]
+    assert [int(attrs["data-claim"]) for attrs in sections] == list(range(1, 9))
+    assert [attrs["data-verdict"] for attrs in sections] == [
+        claim["verdict"] for claim in summary["claims"]
+    ]
+    for claim in summary["claims"]:
+        assert claim["verdict"] in ("reproduced", "not-reproduced", "open")
+        assert {"statistic", "interval", "p", "n", "by_exclusion"} <= claim.keys()
+
+
+def test_only_a_partial_study_is_marked_as_partial(reported, whole):
+    text = (reported / "index.html").read_text(encoding="utf-8")
+    assert "6 of 115 worlds are done" in text
+    assert json.loads((reported / "summary.json").read_text())["partial"] is True
+    assert "worlds are done" not in whole
+
+
+def test_one_world_is_not_many(tmp_path, whole, undrawn):
+    write_report(invent(1), tmp_path)
+    one = (tmp_path / "index.html").read_text(encoding="utf-8")
+    for text, words in ((one, "1 world · 50 trials"), (whole, "2 worlds · 100 trials")):
+        assert words in text
+        assert not re.search(r"\b1 worlds", text)
+
+
+def test_few_worlds_have_a_warning(tmp_path, whole, undrawn):
+    warning = "so few worlds may show what others would not"
+    assert warning in whole
+    write_report(invent(20), tmp_path)
+    assert warning not in (tmp_path / "index.html").read_text(encoding="utf-8")
+
+
+def test_all_rules_can_be_looked_at(reported):
+    reader = read(reported)
+    shown = [set(attrs.get("class", "").split()) for attrs in reader.of("div")]
+    for rule in RULES:
+        assert sum({"by-rule", rule} <= names for names in shown) >= 8
+
+
+def test_failed_trials_are_listed_with_their_world(reported):
+    text = (reported / "index.html").read_text(encoding="utf-8")
+    assert "1 failed trials" not in text
+    assert "1 failed trial" in text
+    assert "&lt;script&gt;alert(1)&lt;/script&gt;" in text
+    (failed,) = json.loads((reported / "summary.json").read_text())["failed"]
+    assert failed["iteration"] == 1
+
+
+def strange(study):
+    """The same study with texts that would be markup, as one of a variable of two words."""
+    two = narrowed(study, [0, 1])
+    variable = replace(setting_variable(BAD, [BAD, f"{BAD}2"]), label=BAD, column=BAD, meaning=BAD)
+    failure = Failure(iteration=0, strategy=BAD, filter=BAD, beamwidth_deg=33.0,
+                      settings={BAD: BAD}, error=BAD)  # fmt: skip
+    return replace(two, name=BAD, variables=(variable,), grid={BAD: (BAD,)}, errors=(failure,))
+
+
+def test_no_text_of_a_study_becomes_markup(tmp_path, undrawn):
+    write_report(strange(invent(3)), tmp_path)
+    reader = read(tmp_path)
+    assert len(reader.of("script")) == 1
+    text = (tmp_path / "index.html").read_text(encoding="utf-8")
+    assert text.count("<script>") == 1
+    assert text.count("alert(&#39;a&#39;)") >= 20
+    assert not [a for _, attrs in reader.found for a in attrs if a.startswith("on")]
+
+
+def test_failed_trials_are_counted_over_all_combinations(tmp_path, capsys, undrawn):
+    grid = '"air.relative_humidity" = [0.3, 0.7]\n'
+    plan, _, _ = write_store(tmp_path / "store", invent(1), grid=grid)
+    moist = [c.number for c in cases_of(plan) if c.values["air.relative_humidity"] == 0.7]
+    failed = [(0, moist[0]), (1, moist[5]), (1, moist[-1])]
+    again = tmp_path / "again"
+    write_store(again, invent(2), grid=grid, failed=failed)
+    assert main(["report", str(again)]) == 0
+    printed = capsys.readouterr().out.splitlines()
+    assert printed[0] == "failed: 3 trials; see the page"
+    summary = json.loads((again / "report" / "summary.json").read_text())
+    assert summary["trials_failed"] == 3
+    assert [row["settings"] for row in summary["failed"]] == [{"air.relative_humidity": "0.7"}] * 3
+    text = (again / "report" / "index.html").read_text(encoding="utf-8")
+    assert "3 failed trials" in text
+    assert len(re.findall(r"<h4>World \d, .*, air\.relative_humidity = 0\.7</h4>", text)) == 3
+
+
+def test_the_page_lists_near_its_top_the_settings_that_differ_from_the_papers(tmp_path, undrawn):
+    for flags, there in (({"beacon": {"level_db": 45.0}}, True), ({}, False)):
+        plan = read_plan(find_plan("paper"), from_flags(flags))
+        write_report(replace(invent(2), config=plan.config, grid=plan.grid), tmp_path)
+        ids = [attrs.get("id") for _, attrs in read(tmp_path).found]
+        assert ("departures" in ids) is there
+        if there:
+            assert ids.index("departures") < ids.index("claims")
+
+
+def test_the_summary_is_plain_json_even_of_a_study_that_diverged(tmp_path, undrawn):
+    study = invent(3)
+    for trials in study.trials.values():
+        trials.scores["position_rmse_m"][:] = np.inf
+        trials.nees[0] = np.inf
+        trials.diverged[:] = True
+    write_report(study, tmp_path)
+    text = (tmp_path / "summary.json").read_text()
+    assert "Infinity" not in text
+    assert "NaN" not in text
+    read(tmp_path)
+
+
+def test_a_rule_without_worlds_has_a_note_and_the_others_are_shown(tmp_path, undrawn):
+    study = invent(3)
+    for way, trials in study.trials.items():
+        trials.diverged[:] = way[0] == "ekf"
+    write_report(study, tmp_path)
+    text = (tmp_path / "index.html").read_text(encoding="utf-8")
+    assert text.count("No world is left under this rule.") == 2
+    assert (tmp_path / "figures" / "anees_ekf.csv").read_text().count("none,") > 0
+
+
+def test_table_ii_as_csv_has_the_papers_rows_under_each_rule(reported):
+    with (reported / "figures" / "table_ii.csv").open(newline="") as file:
+        rows = list(csv.DictReader(file))
+    assert len(rows) == len(RULES) * len(TABLE_II)
+    assert [float(row["paper_full"]) for row in rows[:8]] == [row.full[0] for row in TABLE_II]
+    assert rows[0]["exclusion"] == "world"
+    assert float(rows[0]["full_std"]) > 0.0
+
+
+def test_figures_have_their_numbers_under_each_rule(reported):
+    for name in ("position_rmse", "anees_fastslam"):
+        with (reported / "figures" / f"{name}.csv").open(newline="") as file:
+            assert {row["exclusion"] for row in csv.DictReader(file)} == set(RULES)
+
+
+def test_the_command_prints_the_verdicts_and_the_page_last(store, tmp_path, capsys, undrawn):
+    assert main(["report", str(store), "-o", str(tmp_path / "out")]) == 0
+    printed = capsys.readouterr().out.splitlines()
+    assert printed[0] == "partial: 6 of 115 worlds"
+    assert printed[1] == "failed: 1 trial; see the page"
+    assert [line[0] for line in printed[2:-1] if line[0] != " "] == list("12345678")
+    assert printed[-1] == str(tmp_path / "out" / "index.html")
+
+
+def test_a_folder_that_is_no_study_ends_in_a_line(tmp_path, capsys):
+    assert main(["report", str(tmp_path)]) == 2
+    assert "plan.toml" in capsys.readouterr().err
+
+
+def test_a_place_that_cannot_be_written_is_refused(small, tmp_path, undrawn):
+    (tmp_path / "file").write_text("")
+    with pytest.raises(InputError, match="file"):
+        write_report(small, tmp_path / "file" / "deep")
+
+
+def panels_of(folder, figure):
+    text = (folder / "index.html").read_text(encoding="utf-8")
+    start = text.index(f'<figure id="{figure}">')
+    drawn = text[start : text.index("</figure>", start)]
+    return list(dict.fromkeys(re.findall(r'<h4 class="c-\w+">(.*?)</h4>', drawn)))
+
+
+def test_a_third_filter_has_its_panels_rows_and_files(tmp_path, monkeypatch):
+    draw_only(monkeypatch, "Smoother")
+    write_report(with_third(invent(4), "toy_slam.filters:Smoother"), tmp_path)
+    read(tmp_path)
+    titles = ["EKF", "FastSLAM 2.0", "Smoother"]
+    assert panels_of(tmp_path, "position_rmse") == titles
+    assert panels_of(tmp_path, "landmarks") == titles
+    assert panels_of(tmp_path, "gain") == [f"{w}, {t}" for w in ("position", "map") for t in titles]
+    assert panels_of(tmp_path, "anees_toy_slam_filters_Smoother") == list(STRATEGIES)
+    assert len(panels_of(tmp_path, "table_ii")) == 4, "the paper's table is of its two"
+    for kind in ("png", "pdf", "csv"):
+        assert (tmp_path / "figures" / f"anees_toy_slam_filters_Smoother.{kind}").is_file()
+    text = (tmp_path / "index.html").read_text(encoding="utf-8")
+    assert "<td></td><td>2 of 4</td><td></td>" in text, "no limit and no count of the paper's"
+    summary = json.loads((tmp_path / "summary.json").read_text())
+    assert summary["exclusions"][2]["diverged"]["active"] > 0
+    assert [row["filter"] for row in summary["exclusions"]][2] == "toy_slam.filters:Smoother"
+
+
+def test_a_stored_study_of_a_filter_that_is_not_installed_can_be_read(store, tmp_path, undrawn):
+    folder = shutil.copytree(store, tmp_path / "store")
+    plan = read_plan(folder / "plan.toml")
+    for world in done_worlds(folder):
+        paths = {name: world_file(folder, name, world) for name in TABLES}
+        tables = {name: pl.read_parquet(path) for name, path in paths.items()}
+        name = pl.col("filter").replace("fastslam", "no_such_module:Slam")
+        changed = tables | {"trials": tables["trials"].with_columns(name)}
+        paths["trials"].write_bytes(with_sums(changed, plan, world)["trials"])
+    write_report(read_study(folder), tmp_path / "report")
+    assert panels_of(tmp_path / "report", "map_rmse") == ["EKF", "Slam"]
+
+
+def test_a_report_never_takes_the_place_of_results_or_of_a_log(small, tmp_path, undrawn):
+    for kind in (RESULTS, LOG):
+        folder, name = tmp_path / kind.title, kind.names[0]
+        OwnFiles(folder, kind).replace({name: "precious"})
+        with pytest.raises(InputError, match=f"holds {kind.title} of Pipistrelle, which a"):
+            write_report(small, folder)
+        assert (folder / name).read_text() == "precious"
