@@ -1,1 +1,1 @@
-"""The timings: `./dev bench`. Rows of one run are compared with each other, never asserted."""
+"""Benchmarks, run by `./dev bench`: rows of a run are compared with each other, never asserted."""

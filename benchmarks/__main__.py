@@ -1,4 +1,4 @@
-"""Measure everything that was promised, and say what holds: `./dev bench`."""
+"""Run all benchmarks and compare them with their targets: `./dev bench`."""
 
 import sys
 from datetime import UTC, datetime
@@ -18,7 +18,7 @@ from benchmarks.table import Row, grown, read, rows_of, show, write
 
 LATEST, HISTORY = ROOT / "benchmarks" / "latest.json", ROOT / "benchmarks" / "history"
 WORSE = 1.25
-"""A row is named when it grew by more than this factor."""
+"""Factor of growth above which a row is reported."""
 
 Part = Literal["stages", "study", "programs", "peer", "callers", "robot", "growth"]
 app = App(
@@ -45,19 +45,19 @@ def bench(
     Parameters
     ----------
     only
-        Measure these parts alone, and write nothing.
+        Measure only these parts, and write nothing.
     k
-        Time the stages whose names match this expression of pytest's, and do nothing else.
+        Only time the stages whose names match this pytest expression.
     quick
-        Three worlds, and each program once, to try the bench itself; writes nothing.
+        Run three worlds, and each program once, to test the benchmarks; write nothing.
     worlds
-        How many worlds of the study to run, at least 3.
+        Number of worlds of the study, at least 3.
     scaling
-        How cost grows, too.
+        Also measure how cost grows with size.
     save
         Keep a dated copy under benchmarks/history.
     against
-        The file to compare with; without it, the newest one kept.
+        File to compare with; by default the newest in benchmarks/history.
     """
     if k is not None:
         show(list(stages.rows(stages.timed_stages("-k", k))))
@@ -84,7 +84,7 @@ def bench(
 def measured(
     only: tuple[Part, ...], worlds: int, rounds: int, scaling: bool
 ) -> tuple[list[Row], list[float]]:
-    """Measure the chosen parts, one after the other."""
+    """Measure the selected parts in sequence; return their rows and calibration times [s]."""
     parts = {
         "stages": stages.measure,
         "study": lambda: study.measure(worlds),
@@ -108,12 +108,12 @@ def measured(
 
 
 def newest(folder: Path) -> Path | None:
-    """Return the file last kept, if any."""
+    """Return the newest JSON file of a folder, if any."""
     return max(folder.glob("*.json"), default=None)
 
 
 def compare(rows: list[Row], before: list[Row], name: str) -> None:
-    """Say which rows became worse than in another run; a report, not a verdict."""
+    """Print the rows that became worse than in an earlier run."""
     worse = grown(rows, before, WORSE)
     for row, factor in worse:
         told = "kept its promise" if factor == inf else f"was {factor:.2f} times better"

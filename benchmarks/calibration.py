@@ -1,10 +1,10 @@
-"""The yardstick: a kernel that never changes, timed around everything that is compared.
+"""Calibration kernel: a fixed computation, timed before and after every benchmark.
 
-A symmetric matrix of 128 x 128 numbers is updated by an outer product two thousand times: plain
-multiply-adds within the second-level cache, much as a filter's correction does them. A time in
-units of this kernel's is comparable between runs of one kind of machine, however busy.
+A symmetric matrix of 128 x 128 numbers is updated by an outer product two thousand times:
+multiply-adds within the second-level cache, much like an EKF update. A time in units of this
+kernel's can be compared between runs on similar machines, whatever their load.
 
-    python -m benchmarks.calibration     # seconds, on one line
+    python -m benchmarks.calibration     # seconds
 """
 
 import time
@@ -16,12 +16,12 @@ from numba import njit
 
 SIZE, UPDATES = 128, 2000
 ELEMENTS = SIZE * SIZE * UPDATES
-"""Multiply-adds of one round."""
+"""Multiply-adds of a round."""
 
 
 @njit(cache=True, error_model="numpy")
 def _outer_products(matrix, vector, updates):
-    """Subtract an outer product, again and again."""
+    """Subtract outer products of a vector from a matrix."""
     for k in range(updates):
         scale = 1e-3 / (1.0 + k)
         for i in range(vector.size):
@@ -31,7 +31,7 @@ def _outer_products(matrix, vector, updates):
 
 
 def calibrate(clock: Callable[[], float] = time.perf_counter, rounds: int = 41) -> float:
-    """Time the yardstick: the median of some rounds [s]."""
+    """Time the calibration kernel: the median of some rounds [s]."""
     matrix, vector = np.eye(SIZE), np.cos(np.arange(SIZE))
     _outer_products(matrix, vector, 1)
     took = []

@@ -1,10 +1,10 @@
-"""What three callers' sound costs beside one's, and what it cannot cost less.
+"""Cost of simulating three callers relative to one, and its lower bound.
 
 python -m benchmarks.callers WORLDS     # ratio, floor and counts as JSON
 
-Each caller has a tone, so that four are heard in place of two; each echoes from every landmark, and
-an echo is heard at every tone. The floor is what one caller's sound would take if its parts only
-had that much more to do, each by its own count, and all else no more.
+Each caller has a tone, so four tones are simulated instead of two; each echoes from every landmark,
+and an echo is computed at every tone. The floor scales each part of the time with one caller by the
+growth of its count, and keeps the rest.
 """
 
 import json
@@ -31,12 +31,12 @@ TASKS: dict[str, Callable[..., int]] = {
     "filter_blocks": lambda found, *_: found.size,
     "find_calls": lambda found, *_: found.delay.size,
 }
-"""The parts of listening that grow, and how much each has to do."""
+"""Parts of the simulation that grow, with the count of work in each."""
 WORLDS = 9
 
 
 def measure(worlds: int = WORLDS) -> tuple[list[Row], list[float]]:
-    """Time both in turns in a process of its own: the row; no yardstick, for it is a ratio."""
+    """Time both cases in a separate process; return a row, and no calibration times."""
     told = answer("-m", "benchmarks.callers", str(worlds))
     note = f"{told['noise']:.2f} times the noise, {told['echoes']:.2f} times the echoes by tones"
     command, ratio = "./dev bench --only callers", told["ratio"]
@@ -47,7 +47,7 @@ def measure(worlds: int = WORLDS) -> tuple[list[Row], list[float]]:
 
 
 class Sound:
-    """Times and counts of the sound of some worlds."""
+    """Times and counts of the simulated sound of some worlds."""
 
     def __init__(self, tones: tuple[float, ...]) -> None:
         self.tones = tones
@@ -56,7 +56,7 @@ class Sound:
         self.count: Counter[str] = Counter()
 
     def hear(self, seed: int) -> None:
-        """Listen through a world."""
+        """Simulate the scans of a world."""
         callers = tuple(CallerConfig(name=f"at{f:.0f}", frequency=f) for f in self.tones)
         config = Config(seed=seed, callers=callers)
         world, parts = world_of(config), {name: self._timed(name) for name in TASKS}
@@ -67,7 +67,7 @@ class Sound:
             self.seconds.append(time.process_time() - began)
 
     def _timed(self, name: str) -> Callable[..., Any]:
-        """Return a part of listening that keeps its time and its count."""
+        """Wrap a function of the simulation to add up its time and its count."""
         function = getattr(listening, name)
 
         def timed(*arguments: Any, **named: Any) -> Any:
@@ -81,7 +81,7 @@ class Sound:
 
 
 def shares(worlds: int) -> dict[str, float]:
-    """Return the ratio of CPU times, the median over worlds, its floor, and counts."""
+    """Return the median ratio of CPU times over worlds, its floor, and ratios of counts."""
     for tones in (TONES[:1], TONES):
         Sound(tones).hear(0)  # compiles
     one, three = Sound(TONES[:1]), Sound(TONES)

@@ -1,4 +1,4 @@
-"""What a filter's mission cannot do without, counted while it runs: floors are told from it."""
+"""Counts of the operations that a filter needs in a mission, as a lower bound of its time."""
 
 from collections.abc import Sequence
 
@@ -14,9 +14,10 @@ from pipistrelle.experiments.runs.trial import run_trial
 
 
 def covariance_updates(case: Case, drive: Drive, scans: Sequence[Scan], config: Config) -> int:
-    """Count the elements that the corrections of an EKF mission must change.
+    """Count the covariance elements that the updates of an EKF mission must change.
 
-    Half a symmetric matrix, once for a bearing of each member and twice for a bearing with range.
+    An update changes half a symmetric matrix, once for a bearing of each hypothesis and twice for a
+    bearing with range.
     """
     count, before = 0, np.empty(0, dtype=int)
 
@@ -33,13 +34,13 @@ def covariance_updates(case: Case, drive: Drive, scans: Sequence[Scan], config: 
 
 
 def elementary_functions(case: Case, drive: Drive, scans: Sequence[Scan], config: Config) -> int:
-    """Count the elementary functions that the particles of a FastSLAM mission must take.
+    """Count the elementary functions that the particles of a FastSLAM mission must evaluate.
 
-    An arctangent for every look at a member, a logarithm for every likelihood. A landmark with a
-    range is looked at twice, to refine the pose and to correct the member, and weighed once. A
-    bearing takes a third look, to weigh it; a ray's member a fourth, with another likelihood, and
-    five exponentials: for two weights, two shares and whether it stays. A control step turns by a
-    cosine and a sine, and so does the swarm's mean.
+    Each prediction of a hypothesis needs an arctangent, each likelihood a logarithm. A landmark
+    with a range is predicted twice, to refine the pose and to update the landmark, and weighed
+    once. A bearing needs a third prediction, to weigh it; a hypothesis of a ray a fourth, with
+    another likelihood, and five exponentials: for two weights, two shares and the pruning. A
+    control step needs a cosine and a sine, as does the mean of the particles.
     """
     particles = config.fastslam.particles
     count, before = 4 * particles * len(drive.controls), {}

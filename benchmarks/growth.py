@@ -1,4 +1,4 @@
-"""How cost grows: frames with echoes, filters with landmarks, memory with worlds.
+"""Growth of cost: of frames with echoes, of filters with landmarks, of memory with worlds.
 
 python -m benchmarks.growth     # CPU time at several sizes as JSON
 """
@@ -17,7 +17,7 @@ from benchmarks.table import Row
 LANDMARKS = (10, 25, 50, 100, 200)
 MAPPED = (25, 50, 100, 200, 400)
 BEARINGS = 20
-"""Landmarks of the worlds that are heard, and of the EKF's maps; bearings in a frame of the EKF."""
+"""Landmarks of the simulated worlds, and of the EKF's maps; bearings in a frame of the EKF."""
 WORLDS = (2, 6)
 COMMAND = "./dev bench --only growth --scaling"
 ROWS = {
@@ -25,11 +25,11 @@ ROWS = {
     "ekf_growth": ("states", "ekf_s", f"a frame of {BEARINGS} bearings"),
     "fastslam_growth": ("landmarks", "fastslam_s", "a measurement"),
 }
-"""What is drawn against what."""
+"""Size, cost and unit of each row."""
 
 
 def measure() -> tuple[list[Row], list[float]]:
-    """Time growing worlds in a process of their own: the rows."""
+    """Time growing worlds in a separate process; return the rows, and no calibration times."""
     sizes = answer("-m", "benchmarks.growth")["points"]
     rows = [_power(name, sizes) for name in ROWS]
     few, many = (command_slice(worlds, 1).peak / 1e6 for worlds in WORLDS)
@@ -38,9 +38,9 @@ def measure() -> tuple[list[Row], list[float]]:
 
 
 def _power(name: str, points: list[dict[str, float]]) -> Row:
-    """Fit a power of the size to what the three largest cost more than the smallest; name all.
+    """Fit a power law of size to the cost above the smallest; the note lists all costs.
 
-    What every size costs alike would hide the growth. Where the cost falls, the power of it all.
+    Costs that all sizes share would hide the growth. If the cost falls, the power law of the whole.
     """
     abscissa, ordinate, each = ROWS[name]
     x, y = np.array([(p[abscissa], p[ordinate]) for p in points if ordinate in p]).T
@@ -55,7 +55,7 @@ def _power(name: str, points: list[dict[str, float]]) -> Row:
 
 
 def points() -> list[dict[str, float]]:
-    """Time frames, the EKF and FastSLAM in worlds and maps of more and more landmarks."""
+    """Time frames, the EKF and FastSLAM for growing worlds and maps."""
     from pipistrelle.experiments.machine import keep_freed_memory
     from pipistrelle.experiments.runs.compiling import compile_kernels
 
@@ -65,7 +65,7 @@ def points() -> list[dict[str, float]]:
 
 
 def _heard(landmarks: int) -> dict[str, float]:
-    """Time a frame, and a measurement in FastSLAM, in a world of so many landmarks."""
+    """Time a frame, and a measurement in FastSLAM, in a world with a number of landmarks."""
     from benchmarks.worlds import scans_of, some_frames, world_of
     from pipistrelle.config import Config, ScenarioConfig
     from pipistrelle.experiments.hearing.listening import listen
@@ -88,7 +88,7 @@ def _heard(landmarks: int) -> dict[str, float]:
 
 
 def _mapped(landmarks: int) -> dict[str, float]:
-    """Time a frame of bearings to some of the landmarks of a map, four control steps included."""
+    """Time an EKF frame with bearings to some landmarks of a map, including four control steps."""
     from pipistrelle.config import Config
     from pipistrelle.detection.scans import make_scan
     from pipistrelle.estimation.beliefs import Gaussian
@@ -112,7 +112,7 @@ def _mapped(landmarks: int) -> dict[str, float]:
 
 
 def _cpu(rounds: int, task: Callable[..., object], *arguments: object) -> float:
-    """Time a task: the least of some rounds, to which noise only adds [s]."""
+    """Time a task [s]: the minimum of some rounds, as noise only adds."""
     took = []
     for _ in range(rounds + 1):
         began = time.process_time()

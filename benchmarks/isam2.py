@@ -1,19 +1,19 @@
-"""The peers: GTSAM's iSAM2 and its batch optimiser on a mission of the EKF and the smoother.
+"""GTSAM's iSAM2 and batch optimiser on the mission of the EKF and the smoother.
 
     python -m benchmarks.isam2 ROUNDS     # CPU seconds and errors as JSON; needs gtsam
 
-Both are told the same: controls and their noise, labels, bearings with and without range, and how
-uncertain each is. A frame's four steps become one odometry factor, composed beforehand, outside
-the timing. Each measurement is a factor, each frame one incremental update, after which the new
-pose is read. A landmark enters the graph with its first range; a passive one when two of its
-bearings cross at `PARALLAX` or more, where they cross, with all its bearings so far. The peer's
-time is what it spends in its own calls, not in the Python around them, and it is not asked for
-covariances; the times of the EKF and the smoother are those of the whole trials, which have them.
+All receive the same data: controls and their noise, labels, bearings with and without range, and
+standard deviations. The four steps of a frame become a single odometry factor, composed outside the
+timing. Each measurement is a factor, each frame an incremental update, after which the new pose is
+read. A landmark enters the graph with its first range, or, without ranges, at the first crossing of
+two of its bearings at `PARALLAX` or more, with all its bearings so far. GTSAM's time counts its
+calls, without the Python around them and without covariances; the times of the EKF and the smoother
+are whole trials, with covariances.
 
-In a batch all is linearised first at the EKF's poses and map: GTSAM's optimiser by Levenberg and
-Marquardt has the factors of its graph, the smoother what it has heard. GTSAM's goes on
-until the cost falls by less than 1e-7 of it, the smoother until 1e-10 (`chain.CONVERGED`), and its
-time includes the covariance of every pose.
+The batch problems are linearised at the EKF's poses and map: GTSAM's Levenberg-Marquardt optimiser
+has the factors of its graph, the smoother its measurements. GTSAM stops when the relative decrease
+of the cost falls below 1e-7, the smoother below 1e-10 (`chain.CONVERGED`), and the smoother's time
+includes the covariance of every pose.
 """
 
 import json
@@ -42,14 +42,14 @@ from pipistrelle.experiments.runs.heard_world import drive_of
 from pipistrelle.experiments.runs.trial import run_filter, run_trial
 
 PARALLAX = 0.5
-"""Least angle between two bearings that place a landmark [rad]."""
+"""Least angle between two bearings that initialise a landmark [rad]."""
 
 Odometry = list[tuple[np.ndarray, np.ndarray]]
 
 
 @dataclass
 class Graph:
-    """An incremental smoother, and what of a mission has not entered it yet."""
+    """An incremental smoother, and the bearings of landmarks that are not in it yet."""
 
     config: Config
     isam: "gtsam.ISAM2"
@@ -58,13 +58,13 @@ class Graph:
     seconds: float = 0.0
 
     def update(self, factors: "gtsam.NonlinearFactorGraph", values: "gtsam.Values") -> None:
-        """Give the smoother new factors and values, and count the time it takes."""
+        """Add factors and values to the smoother, and add up the time."""
         began = time.process_time()
         self.isam.update(factors, values)
         self.seconds += time.process_time() - began
 
     def pose(self, k: int) -> np.ndarray:
-        """Read the present estimate of a frame's pose, and count the time it takes."""
+        """Read the current estimate of a frame's pose, and add up the time."""
         began = time.process_time()
         pose = self.isam.calculateEstimatePose2(k)
         self.seconds += time.process_time() - began
@@ -72,12 +72,12 @@ class Graph:
 
 
 def landmark_key(label: int) -> int:
-    """Name a landmark in the graph; poses are their frames' numbers."""
+    """Return the graph's key of a landmark; a pose's key is its frame's number."""
     return gtsam.symbol("l", label)
 
 
 def odometry(motion: Motion, drive: Drive, steps: int) -> Odometry:
-    """Compose the steps of each frame: the relative pose, and its covariance in its end's axes."""
+    """Compose the steps of each frame: relative pose, and covariance in the axes of its end."""
     Q, frames = np.diag(np.square(motion.control_std)), []
     dt = np.diff(drive.time)
     for first in range(0, len(drive.controls), steps):
@@ -94,7 +94,7 @@ def odometry(motion: Motion, drive: Drive, steps: int) -> Odometry:
 def smooth(
     config: Config, drive: Drive, frames: Odometry, scans: tuple[Scan, ...]
 ) -> tuple[np.ndarray, Graph]:
-    """Run a mission with GTSAM's defaults: each pose as known at its frame, and the graph."""
+    """Run a mission with GTSAM's defaults; return the online pose of each frame, and the graph."""
     graph = Graph(config=config, isam=gtsam.ISAM2(gtsam.ISAM2Params()))
     factors, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
     start = gtsam.noiseModel.Gaussian.Covariance(drive.start.covariance)
@@ -118,7 +118,7 @@ def smooth(
 
 
 def measure(graph: Graph, factors, values, poses, label: int, bearing: float, distance: float):
-    """Add a measurement's factor, or keep it until its landmark can be placed."""
+    """Add the factor of a measurement, or store it until its landmark can be initialised."""
     k, passive, key = len(poses) - 1, math.isnan(distance), landmark_key(label)
     if label not in graph.mapped:
         place = None if passive else along(poses[k], bearing, distance)
@@ -149,15 +149,15 @@ def add_bearing(graph: Graph, factors, frame: int, key: int, bearing: float) -> 
 
 
 def along(pose: np.ndarray, bearing: float, distance: float) -> np.ndarray:
-    """Return the point at a bearing and a range."""
+    """Return the point at a bearing and a range from a pose."""
     angle = pose[2] + bearing
     return pose[:2] + distance * np.array([math.cos(angle), math.sin(angle)])
 
 
 def crossing(poses: np.ndarray, bearings: list[tuple[int, float]]) -> np.ndarray | None:
-    """Where the newest bearing of a landmark crosses an earlier one, if it does so clearly.
+    """Return the crossing of a landmark's newest bearing with an earlier one; None if too oblique.
 
-    Of the earlier bearings, the one that crosses the most squarely, ahead of both poses.
+    It uses the earlier bearing with the largest angle to the newest, and a crossing ahead of both.
     """
     (k, last), best, place = bearings[-1], math.sin(PARALLAX), None
     angle = poses[k, 2] + last
@@ -185,7 +185,7 @@ def whole_belief(config: Config, drive: Drive, scans: tuple[Scan, ...]) -> Smoot
 
 
 def smooth_at_once(belief: SmootherBelief, track: Track, every: int) -> float:
-    """Solve all that a belief has heard from an EKF's track, and return the time it takes [s]."""
+    """Solve the smoother's batch problem from an EKF's track; return the time [s]."""
     began = time.process_time()
     history, points = belief.history, belief.solution.points
     at = np.ascontiguousarray(track.pose.mean[::every])
@@ -199,7 +199,7 @@ def smooth_at_once(belief: SmootherBelief, track: Track, every: int) -> float:
 
 
 def optimise_at_once(graph: Graph, track: Track, every: int) -> float:
-    """Solve a graph of GTSAM's from an EKF's track, and return the time it takes [s]."""
+    """Solve GTSAM's batch problem from an EKF's track; return the time [s]."""
     factors, values = graph.isam.getFactorsUnsafe(), graph.isam.calculateEstimate()
     for k, pose in enumerate(track.pose.mean[::every]):
         values.update(k, gtsam.Pose2(*pose))
@@ -214,14 +214,14 @@ def optimise_at_once(graph: Graph, track: Track, every: int) -> float:
 
 
 def places_of(track: Track) -> dict[int, np.ndarray]:
-    """Return where a track has placed its landmarks."""
+    """Return the positions of a track's initialised landmarks, by label."""
     sure = placed(track.landmarks)
     labels = track.landmarks.landmark[sure].tolist()
     return dict(zip(labels, track.landmarks.mean[sure], strict=True))
 
 
 def compare(rounds: int) -> dict[str, float]:
-    """Time both on one mission, in turns; errors over the frames [m], CPU time [s]."""
+    """Time all solvers on a mission, alternately: errors over the frames [m], CPU times [s]."""
     config = Config()
     world, scans = world_of(config), scans_of(config, "fused")
     drive, every = drive_of(world, config), config.scenario.steps_per_frame

@@ -1,4 +1,4 @@
-"""What this machine does at best, in the loops that the stages consist of: rates for floors.
+"""Peak rates of this machine in the inner loops of the benchmarks, for their lower bounds.
 
 python -m benchmarks.limits     # a line for each
 """
@@ -18,24 +18,24 @@ NUMBERS, ROUNDS = 4096, 41
 
 
 def multiply_add() -> float:
-    """Time one multiply-add within the second-level cache, at the yardstick's rate [s]."""
+    """Time a multiply-add within the second-level cache, from the calibration kernel [s]."""
     return calibrate(time.process_time) / ELEMENTS
 
 
 def elementary_function() -> float:
-    """Time one of a filter's own elementary functions, the mean of three, in a loop of them [s]."""
+    """Time an elementary function of `arithmetic.elementary`, averaged over three in a loop [s]."""
     x = np.linspace(0.1, 3.0, NUMBERS)
     return _timed(lambda: _functions(x, np.empty_like(x), 100)) / (3 * 100 * NUMBERS)
 
 
 def library_function() -> float:
-    """Time one cosine of the C library, in a loop of them [s]."""
+    """Time a cosine of the C library, in a loop [s]."""
     x = np.linspace(0.1, 3.0, NUMBERS)
     return _timed(lambda: _cosines(x, np.empty_like(x), 10)) / (10 * NUMBERS)
 
 
 def copied_byte(size: int) -> float:
-    """Time a byte of an array of some bytes, read and written by a copy [s]."""
+    """Time the copy of a byte, read and written, in an array of a given size in bytes [s]."""
     source = np.ones(size // 8)
     target, copies = np.empty_like(source), max(20_000_000 // size, 1)
 
@@ -48,7 +48,7 @@ def copied_byte(size: int) -> float:
 
 @njit(cache=True, error_model="numpy")
 def _functions(x, y, times):
-    """Take the three functions of every number, lane by lane, some times."""
+    """Evaluate the three functions of every number, several times."""
     for _ in range(times):
         for i in range(x.size):
             y[i] = arctangent(x[i], 1.0) + exponential(x[i]) + logarithm(x[i])
@@ -56,14 +56,14 @@ def _functions(x, y, times):
 
 @njit(cache=True, error_model="numpy")
 def _cosines(x, y, times):
-    """Take the cosine of every number, some times."""
+    """Evaluate the cosine of every number, several times."""
     for _ in range(times):
         for i in range(x.size):
             y[i] = math.cos(x[i])
 
 
 def _timed(task: Callable[[], None]) -> float:
-    """Time a task: the median of some rounds, after a first one [s]."""
+    """Time a task after a warm-up: the median of some rounds [s]."""
     task()
     took = []
     for _ in range(ROUNDS):

@@ -1,4 +1,4 @@
-"""What a run was measured on, and the processes it is measured in."""
+"""Description of the machine, and separate processes for measurements."""
 
 import json
 import os
@@ -16,7 +16,7 @@ ROOT = Path(__file__).resolve().parents[1]
 
 
 def facts() -> dict[str, Any]:
-    """Name the machine, its load and the versions that matter; no host, no user, no folder."""
+    """Describe the machine, its load and the relevant versions, without names of host or user."""
     return {
         "date": datetime.now(UTC).strftime("%Y-%m-%d %H:%M UTC"),
         "cpu": _processor(),
@@ -33,9 +33,9 @@ def facts() -> dict[str, Any]:
 
 
 def python(*arguments: str, **changes: str) -> str:
-    """Run this interpreter from the repository's root, and return what it prints.
+    """Run this interpreter in the repository's root, and return its output.
 
-    Where it fails, what it printed is told, and the bench ends.
+    If it fails, print the output and exit.
     """
     done = subprocess.run(
         [sys.executable, *arguments],
@@ -50,17 +50,17 @@ def python(*arguments: str, **changes: str) -> str:
 
 
 def answer(*arguments: str) -> dict[str, Any]:
-    """Run this interpreter, and read its last line as JSON."""
+    """Run this interpreter, and parse the last line of its output as JSON."""
     return json.loads(python(*arguments).splitlines()[-1])
 
 
 def yardstick() -> float:
-    """Time the calibration kernel in a process of its own [s]."""
+    """Time the calibration kernel in a separate process [s]."""
     return float(python("-m", "benchmarks.calibration"))
 
 
 class Calibrated:
-    """Times the yardstick on entry and on exit; the mean is there afterwards, in seconds."""
+    """Context that times the calibration kernel on entry and exit; `seconds` is the mean."""
 
     def __enter__(self) -> "Calibrated":
         self._before = yardstick()
@@ -71,7 +71,7 @@ class Calibrated:
 
 
 def _processor() -> str:
-    """Name the processor."""
+    """Return the name of the processor."""
     try:
         lines = Path("/proc/cpuinfo").read_text().splitlines()
         return next(line.split(":")[1].strip() for line in lines if line.startswith("model name"))
@@ -80,7 +80,7 @@ def _processor() -> str:
 
 
 def _memory() -> int:
-    """Return the machine's memory [bytes]; 0 where it cannot be had."""
+    """Return the machine's memory [bytes]; 0 if unknown."""
     try:
         return os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
     except (AttributeError, OSError, ValueError):
@@ -88,7 +88,7 @@ def _memory() -> int:
 
 
 def _version(name: str) -> str | None:
-    """Return the version of a library, if it is there."""
+    """Return the version of a library, if installed."""
     try:
         return version(name)
     except PackageNotFoundError:
@@ -96,7 +96,7 @@ def _version(name: str) -> str | None:
 
 
 def _commit() -> str | None:
-    """Name the commit, and whether the tree holds changes."""
+    """Return the commit's short name, marked if the tree has changes."""
     try:
         told = subprocess.run(
             ["git", "describe", "--always", "--dirty", "--exclude", "*"],

@@ -1,4 +1,4 @@
-"""How much of a study's CPU time is spent in its stages; one worker, in this process.
+"""Share of a study's CPU time outside simulation and filters, with one worker in this process.
 
 python -m benchmarks.overhead WORLDS     # CPU seconds as JSON
 """
@@ -17,7 +17,7 @@ from pipistrelle.experiments.studies.study import run_study
 
 
 def shares(worlds: int) -> dict[str, float]:
-    """CPU time before the first world, and per world: all, in listening, in filters [s]."""
+    """Return CPU times [s]: before the first world, and per world total, listening, filters."""
     listening, listen = 0.0, world.listen
     compile_kernels()
     before = time.process_time()

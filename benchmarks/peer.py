@@ -1,4 +1,4 @@
-"""The EKF and the smoother beside their peers, where these are installed."""
+"""Comparison of the EKF and the smoother with GTSAM, if installed."""
 
 from collections.abc import Iterator
 from importlib.util import find_spec
@@ -16,7 +16,7 @@ MISSING = (
 
 
 def measure(rounds: int) -> tuple[list[Row], list[float]]:
-    """Time both on one mission in one process: the rows, and what the yardstick took [s]."""
+    """Time the solvers on a mission in a separate process; return rows and calibration time [s]."""
     if find_spec("gtsam") is None:
         print(MISSING)
         return [], []

@@ -1,4 +1,4 @@
-"""What a person waits for: the warm run, the help, the first compilation."""
+"""Waiting times of a user: a warm run, the help, and the first compilation."""
 
 import subprocess
 import sys
@@ -35,7 +35,7 @@ COMMAND = "./dev bench --only programs"
 
 
 def measure(rounds: int) -> tuple[list[Row], list[float]]:
-    """Time the programs by the clock: the rows, and what the yardstick took [s]."""
+    """Time the programs by wall clock; return their rows and calibration times [s]."""
     with Calibrated() as around_run:
         run, imports = _run(rounds), median(_wall("-c", LIBRARIES) for _ in range(rounds))
     ours, bare = _helps(2 * rounds + 1)
@@ -70,14 +70,14 @@ def measure(rounds: int) -> tuple[list[Row], list[float]]:
 
 
 def _wall(*arguments: str, **changes: str) -> float:
-    """Time an interpreter by the clock [s]."""
+    """Time an interpreter by wall clock [s]."""
     began = time.perf_counter()
     python(*arguments, **changes)
     return time.perf_counter() - began
 
 
 def _run(rounds: int) -> float:
-    """Time `./dev run --settings paper` when everything is set up and compiled [s]."""
+    """Time `./dev run --settings paper` with everything installed and compiled [s]."""
     took = []
     for _ in range(rounds + 1):
         with TemporaryDirectory() as name:
@@ -98,7 +98,7 @@ def _run(rounds: int) -> float:
 
 
 def _helps(rounds: int) -> tuple[float, float]:
-    """Time our help and a bare program's, in turns [s]."""
+    """Time the help of Pipistrelle and of a minimal program, alternately [s]."""
     pairs = [(_wall("-m", "pipistrelle", "--help"), _wall("-c", BARE)) for _ in range(rounds)]
     ours, bare = zip(*pairs, strict=True)
     return median(ours), median(bare)

@@ -1,4 +1,4 @@
-"""What each row promises, and what the best imaginable value is where it is known beforehand."""
+"""Targets of the benchmarks, and lower bounds known beforehand."""
 
 from typing import Literal
 
@@ -43,10 +43,9 @@ PROMISES: dict[str, tuple[str, float | None, Relation, float | None]] = {
     "fastslam_growth": ("1", None, "<=", None),
     "memory_growth_mb": ("MB", 10.0, "<=", 0.0),
 }
-"""Unit, target, relation and floor by name; a floor that is counted or measured comes with its
-row."""
+"""Unit, target, relation and floor by name; other floors are counted or measured."""
 REQUIRED = tuple(PROMISES)[:13]
-"""The rows of every complete run."""
+"""Rows of every complete run."""
 
 
 def row(
@@ -58,7 +57,7 @@ def row(
     floor: float | None = None,
     note: str = "",
 ) -> Row:
-    """Put a measured value beside what is promised of it."""
+    """Create a row from a measured value, with its unit and target."""
     unit, target, relation, known = PROMISES[name]
     return Row(
         name=name,

@@ -1,4 +1,4 @@
-"""How long a robot's own loop takes for a scan, by `pipistrelle.Slam`, when the map is full.
+"""Latency of a scan in a robot's loop with `pipistrelle.Slam`, for a full map.
 
 python -m benchmarks.robot     # CPU milliseconds as JSON: by estimator and landmarks
 """
@@ -28,11 +28,11 @@ ROBOT = {
 MOTION, CONTROL = Motion(model="unicycle", control_std=(0.05, 0.05)), (0.5, 0.1)
 ESTIMATORS, LANDMARKS = ("ekf", "iekf"), (50, 200, 1000)
 HEARD, SCANS, STEP = 25, 1000, 0.1
-"""Rows of a scan, scans that are timed, and the time from one to the next [s]."""
+"""Measurements per scan, number of timed scans, and time between them [s]."""
 
 
 def measure() -> tuple[list[Row], list[float]]:
-    """Time the loop in a process of its own: the rows, and no yardstick."""
+    """Time the loop in a separate process; return the rows, and no calibration times."""
     told = answer("-m", "benchmarks.robot")
     return [
         row(
@@ -48,7 +48,7 @@ def measure() -> tuple[list[Row], list[float]]:
 
 
 def latencies(name: str, landmarks: int) -> list[float]:
-    """Return the median, the 99th of a hundred, and the worst time of a scan [ms]."""
+    """Return the median, 99th percentile and maximum of the time of a scan [ms]."""
     rng, slam, seconds = np.random.default_rng(0), Slam(ROBOT, filter=name), []
     places = rng.uniform(-20.0, 20.0, (landmarks, 2))
     rounds, pose = -(-landmarks // HEARD), np.zeros(3)
@@ -69,7 +69,7 @@ def latencies(name: str, landmarks: int) -> list[float]:
 def _measured(
     pose: Float[np.ndarray, "3"], places: Float[np.ndarray, "m 2"], rng: np.random.Generator
 ) -> dict[str, Float[np.ndarray, " m"]]:
-    """Return bearings and ranges of places from a pose."""
+    """Return noisy bearings and ranges of positions from a pose."""
     distance, bearing = range_and_bearing(pose, places)
     noise = rng.normal(0.0, 1.0, (2, len(places)))
     return {

@@ -1,4 +1,4 @@
-"""The stages' rows, from what pytest-benchmark wrote."""
+"""Rows of the stages, from the records of pytest-benchmark."""
 
 import json
 from collections.abc import Iterator
@@ -17,7 +17,7 @@ ROWS = {
     "ekf_mission_ms": "test_mission[ekf-fused]",
     "fastslam_mission_ms": "test_mission[fastslam-fused]",
 }
-"""The stage behind each row."""
+"""Benchmark of each row."""
 RATIOS = {
     "iekf_over_ekf": "test_estimator[iekf]",
     "smoother_over_ekf": "test_estimator[smoother]",
@@ -27,18 +27,18 @@ DRIVES = {
     "precise_iekf_m": "test_precise_bearings[iekf]",
     "precise_smoother_m": "test_precise_bearings[smoother]",
 }
-"""The stages that tell a ratio, and an error."""
+"""Benchmarks that give a ratio, and an error."""
 BOTH = "test_listening_to_few_frames_by_samples_and_by_blocks"
 
 
 def measure() -> tuple[list[Row], list[float]]:
-    """Time the stages in a process of their own: their rows, and what the yardstick took [s]."""
+    """Time the stages in a separate process; return their rows and calibration times [s]."""
     stages = timed_stages()
     return list(rows(stages)), [s["extra_info"]["calibration_s"] for s in stages.values()]
 
 
 def timed_stages(*options: str) -> dict[str, Any]:
-    """Time the stages, all or some, print pytest-benchmark's table, return its records by name."""
+    """Time all or some stages, print pytest-benchmark's table, and return its records by name."""
     with TemporaryDirectory() as folder:
         path = Path(folder) / "stages.json"
         print(timed(path, *options))
@@ -46,14 +46,14 @@ def timed_stages(*options: str) -> dict[str, Any]:
 
 
 def timed(path: Path, *options: str) -> str:
-    """Time the stages, write their records to a file, and return pytest-benchmark's own table."""
+    """Time the stages, write their records to a file, and return pytest-benchmark's table."""
     columns = "--benchmark-columns=min,median,max,rounds"
     only = ["--benchmark-only", columns, f"--benchmark-json={path}", "-m", ""]
     return python("-m", "pytest", FILE, *only, *options)
 
 
 def rows(stages: dict[str, Any]) -> Iterator[Row]:
-    """Read the rows of those stages out of pytest-benchmark's records, by name."""
+    """Yield the rows of the stages that pytest-benchmark's records contain."""
     for name, test in ROWS.items():
         if test not in stages:
             continue
@@ -82,5 +82,5 @@ def rows(stages: dict[str, Any]) -> Iterator[Row]:
 
 
 def _command(test: str) -> str:
-    """Say what measures a stage again."""
+    """Return the command that measures a stage again."""
     return f"./dev bench -k '{test.replace('[', ' and ').replace('-', ' and ').rstrip(']')}'"

@@ -1,8 +1,8 @@
-"""The paper's whole study, told from some of its worlds.
+"""Time of the paper's whole study, extrapolated from some of its worlds.
 
-The first worlds, one per worker, carry the start-up; the others tell the rate:
+The first worlds, one per worker, include the start-up; the others give the rate:
 T = t_W + (115 - W) (t_N - t_W) / (N - W), with t_i when the i-th world is done, W workers and N
-worlds. The command itself is run, and the times are those of its files.
+worlds. The times are the modification times of the files that the command writes.
 """
 
 import os
@@ -23,7 +23,7 @@ WORLDS = 115
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Slice:
-    """What a slice of the study took.
+    """Cost of a part of the study.
 
     `seconds` is for all 115 worlds, `peak` [bytes] of the largest process, `disk` [bytes] for all.
     """
@@ -34,14 +34,14 @@ class Slice:
 
 
 def measure(worlds: int) -> tuple[list[Row], list[float]]:
-    """Run a slice by one worker and by two: the rows, and what the yardstick took [s]."""
+    """Run part of the study with one and two workers; return rows and calibration times [s]."""
     with Calibrated() as around_one:
         one, stages = command_slice(worlds, 1), answer("-m", "benchmarks.overhead", str(worlds))
     with Calibrated() as around_two:
         two = command_slice(worlds, 2)
     share = f"{worlds} of {WORLDS} worlds"
     command = f"./dev bench --only study --worlds {worlds}"
-    # stages: CPU seconds per world in listening and filters; everything: what the process took.
+    # stages: CPU seconds per world in listening and filters; whole: all CPU time of the process.
     whole = stages["before"] + WORLDS * stages["world"]
     within = WORLDS * (stages["listening"] + stages["filters"])
     rows = [
@@ -90,7 +90,7 @@ def command_slice(worlds: int, workers: int) -> Slice:
 
 
 def whole_study(done: list[float], workers: int) -> float:
-    """Tell the time of all worlds from when each of some was done, rising [s].
+    """Extrapolate the time of all worlds from the rising finish times of some [s].
 
     >>> whole_study([5.0, 5.0, 7.0, 7.0], 2)
     118.0
@@ -100,7 +100,7 @@ def whole_study(done: list[float], workers: int) -> float:
 
 
 def peak_of(command: list[str]) -> int:
-    """Run a command, and return the peak memory of the largest of its processes [bytes]."""
+    """Run a command, and return the peak memory of its largest process [bytes]."""
     process = subprocess.Popen(command, cwd=ROOT, stdout=subprocess.DEVNULL)
     _, status, usage = os.wait4(process.pid, 0)
     process.returncode = os.waitstatus_to_exitcode(status)

@@ -1,7 +1,7 @@
-"""A run's rows: what was promised, whether it holds, as a table, as a file, against another run.
+"""Rows of the benchmarks with their targets: as a table, as a file, and against another run.
 
-Only the standard library is imported here, so that the process that starts the measured ones
-stays small (a child is charged with its parent's memory) and the documentation can show the file.
+Only the standard library is imported here, so that the process that starts the measured processes
+stays small (a child is charged with its parent's memory) and the documentation can use the file.
 """
 
 import json
@@ -16,7 +16,7 @@ HEADINGS = ("row", "value", "unit", "target", "met", "ratio", "floor")
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Row:
-    """One line of the table.
+    """A line of the table.
 
     Attributes
     ----------
@@ -24,18 +24,18 @@ class Row:
     value : float
     unit : str
     target : float or None
-        None: measured without a promise.
+        None: measured without a target.
     relation : "<=" or ">="
-        What the value must be to the target; without one, which way is better.
+        Required relation of value to target; without a target, the better direction.
     ratio : float or None
         A time in units of the calibration kernel's, measured around it; a row that compares two
-        times of one run is its own ratio; sizes have none.
+        times of a run is its own ratio; sizes have none.
     floor : float or None
-        What the arithmetic, or the row's nature, would allow at best.
+        Best value that the arithmetic, or the row's nature, allows.
     command : str
-        Which measures this row again.
+        Command that measures this row again.
     note : str
-        How to read it.
+        Explanation.
     """
 
     name: str
@@ -50,7 +50,7 @@ class Row:
 
 
 def met(row: Row) -> bool | None:
-    """Whether a row keeps its promise; None where there is none.
+    """Return whether a row meets its target; None without a target.
 
     >>> row = Row(name="help_ratio", value=1.2, unit="1", target=1.4, relation="<=", ratio=1.2,
     ...           floor=1.0, command="")
@@ -63,7 +63,7 @@ def met(row: Row) -> bool | None:
 
 
 def cells(row: Row) -> tuple[str, ...]:
-    """Word a row, a cell for each of the headings."""
+    """Format a row, with a cell for each of the headings."""
     target = "" if row.target is None else f"{row.relation} {number(row.target)}"
     kept = {True: "yes", False: "NO", None: ""}[met(row)]
     quantities = number(row.ratio), number(row.floor)
@@ -71,7 +71,7 @@ def cells(row: Row) -> tuple[str, ...]:
 
 
 def number(value: float | None) -> str:
-    """Word a number in three digits, a large one whole; nothing of none.
+    """Format a number with three digits, from 1000 on as an integer; None gives an empty string.
 
     >>> number(0.12345), number(4321.0), number(None)
     ('0.123', '4321', '')
@@ -82,7 +82,7 @@ def number(value: float | None) -> str:
 
 
 def plain(rows: Sequence[Row]) -> str:
-    """Lay the rows out in lines, for a file or a pipe."""
+    """Format rows as lines of text, for a file or a pipe."""
     lines = [HEADINGS, *(cells(row) for row in rows)]
     widths = [max(len(line[i]) for line in lines) for i in range(len(HEADINGS))]
     return "\n".join(
@@ -95,7 +95,7 @@ def plain(rows: Sequence[Row]) -> str:
 
 
 def markdown(report: dict[str, Any]) -> str:
-    """Lay out a file's rows, notes and machine for the documentation."""
+    """Format the rows, notes and machine of a file as Markdown."""
     rows = rows_of(report)
     lines = ["| " + " | ".join(HEADINGS) + " |", "|---|--:|---|--:|---|--:|--:|"]
     lines += ["| " + " | ".join((f"`{name}`", *rest)) + " |" for name, *rest in map(cells, rows)]
@@ -105,7 +105,7 @@ def markdown(report: dict[str, Any]) -> str:
 
 
 def show(rows: Sequence[Row]) -> None:
-    """Print the rows and their notes: a table on a terminal, plain lines elsewhere."""
+    """Print the rows and their notes: as a table on a terminal, else as plain lines."""
     from rich.console import Console
     from rich.table import Table
 
@@ -124,14 +124,14 @@ def show(rows: Sequence[Row]) -> None:
 
 
 def write(path: Path, machine: dict[str, Any], rows: Sequence[Row]) -> None:
-    """Write a run's machine and rows as JSON."""
+    """Write the machine and rows of a run as JSON."""
     path.parent.mkdir(parents=True, exist_ok=True)
     report = {"machine": machine, "rows": [asdict(row) for row in rows]}
     path.write_text(json.dumps(report, indent=1, allow_nan=False) + "\n", encoding="utf-8")
 
 
 def read(path: Path) -> dict[str, Any]:
-    """Read what `write` wrote."""
+    """Read a file from `write`."""
     return json.loads(path.read_text(encoding="utf-8"))
 
 
@@ -141,11 +141,11 @@ def rows_of(report: dict[str, Any]) -> list[Row]:
 
 
 def grown(now: Sequence[Row], before: Sequence[Row], factor: float) -> list[tuple[str, float]]:
-    """Rows that became worse by more than a factor, and by how much.
+    """Return the rows that became worse by more than a factor, and by how much.
 
-    Ratios are compared where both runs have one, so that a slower or a busier machine is no
-    regression; else the values. Where more is better, the factor is the other way up. Nothing can
-    be some times worse than zero: such a row is infinitely worse when it breaks its promise.
+    Ratios are compared if both runs have them, so that a slower or busier machine is no regression;
+    else the values. For ">=" the factor is inverted. A row whose earlier value is not positive is
+    infinitely worse if it no longer meets its target.
     """
     known = {row.name: row for row in before}
     worse = []

@@ -1,7 +1,7 @@
-"""Timings of the chain's stages, one core each: `./dev bench` reads them into its table.
+"""Timings of the stages of a mission, in CPU time on a single core, for `./dev bench`.
 
-CPU time, which on an idle core is the time on the clock. Each stage is timed between two
-timings of the yardstick; what one round consists of is kept beside it.
+Each stage is timed between two timings of the calibration kernel; the numbers of frames and the
+lower bounds are stored with it.
 """
 
 import time
@@ -32,7 +32,7 @@ pytestmark = pytest.mark.benchmark(timer=time.process_time)
 
 @pytest.fixture(autouse=True)
 def _yardstick(benchmark):
-    """Keep the yardstick's time around a stage [s], and how many frames a round has."""
+    """Store the time of the calibration kernel around a stage [s]."""
     before = calibrate(time.process_time)
     yield
     after = calibrate(time.process_time)
@@ -101,7 +101,7 @@ def test_estimator(benchmark, name):
 
 @pytest.mark.parametrize("name", ["ekf", "iekf", "smoother"])
 def test_precise_bearings(benchmark, name):
-    """Time a drive of 300 looks by bearings good to 0.003 rad; keep its aligned error."""
+    """Time a drive of 300 scans with bearings of 0.003 rad; store its aligned error."""
     drive, scans = turn_and_drive(1)
     config = Config(
         filter=FilterConfig(gate=0.999), rays=RayConfig(range_bounds=(0.1, 10.0), spacing="auto")

@@ -1,4 +1,4 @@
-"""What the stages are timed on: the paper's world and short versions of it."""
+"""Worlds of the benchmarks: the paper's world and short versions of it."""
 
 from functools import lru_cache
 
@@ -12,7 +12,7 @@ from pipistrelle.experiments.runs import heard_world
 from pipistrelle.experiments.studies.plan import find_plan, read_plan
 
 RADII = tuple(read_plan(find_plan("paper")).grid["emitter.radius"])
-"""The paper's twelve pistons [m]."""
+"""The paper's twelve piston radii [m]."""
 
 
 def some_frames(world: Scenario, every: int) -> Scenario:
@@ -31,6 +31,6 @@ def some_frames(world: Scenario, every: int) -> Scenario:
 
 @lru_cache
 def scans_of(config: Config, strategy: str) -> tuple[Scan, ...]:
-    """Listen through a whole world and take a strategy's measurements."""
+    """Simulate the scans of a strategy in a whole world."""
     (heard,) = listen(world_of(config), config, (config.emitter.radius,))
     return heard_world.scans_of(heard, strategy, config)

@@ -1,4 +1,4 @@
-"""Bags of ROS 1 and 2, written by rosbags from messages that are told as dictionaries."""
+"""ROS 1 and 2 bags, written by rosbags from messages given as dictionaries."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -25,7 +25,7 @@ BASE, NAME, ARRAY, SEQUENCE = 1, 2, 3, 4
 
 
 def store_of(first=False):
-    """Return the types of ROS 1 or 2, and ours."""
+    """Return the message types of ROS 1 or 2, with Pipistrelle's additional ones."""
     store = get_typestore(Stores.ROS1_NOETIC if first else Stores.ROS2_HUMBLE)
     for name, text in DEFINITIONS.items():
         store.register(get_types_from_msg(text, name))
@@ -33,7 +33,7 @@ def store_of(first=False):
 
 
 def made(store, kind, values):
-    """Make a message; what is not told is zero."""
+    """Create a message from a dictionary; missing fields are zero."""
     fields = store.fielddefs[kind][1]
     return store.types[kind](
         **{name: _field(store, description, values.get(name)) for name, description in fields}
@@ -56,7 +56,7 @@ def _field(store, description, value):
 
 
 def header(time, frame=""):
-    """Tell a header."""
+    """Return the header of a message."""
     whole = int(np.floor(time))
     return {
         "stamp": {"sec": whole, "nanosec": round((time - whole) * 1e9)},
@@ -65,12 +65,12 @@ def header(time, frame=""):
 
 
 def quaternion(heading):
-    """Tell a turn in the plane."""
+    """Convert a heading to a quaternion."""
     return {"z": np.sin(heading / 2.0), "w": np.cos(heading / 2.0)}
 
 
 def odometry(time, x, y, heading, velocity=0.0, rate=0.0, covariance=None, aside=0.0):
-    """Tell where the vehicle is, and how it moves."""
+    """Return an odometry message with pose and velocities."""
     pose = {"position": {"x": x, "y": y}, "orientation": quaternion(heading)}
     twist = {"twist": {"linear": {"x": velocity, "y": aside}, "angular": {"z": rate}}}
     if covariance is not None:
@@ -84,7 +84,7 @@ def odometry(time, x, y, heading, velocity=0.0, rate=0.0, covariance=None, aside
 
 
 def labelled(time, rows, *, at=(0.0, 0.0, 0.0), stds=(0.0, 0.0)):
-    """Tell labels, bearings and ranges, by a sensor at a place on the vehicle."""
+    """Return a message of labels, bearings and ranges from a sensor at a pose on the vehicle."""
     pose = {"position": {"x": at[0], "y": at[1]}, "orientation": quaternion(at[2])}
     return {
         "header": header(time, "base_link"),
@@ -96,17 +96,17 @@ def labelled(time, rows, *, at=(0.0, 0.0, 0.0), stds=(0.0, 0.0)):
 
 
 def static(parent, child, x, y, heading=0.0, q=None):
-    """Tell a transform that does not change."""
+    """Return a message with a constant transform."""
     transform = {"translation": {"x": x, "y": y}, "rotation": q or quaternion(heading)}
     one = {"header": header(0.0, parent), "child_frame_id": child, "transform": transform}
     return {"transforms": [one]}
 
 
 def write_bag(path, messages, *, late=0.0, definitions=True, compression=None):
-    """Write a bag: a .bag, a .mcap or .db3 alone, or a folder with the storage that it names.
+    """Write a bag: a .bag, .mcap or .db3 file, or a folder with the storage that it names.
 
-    `messages`: topic, type, time and what is told, each; they are received `late` [s] later.
-    `definitions`: whether the bag has them, or the text of each topic that has another.
+    `messages` are tuples of topic, type, time and fields, received `late` [s] later. `definitions`
+    is whether the bag contains message definitions, or a dict of texts for topics with other ones.
     """
     path = Path(path)
     if path.suffix == ".bag":
@@ -150,7 +150,7 @@ def _write_first(path, messages, late, compression):
 
 
 def of_log(log, *, topic="/odom", poses=None):
-    """Tell a log as messages: its poses, or its controls, and what it measured."""
+    """Convert a log to messages: its poses or controls, and its measurements."""
     told = []
     for i, time in enumerate(log.time):
         x, y, heading = (0.0, 0.0, 0.0) if poses is None else poses[i]
@@ -163,13 +163,13 @@ def of_log(log, *, topic="/odom", poses=None):
 
 
 def with_ranges(log):
-    """Return a log without the rows of which no range is known, which a `LABELLED` cannot tell."""
+    """Remove measurements without a range from a log, as `LABELLED` cannot represent them."""
     scans = [rows_of(scan, np.isfinite(scan.range)) for scan in log.scans]
     return replace(log, scans=tuple(scan for scan in scans if scan.landmark.size), gate=None)
 
 
 def as_poses(log, stds):
-    """Return a log whose odometry is the poses to which its controls lead, and those poses."""
+    """Convert a log's odometry to noise-free poses from its controls; return both."""
     motion = Motion(model=log.motion, control_std=log.control_std, wheelbase=log.wheelbase)
     poses = [np.zeros(3)]
     for controls, dt in zip(log.controls, log.dt, strict=True):

@@ -1,4 +1,4 @@
-"""What a command line leaves behind: its folder, its table, its tracks."""
+"""Outputs of a command line: its folder, its table, its tracks."""
 
 import json
 import re
@@ -22,7 +22,7 @@ def track(folder, name):
 
 
 def table(printed):
-    """Rows of the closing table: title and cells, eleven characters each."""
+    """Parse the rows of the final table: title and cells, eleven characters each."""
     lines = [line for line in printed.splitlines()[:-1] if line != IN_ONE_WORLD]
     return {line[:32].strip(): re.findall(r".{11}", line[32:]) for line in lines[2:]}
 

@@ -1,6 +1,6 @@
-"""The smoother's problem by dense normal equations: all nodes, all landmarks, one matrix, numpy.
+"""The smoother's problem by dense normal equations over all nodes and landmarks, with numpy.
 
-No Huber's loss, no caller that moves. Steps of Gauss and Newton, all derivatives by differences.
+Without Huber's loss and moving callers. Gauss-Newton steps, with all derivatives by differences.
 """
 
 import numpy as np
@@ -9,7 +9,7 @@ from pipistrelle.geometry import wrap
 
 
 def solved(belief, passes=30):
-    """Return poses (k, 3), landmarks (l, 2) and parameters of the least cost, and it, times two."""
+    """Return poses (k, 3), landmarks (l, 2), parameters of the least cost, and twice the cost."""
     points, nodes = belief.solution.points, belief.history.nodes
     parts = points.at.entries(0), points.spots, points.parameters
     x = np.concatenate([part.ravel() for part in parts])
@@ -25,7 +25,7 @@ def solved(belief, passes=30):
 
 
 def misfits(history, x):
-    """Return all misfits in standard deviations, and their derivatives."""
+    """Return all residuals in standard deviations, and their derivatives."""
     mean, noise, _, rows, _, slopes = map(history.legs.entries, range(6))
     misfit, slope, size = [], [], x.size
     first, asked = 3 * history.nodes, history.calibration
@@ -56,7 +56,7 @@ def misfits(history, x):
 
 
 def hear(history, x, k, m, into):
-    """Add the misfits of one row."""
+    """Add the residuals of a measurement."""
     (slot, caller, *_), numbers = history.rows.entries(0)[m], history.rows.entries(1)[m]
     if history.index[slot] == 0:
         return
@@ -84,7 +84,7 @@ def hear(history, x, k, m, into):
 
 
 def sensor(history, k, pose, parameters):
-    """Return place and heading of the sensor, the sound's scale, and what bearings lean by."""
+    """Return position and heading of the sensor, the scale of ranges, and the skew of bearings."""
     sound, turned, place, clock = history.calibration.sensor - 1
     off, heading, scale, lean = np.zeros(2), pose[2], 1.0, 0.0
     seconds = history.legs.entries(2)[k]
@@ -106,25 +106,25 @@ def sensor(history, k, pose, parameters):
 
 
 def turning(angle):
-    """Return the matrix that turns by an angle."""
+    """Return the rotation matrix of an angle."""
     return np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
 
 
 def by_all(function, x, ends, into):
-    """Add what a function of parts of the unknowns is off, and its derivatives by each."""
+    """Add the residual of a function of several unknowns, and its derivatives by each."""
     values = [x[at] for at in ends]
     by = [(at, differences(function, values, e)) for e, at in enumerate(ends)]
     add(*into, x.size, function(*values), by)
 
 
 def place_of(history, slot):
-    """Return where a slot's place stands among the unknowns."""
+    """Return the indices of a landmark's position among the unknowns."""
     first = 3 * history.nodes + 2 * (history.index[slot] - 1)
     return slice(first, first + 2)
 
 
 def add(misfit, slope, size, r, by):
-    """Append misfits and their derivatives by parts of the unknowns."""
+    """Append residuals and their derivatives by parts of the unknowns."""
     J = np.zeros((len(r), size))
     for at, part in by:
         J[:, at] += part
@@ -133,7 +133,7 @@ def add(misfit, slope, size, r, by):
 
 
 def odometry(ends, mean, k):
-    """Return what a motion is off, as the logarithm of SE(2); of the start, what it is off."""
+    """Return the residual of a motion, or of the start, as the logarithm of SE(2)."""
     a, b = (ends[:3], ends[3:]) if k else (np.zeros(3), ends)
     if k:
         c, s = np.cos(a[2]), np.sin(a[2])
@@ -146,7 +146,7 @@ def odometry(ends, mean, k):
 
 
 def differences(function, values, which, h=1e-3):
-    """Return the derivatives of a function by one of its arguments, to the fourth power of h."""
+    """Return the derivatives of a function by an argument, accurate to the fourth power of h."""
 
     def apart(step):
         there, back = list(values), list(values)

@@ -1,4 +1,4 @@
-"""A made-up recorded drive: turns in place, short drives, precise bearings, near landmarks."""
+"""A synthetic recorded drive: turns in place, short drives, precise bearings, near landmarks."""
 
 import numpy as np
 
@@ -12,14 +12,14 @@ TURTLE = Motion(model="unicycle", control_std=(0.03, 0.03), noise_at_rest=False)
 SIDE = 6.0
 """Half the width of the field [m]."""
 GROSS = 0.5
-"""A gross error of a bearing [rad]."""
+"""Size of a gross error of a bearing [rad]."""
 
 
 def turn_and_drive(seed, looks=300, landmarks=60, bearing_std=0.003, gross=0.0):
-    """Turn in place, drive 0.4 m, look; eight bearings at most, ahead, from 0.2 to 5 m.
+    """Simulate repeated turns in place, drives of 0.4 m, and scans; return the drive and its scans.
 
-    A share of them is off by half a radian besides. Returns the drive, its start exact, and its
-    scans.
+    A scan has at most eight bearings, ahead, at ranges from 0.2 to 5 m; a share `gross` of them has
+    gross errors. The start is exact.
     """
     rng = np.random.default_rng(seed)
     points = field(rng, landmarks)
@@ -46,14 +46,14 @@ def turn_and_drive(seed, looks=300, landmarks=60, bearing_std=0.003, gross=0.0):
 
 
 def with_gross_errors(rng, scan, share):
-    """Turn a share of a scan's bearings by half a radian, to either side."""
+    """Shift a share of a scan's bearings by half a radian, to either side."""
     turned = GROSS * rng.choice([-1.0, 1.0], scan.bearing.size)
     turned *= rng.random(scan.bearing.size) < share
     return with_columns(scan, bearing=wrap(scan.bearing + turned))
 
 
 def field(rng, count):
-    """Points in a square, half a metre apart or more."""
+    """Draw points in a square, at least half a metre from each other."""
     points = []
     while len(points) < count:
         point = rng.uniform(-SIDE, SIDE, 2)
@@ -63,7 +63,7 @@ def field(rng, count):
 
 
 def turn(rng, pose):
-    """An angle to turn by: at random, or back towards the middle."""
+    """Return a turn: random, or back towards the centre."""
     if np.hypot(*pose[:2]) < 0.7 * SIDE:
         return float(rng.uniform(-0.6, 0.6))
     home = wrap(np.arctan2(-pose[1], -pose[0]) - pose[2])

@@ -1,9 +1,9 @@
-"""EKF-SLAM with rays of Gaussians, slowly: written from the equations alone, for comparison.
+"""EKF-SLAM with rays of Gaussians, implemented slowly from the equations, for comparison.
 
-Every Jacobian is a dense matrix over the whole state, every member of a ray is a named block, and
-nothing is shared with the package. Equation numbers are those of Bradley & Abaid; the ray is that
-of Sola (2005). The state is the pose, then the members in the order of their initialisation, then
-(only with `carry_correspondence`) one correspondence per landmark.
+Every Jacobian is a dense matrix over the whole state, every hypothesis of a ray is a named block,
+and no code is shared with the package. Equation numbers are from Bradley & Abaid; the ray is from
+Sola (2005). The state is the pose, then the hypotheses in the order of initialisation, then (only
+with `carry_correspondence`) a correspondence per landmark.
 """
 
 import math
@@ -23,19 +23,19 @@ BELIEVED = 2.0
 
 
 def wrapped(angle):
-    """Angle in [-pi, pi)."""
+    """Wrap an angle to [-pi, pi)."""
     angle = math.remainder(angle, 2 * math.pi)
     return -math.pi if angle == math.pi else angle
 
 
 def moved(motion, pose, control, dt):
-    """Pose after one step, and the Jacobians by pose F (3, 3) and by what is noisy U (3, n)."""
+    """Pose after a step, and Jacobians F (3, 3) by the pose and U (3, n) by the noisy controls."""
     models = {"bicycle": bicycle, "unicycle": unicycle, "poses": poses, "ackermann": car}
     return models[motion.model](motion, pose, control, dt)
 
 
 def noise_of(motion, control):
-    """Covariance of what is noisy in a control step."""
+    """Covariance of the noise in a control step."""
     told = 3 if motion.model == "poses" else 2
     if not motion.noise_at_rest and all(number == 0 for number in control[:told]):
         return np.zeros((told, told))
@@ -60,7 +60,7 @@ def bicycle(motion, pose, control, dt):
 
 
 def unicycle(_, pose, control, dt):
-    """An exact arc: the chord has length v dt sin(a)/a and direction th + a, with a = w dt / 2."""
+    """Exact arc: the chord has length v dt sin(a)/a and direction th + a, with a = w dt / 2."""
     (x, y, th), (v, w) = pose, control
     a = w * dt / 2
     if abs(a) < 1e-4:
@@ -76,9 +76,9 @@ def unicycle(_, pose, control, dt):
 
 
 def car(motion, pose, control, dt):
-    """The unicycle of the middle of the rear axle, and the chain rule.
+    """Unicycle of the centre of the rear axle, by the chain rule.
 
-    The speed is measured h to the left of it: there it is that of the middle less the rate times h.
+    The speed is measured h to the left of the centre, where it is lower by the turn rate times h.
     """
     (v, g), b, h = control, motion.wheelbase, motion.speed_offset
     bend = math.tan(g) / b
@@ -92,7 +92,7 @@ def car(motion, pose, control, dt):
 
 
 def poses(_, pose, control, dt):
-    """The motion itself, in the axes of the pose before: forward f, sideways g, and a turn."""
+    """Relative motion in the axes of the previous pose: forward f, sideways g, and a turn."""
     (x, y, th), (f, g, turn) = pose, control[:3]
     c, s = math.cos(th), math.sin(th)
     after = [x + f * c - g * s, y + f * s + g * c, wrapped(th + turn)]
@@ -102,7 +102,7 @@ def poses(_, pose, control, dt):
 
 
 def ray_ranges(rays):
-    """Ranges of the members of a new ray, Eq. (17)."""
+    """Ranges of the hypotheses of a new ray, Eq. (17)."""
     alpha, beta, (near, far) = rays.ratio, rays.density, rays.range_bounds
     count = 1 + math.ceil(math.log((1 - alpha) / (1 + alpha) * far / near, beta))
     ranges = [near / (1 - alpha)]
@@ -122,7 +122,7 @@ def logarithm(weight):
 
 
 def crossing(z):
-    """Where p + r u crosses p0 + t (q - p0), of z = (p, heading, p0, q, bearing): x, y, r, t."""
+    """Crossing of p + r u and p0 + t (q - p0), for z = (p, heading, p0, q, bearing): x, y, r, t."""
     p, p0, q = z[:2], z[3:5], z[5:7]
     u = np.array([np.cos(z[2] + z[7]), np.sin(z[2] + z[7])])
     r, t = np.linalg.solve(np.column_stack([u, p0 - q]), p0 - p)
@@ -130,16 +130,16 @@ def crossing(z):
 
 
 class SlowEkfSlam:
-    """The filter and its belief in one object that changes in place.
+    """EKF and belief in a single object that changes in place.
 
-    `carry_correspondence` keeps each landmark's number in the state, as Eq. (8) does;
-    `common_bearing_noise` correlates the members of a new ray through the bearing they share;
-    `joseph` updates the covariance by Joseph's form; `robust` lets a measurement that surprises
-    count less, and `tempered` counts how often a range or a bearing did.
+    `carry_correspondence` keeps each landmark's number in the state, as in Eq. (8);
+    `common_bearing_noise` correlates the hypotheses of a new ray through their common bearing;
+    `joseph` updates the covariance by Joseph's form; `robust` reduces the weight of measurements
+    with large innovations, and `tempered` counts them.
     """
 
     turns = 1.0
-    """How much an error of heading turns a bearing."""
+    """Factor by which an error of heading turns a bearing."""
 
     def __init__(
         self,
@@ -169,7 +169,7 @@ class SlowEkfSlam:
     # The state as named blocks
 
     def at(self, block):
-        """Where a block lies in the state."""
+        """Return the indices of a block in the state."""
         sizes = {"pose": 3, "member": 2, "correspondence": 1}
         start = 0
         for other in self.blocks:
@@ -179,7 +179,7 @@ class SlowEkfSlam:
         raise KeyError(block)
 
     def members(self, label):
-        """Members of a landmark, near to far."""
+        """Return the hypotheses of a landmark, near to far."""
         return [block for block in self.blocks if block[:2] == ("member", label)]
 
     def all_members(self):
@@ -187,7 +187,7 @@ class SlowEkfSlam:
 
     @property
     def order(self):
-        """Indices of pose and members, without correspondences."""
+        """Indices of pose and hypotheses, without correspondences."""
         kept = [POSE, *self.all_members()]
         return np.concatenate([np.arange(self.X.size)[self.at(block)] for block in kept])
 
@@ -229,7 +229,7 @@ class SlowEkfSlam:
     # Prediction, Eqs. (5) and (10)
 
     def predict(self, controls, dt):
-        """Advance by the nominal controls; mean and covariance of the pose after each step."""
+        """Predict with the nominal controls; return mean and covariance of the pose per step."""
         means, covariances = [], []
         for control, step in zip(controls, dt, strict=True):
             self.X[:3], F, U = moved(self.motion, self.X[:3], control, step)
@@ -246,7 +246,7 @@ class SlowEkfSlam:
     # Measurement, Eqs. (6), (7) and (11)
 
     def predicted(self, block):
-        """Range and bearing of a member, and their Jacobian (2, n) by the whole state."""
+        """Range and bearing of a hypothesis, and their Jacobian (2, n) by the whole state."""
         (x, y, th), (mx, my) = self.X[self.at(POSE)], self.X[self.at(block)]
         dx, dy = mx - x, my - y
         d = max(math.hypot(dx, dy), NEAREST)
@@ -259,7 +259,7 @@ class SlowEkfSlam:
         return math.dist(self.X[:2], self.X[self.at(block)]) < NEAREST
 
     def innovation(self, block, distance, bearing, inflation=1.0):
-        """Innovation, Jacobian and noise covariance; bearing alone where the distance is NaN."""
+        """Innovation, Jacobian and noise covariance; only of the bearing if the distance is NaN."""
         d, phi, H = self.predicted(block)
         nu = np.array([distance - d, wrapped(bearing - phi)])
         R = np.diag([self.range_variance, self.bearing_variance]) * inflation
@@ -272,7 +272,7 @@ class SlowEkfSlam:
 
     @property
     def precise(self):
-        """Whether bearings are too precise for members as wide as these."""
+        """Return whether bearings are too precise for the width of the rays' hypotheses."""
         linear_to = self.rays.ratio**2 / 2
         return self.rays.spacing == "auto" and math.sqrt(self.bearing_variance) < linear_to
 
@@ -287,7 +287,7 @@ class SlowEkfSlam:
         return np.trace(MP) / 2, np.trace(MP @ MP) / 2
 
     def correct(self, block, nu, H, R, inflation=1.0):
-        """Eq. (11); the correspondence, if carried, is measured without error."""
+        """Update the state, Eq. (11); a carried correspondence is measured without error."""
         if self.carry_correspondence:
             row = np.zeros((1, self.X.size))
             row[0, self.at(("correspondence", block[1]))] = 1
@@ -306,7 +306,7 @@ class SlowEkfSlam:
             self.P = (self.P + self.P.T) / 2
 
     def distance_squared(self, nu, H, R):
-        """Mahalanobis distance of an innovation, squared, and the covariance S."""
+        """Squared Mahalanobis distance of an innovation, and its covariance S."""
         S = H @ self.P @ H.T + R
         return float(nu @ np.linalg.solve(S, nu)), S
 
@@ -327,7 +327,7 @@ class SlowEkfSlam:
         self.X[2] = wrapped(self.X[2])
 
     def measure(self, label, distance, bearing):
-        """Measure a mapped landmark, as surely as it is believed."""
+        """Update with a measurement of a mapped landmark, with robust variances if `robust`."""
         stated = self.range_variance, self.bearing_variance
         if self.robust:
             self.range_variance, self.bearing_variance = self.believed(label, distance, bearing)
@@ -335,7 +335,7 @@ class SlowEkfSlam:
         self.range_variance, self.bearing_variance = stated
 
     def believed(self, label, distance, bearing):
-        """Variances of range and bearing by Huber's rule; a bearing that waits expects nothing."""
+        """Variances of range and bearing by Huber's rule; unchanged in delayed initialization."""
         members, believed = self.members(label), [self.range_variance, self.bearing_variance]
         if self.aggregated[members[0]] == WAITS or any(map(self.too_near, members)):
             return believed
@@ -354,7 +354,7 @@ class SlowEkfSlam:
 
     @staticmethod
     def surprise(nu, expected, variance):
-        """Surprise e, and the variance with which an innovation's becomes S e / k, where e > k."""
+        """Normalised innovation e, and the variance that scales its S to S e / k if e > k."""
         S = expected + variance
         e = abs(nu) / math.sqrt(S)
         return e, S * e / BELIEVED - expected if e > BELIEVED else variance
@@ -382,7 +382,7 @@ class SlowEkfSlam:
             self.correct(block, nu, H, R)
 
     def measure_ray(self, label, bearing):
-        """Weigh every member, share the measurement among them, prune: Eqs. (19) to (21)."""
+        """Weigh all hypotheses, share the measurement among them, prune: Eqs. (19) to (21)."""
         members = self.members(label)
         squared, log_likelihood = [], []
         for block in members:
@@ -410,7 +410,7 @@ class SlowEkfSlam:
         self.prune(label)
 
     def shares(self, members, log_likelihood):
-        """How much of a measurement each member takes; 0 for those that are skipped."""
+        """Return each hypothesis's share of a measurement; 0 for skipped hypotheses."""
         n = self.rays.power
         if self.rays.weights == "instantaneous":
             shares = normalised([n * value for value in log_likelihood])
@@ -430,7 +430,7 @@ class SlowEkfSlam:
             self.merge(left)
 
     def merge(self, members):
-        """Let neighbours that agree become one: moments of the mixture of two states."""
+        """Merge neighbouring hypotheses that agree: moments of the mixture of two states."""
         one = members[0]
         for other in members[1:]:
             i, j = self.at(one), self.at(other)
@@ -453,7 +453,7 @@ class SlowEkfSlam:
             self.drop([other])
 
     def measure_ranged_ray(self, label, distance, bearing):
-        """Give a ray a range, in each of the ways in which the sentence may be read."""
+        """Update a ray with a range, by each interpretation of the paper's sentence."""
         members, ranged = self.members(label), self.rays.ranged
         heaviest = max(members, key=self.aggregated.__getitem__)
         if ranged == "anew":
@@ -472,7 +472,7 @@ class SlowEkfSlam:
             self.range_heaviest(label, heaviest, distance, bearing)
 
     def range_heaviest(self, label, heaviest, distance, bearing):
-        """Give the only member that is kept its range, then measure its bearing."""
+        """Set the range of the only remaining hypothesis, then update it with the bearing."""
         known = math.nan
         if self.rays.ranged == "corrected":
             known = distance
@@ -485,19 +485,19 @@ class SlowEkfSlam:
             self.correct(heaviest, *self.innovation(heaviest, known, bearing))
 
     def renormalised(self, members):
-        """Weights that sum to 1; alike where all have underflown."""
+        """Weights that sum to 1; equal if all have underflowed."""
         total = sum(self.aggregated[block] for block in members)
         return [self.aggregated[b] / total if total > 0 else 1 / len(members) for b in members]
 
     def place_again(self, label, distance, bearing):
-        """Place a partial landmark anew, where its first member stood in the state."""
+        """Initialise a partial landmark again, at the index of its first hypothesis."""
         position = self.blocks.index(self.members(label)[0])
         self.drop(self.members(label))
         self.place(position, label, distance, bearing)
         return self.members(label)[0]
 
     def move(self, block, distance):
-        """Put a member's mean at a range, in the direction in which it is."""
+        """Move a hypothesis's mean to a range, in its current direction."""
         offset = self.X[self.at(block)] - self.X[:2]
         self.X[self.at(block)] = self.X[:2] + distance * offset / np.linalg.norm(offset)
 
@@ -516,7 +516,7 @@ class SlowEkfSlam:
             self.place(end, label, distance, bearing)
 
     def point(self, distance, bearing):
-        """Position at a range and bearing, its Jacobians by the state and by (range, bearing)."""
+        """Position at a range and bearing, with Jacobians by the state and by (range, bearing)."""
         x, y, th = self.X[:3]
         c, s = math.cos(th + bearing), math.sin(th + bearing)
         G = np.zeros((2, self.X.size))
@@ -532,7 +532,7 @@ class SlowEkfSlam:
         self.aggregated[block] = 1.0
 
     def await_crossing(self, position, label, bearing):
-        """Keep where a precise bearing was heard from, and a point that it was heard through."""
+        """Store the origin of a precise bearing, and a point along it."""
         ranges = ray_ranges(self.rays)
         for j, ahead in enumerate((0.0, ranges[len(ranges) // 2])):
             m, G, Gz = self.point(ahead, bearing)
@@ -543,7 +543,7 @@ class SlowEkfSlam:
             self.aggregated[block] = WAITS
 
     def cross(self, label, bearing):
-        """Place a landmark where a bearing crosses the one that waits, if that is sure."""
+        """Initialise a landmark where its bearing crosses the stored bearing, if precise enough."""
         origin, through = self.members(label)
         involved = [0, 1, 2]
         for block in (origin, through):

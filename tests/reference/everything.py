@@ -1,9 +1,9 @@
-"""Everything at once, slowly: the path, the noise on it and the map that fit best, by numpy alone.
+"""Maximum-likelihood path, control noise and map of a whole drive, slowly, with numpy only.
 
-The unknowns are the start, the noise of every control step in its own standard deviations, a slack
-at the end of each leg (from scan to scan), and the landmarks. A leg's poses are linear in its noise
-about its nominal controls, its end and the start by the exponential of SE(2); nothing else is
-linear. Levenberg's steps, dense, till nothing moves.
+The unknowns are the start, the noise of every control step in standard deviations, a slack at the
+end of each segment (between scans), and the landmarks. A segment's poses are linear in its noise
+about the nominal controls; its end and the start use the exponential of SE(2). Dense
+Levenberg-Marquardt steps until convergence.
 """
 
 import numpy as np
@@ -15,13 +15,13 @@ SLACK, BELIEVED = 1e-6, 2.0
 
 
 class Everything:
-    """A drive in legs, what was heard at their ends, and the best there is of it.
+    """A drive in segments with the measurements at their ends, and its optimum.
 
-    `legs` holds pairs of controls (k, 2) and durations (k); `rows` holds, of what was heard, the
-    number of the leg at whose end it was (0: before any), label, bearing, range or NaN, and their
-    deviations; `priors` the place of each landmark and the deviation about it;
-    `excess_paths`, of each, the number of the leg, the labels of landmark and caller, itself and
-    its deviation.
+    `legs` are pairs of controls (k, 2) and durations (k). `rows` are tuples of the number of the
+    segment that ends with the measurement (0: the start), label, bearing, range or NaN, and their
+    standard deviations. `priors` are the position of each landmark and its standard deviation.
+    `excess_paths` are tuples of the number of the segment, the labels of landmark and caller, the
+    excess path and its standard deviation.
     """
 
     def __init__(self, motion, start, legs, rows, priors, *, excess_paths=(), robust=False):
@@ -39,13 +39,13 @@ class Everything:
         self.first, self.size = column, column + self.priors.size
 
     def begun(self, places):
-        """Return the unknowns of a drive without noise among landmarks at these places."""
+        """Return the unknowns of a noise-free drive among landmarks at given positions."""
         x = np.zeros(self.size)
         x[self.first :] = np.ravel([places[one] for one in self.labels])
         return x
 
     def poses(self, x):
-        """Return the start and each step, their derivatives, and which are the ends of legs."""
+        """Return start and poses of all steps, their derivatives, and indices of segment ends."""
         pose, own = shaken(self.start.mean, x[:3])
         mean, slope, ends = [pose], [own @ np.eye(3, self.size)], [0]
         for relative, by_noise, columns in self.legs:
@@ -64,7 +64,7 @@ class Everything:
         return np.array(mean), np.array(slope), ends
 
     def misfits(self, x):
-        """Yield what does not fit, in standard deviations, with its derivatives, part by part."""
+        """Yield the residuals in standard deviations with their derivatives, part by part."""
         root = np.linalg.inv(np.linalg.cholesky(self.start.covariance + SLACK**2 * np.eye(3)))
         yield root @ x[:3], root @ np.eye(3, self.size)
         yield x[3 : self.first], np.eye(self.size)[3 : self.first]
@@ -97,13 +97,13 @@ class Everything:
             yield less * r, less * J
 
     def stacked(self, x):
-        """Return all that does not fit, with its derivatives, and what that loses in all."""
+        """Return all residuals with their derivatives, and the total cost."""
         parts = list(self.misfits(x))
         lost = [huber(r) if self.robust and i > 2 else r @ r for i, (r, _) in enumerate(parts)]
         return (*map(np.concatenate, zip(*parts, strict=True)), sum(lost))
 
     def solved(self, x):
-        """Return what fits best, as it is reached from x."""
+        """Return the optimum that is reached from x."""
         damping, (r, J, lost) = 1e-4, self.stacked(x)
         for _ in range(200):
             step = np.linalg.solve(J.T @ J + damping * np.eye(self.size), -J.T @ r)
@@ -118,7 +118,7 @@ class Everything:
         return x
 
     def told(self, x):
-        """Return path and map there: means and covariances of each pose and of each landmark."""
+        """Return means and covariances of each pose and each landmark at x."""
         _, J, _ = self.stacked(x)
         C = np.linalg.inv(J.T @ J)
         mean, slope, _ = self.poses(x)
@@ -130,25 +130,25 @@ class Everything:
 
 
 def huber(r):
-    """Return what a part loses that is weighted as Huber has it, twice over as squares are."""
-    size = np.linalg.norm(r)  # of r = sqrt(BELIEVED / n) times a misfit of n deviations
+    """Return twice the Huber loss of a part with weighted residuals."""
+    size = np.linalg.norm(r)  # r = sqrt(BELIEVED / n) times a residual of n deviations
     return size**2 if size <= BELIEVED else 2.0 * size**2 - BELIEVED**2
 
 
 def length(way, slope):
-    """Return how long a way is, and its slope."""
+    """Return the length of a vector, and its derivative."""
     far = np.hypot(*way)
     return far, way / far @ slope
 
 
 def turned(heading):
-    """Return what turns x and y."""
+    """Return the rotation matrix of a heading for poses."""
     c, s = np.cos(heading), np.sin(heading)
     return np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
 
 
 def shaken(pose, by, slope=None):
-    """Return a pose moved by the exponential of what is told in the world's axes, and its slope."""
+    """Return a pose moved by the exponential of a twist in the world's axes, and its derivative."""
     back, h = turned(pose[2]), 1e-6
 
     def moved_by(twist):
@@ -163,7 +163,7 @@ def shaken(pose, by, slope=None):
 
 
 def relative_poses(motion, controls, dt):
-    """Return the poses of a leg in the axes of its start, and how its noise moves each."""
+    """Return the poses of a segment in the axes of its start, with derivatives by its noise."""
     pose, slope, poses, slopes = np.zeros(3), np.zeros((3, 2 * len(dt) + 3)), [], []
     for k, (control, step) in enumerate(zip(controls, dt, strict=True)):
         pose, F, U = moved(motion, pose, control, step)

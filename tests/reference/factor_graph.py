@@ -16,7 +16,7 @@ def pose_key(node):
 
 
 def graph_of(belief):
-    """Return the factors of all that a belief has heard, and the points where it is linearised."""
+    """Return the factors of all measurements of a belief, and its linearisation point."""
     history, (believed, place_std, speed_std, walk_std, _) = belief.history, belief.noise
     at, spots = belief.solution.points.at.entries(0), belief.solution.points.spots
     mean, noise, seconds, rows = map(history.legs.entries, range(4))
@@ -57,7 +57,7 @@ def graph_of(belief):
 
 
 def key_of(history, labels, slot, node):
-    """Return the key of a slot's place, seen from a node; None where it is not placed."""
+    """Return the graph's key of a slot's position, as seen from a node; None if not initialised."""
     index, (label, _) = history.index[slot], labels[slot]
     if index > 0:
         return gtsam.symbol("l", label)
@@ -74,7 +74,7 @@ def velocity_key(v, node):
 
 
 def robust(noise, believed):
-    """Return a noise model with Huber's loss, where it is bounded."""
+    """Add Huber's loss to a noise model, if the threshold is finite."""
     if math.isinf(believed):
         return noise
     huber = gtsam.noiseModel.mEstimator.Huber.Create(believed)
@@ -82,7 +82,7 @@ def robust(noise, believed):
 
 
 def direction(node, point, numbers, believed):
-    """Return the factor of a bearing, with its range if there is one."""
+    """Return the factor of a bearing, with its range if measured."""
     bearing, distance, _, across, along = numbers[:5]
     if math.isnan(distance):
         noise = robust(gtsam.noiseModel.Isotropic.Sigma(1, across), believed)
@@ -123,7 +123,7 @@ def add_walk(graph, values, at, caller, stds, history, seconds):
 
 
 def walk(v, k, T, walk_std):
-    """Return the factor of a caller's place and velocity at a node and at the one before."""
+    """Return the motion factor of a caller's position and velocity between successive nodes."""
     stray, sway = walk_std**2 * T + LEAST_STD**2, walk_std**2 * T**3 / 12.0 + LEAST_STD**2
     keys = caller_key(v, k - 1), velocity_key(v, k - 1), caller_key(v, k), velocity_key(v, k)
     eye, by = np.eye(2), []
@@ -142,9 +142,9 @@ def walk(v, k, T, walk_std):
 
 
 def optimum(graph, values, passes=40):
-    """Return the optimum near these values, by steps of Gauss and Newton.
+    """Return the optimum near given values, by Gauss-Newton steps.
 
-    GTSAM's own loops end where the cost no longer falls by what can be told of it.
+    GTSAM's own optimisers stop as soon as the cost no longer decreases within rounding.
     """
     for _ in range(passes):
         values = values.retract(graph.linearize(values).optimize())

@@ -1,9 +1,9 @@
-"""FastSLAM 2.0 with rays, slowly: written from the equations alone, for comparison.
+"""FastSLAM 2.0 with rays, implemented slowly from the equations, for comparison.
 
-One particle at a time, one measurement at a time, one small matrix at a time; nothing is shared
-with the package. Equation numbers are those of Bradley & Abaid. A particle is a pose with its
-covariance since the last sample, a log weight, and a map of labels to members: one for a full
-landmark, several, near to far, for a partial one.
+Particles, measurements and small matrices are handled sequentially; no code is shared with the
+package. Equation numbers are from Bradley & Abaid. A particle is a pose with its covariance since
+the last sample, a log weight, and a map from labels to hypotheses: a single hypothesis for a full
+landmark, several, near to far, for a partial landmark.
 """
 
 import copy
@@ -56,14 +56,14 @@ def log_sum(logs):
 
 
 def kalman(mean, P, nu, H, S):
-    """Correct a Gaussian by an innovation of covariance S."""
+    """Update a Gaussian with an innovation of covariance S."""
     K = P @ H.T @ np.linalg.inv(S)
     P = P - K @ S @ K.T
     return mean + K @ nu, (P + P.T) / 2
 
 
 def semidefinite_cholesky(P):
-    """Lower factor of a covariance of any rank: a pivot that is rounding has a zero column."""
+    """Lower factor of a covariance of any rank; a pivot within rounding gives a zero column."""
     A, L = np.array(P, float), np.zeros_like(P)
     for k in range(len(A)):
         if A[k, k] > 1e-12 * P[k, k]:
@@ -73,7 +73,7 @@ def semidefinite_cholesky(P):
 
 
 def log_density(pose, mean, P):
-    """Log of a Gaussian's density, over the directions in which it has a spread."""
+    """Log of a Gaussian density over the directions with a nonzero variance."""
     L = semidefinite_cholesky(P)
     spread = np.flatnonzero(np.diag(L))
     error = np.array(pose) - mean
@@ -88,10 +88,10 @@ def heaviest(members):
 
 
 class SlowFastSlam:
-    """The filter and its swarm in one object that changes in place.
+    """FastSLAM and its particles in a single object that changes in place.
 
-    `swarm` holds particles, resample_below, mixture and weights. With `forget_proposal` weights at
-    the sample are wrong on purpose: the likelihood alone, whose proposal has already used the
+    `swarm` holds particles, resample_below, mixture and weights. `forget_proposal` makes weights at
+    the sample wrong on purpose: only the likelihood, without the proposal that has already used the
     measurements.
     """
 
@@ -108,14 +108,14 @@ class SlowFastSlam:
         self.gated, self.resampled = 0, 0
         return self
 
-    # What the swarm amounts to
+    # Estimates from all particles
 
     @property
     def weights(self):
         return np.array(normalised([p.log_weight for p in self.particles]))
 
     def estimate(self):
-        """Weighted mean, its heading a direction, and covariance with that since the sample."""
+        """Weighted mean with a circular mean heading, and covariance including the particles'."""
         w = self.weights
         x, y, heading = np.array([p.pose for p in self.particles]).T
         mean = [w @ x, w @ y, math.atan2(w @ np.sin(heading), w @ np.cos(heading))]
@@ -129,7 +129,7 @@ class SlowFastSlam:
     # Prediction, Eqs. (5) and (10), of every particle
 
     def predict(self, controls, dt):
-        """Advance by the nominal controls; mean and covariance of the swarm after each step."""
+        """Predict with the nominal controls; return overall mean and covariance at each step."""
         means, covariances = [], []
         for control, step in zip(controls, dt, strict=True):
             Q = noise_of(self.motion, control)
@@ -144,7 +144,7 @@ class SlowFastSlam:
     # Measurement, Eqs. (6) and (7)
 
     def innovation(self, pose, member, distance, bearing, inflation=1.0):
-        """Innovation, Jacobians by pose and landmark, noise; bearing alone if distance is NaN."""
+        """Innovation, Jacobians by pose and landmark, noise; bearing only if distance is NaN."""
         dx, dy = member.mean - pose[:2]
         d = max(math.hypot(dx, dy), NEAREST)
         nu = np.array([distance - d, wrapped(bearing - (math.atan2(dy, dx) - pose[2]))])
@@ -169,7 +169,7 @@ class SlowFastSlam:
         ]
 
     def log_lambdas(self, p, members, bearing):
-        """Likelihoods as they weigh and share a ray: Eq. (19), or as it is printed."""
+        """Log likelihoods that weigh and share a ray: Eq. (19), or its printed form."""
         if self.rays.likelihood == "normal" or self.settings.mixture == "exact":
             return self.log_likelihoods(p, members, bearing)
         logs = []
@@ -219,7 +219,7 @@ class SlowFastSlam:
                 p.map[label] = new
 
     def inside_any(self, label, distance, bearing):
-        """Whether a particle expected a measurement; what it cannot judge it lets in."""
+        """Return whether a measurement is inside the gate of any particle, or cannot be tested."""
         if self.gate == 1 or label not in self.particles[0].map:
             return True
         bound = chi2.ppf(self.gate, 1 if math.isnan(distance) else 2)
@@ -236,7 +236,7 @@ class SlowFastSlam:
     # Proposal and weight, Eqs. (13) and (14) in Kalman form
 
     def log_weight_gain(self, p, members, distance, bearing):
-        """Log of the likelihood of a measurement given the particle; P = 0 once it is sampled."""
+        """Log likelihood of a measurement given the particle; P = 0 after sampling."""
         if len(members) == 1:
             if self.too_near(p.pose, members[0]):
                 return 0.0
@@ -246,7 +246,7 @@ class SlowFastSlam:
         return log_sum([logarithm(m.weight) + log for m, log in zip(members, logs, strict=True)])
 
     def by_bearing(self, distance):
-        """Whether a ray takes a measurement's bearing alone."""
+        """Return whether a ray uses only a measurement's bearing."""
         return math.isnan(distance) or self.rays.ranged in ("bearing", "others", "moved")
 
     def refine(self, p, members, distance, bearing):
@@ -268,7 +268,7 @@ class SlowFastSlam:
             p.pose, p.P = moments(weights, refined)
 
     def refined(self, p, member, distance, bearing, inflation=1.0):
-        """Mean and covariance of the pose after one measurement."""
+        """Mean and covariance of the pose after a measurement."""
         if self.too_near(p.pose, member):
             return p.pose, p.P
         nu, S, Hx = self.expected(p, member, distance, bearing, inflation)
@@ -282,7 +282,7 @@ class SlowFastSlam:
         )
 
     def shares(self, members, logs):
-        """How much of a measurement each member takes; 0 for those that are skipped."""
+        """Return each hypothesis's share of a measurement; 0 for skipped hypotheses."""
         if self.rays.weights == "instantaneous":
             least = LEAST_SHARE
         else:
@@ -299,7 +299,7 @@ class SlowFastSlam:
         return self.merge(left) if self.rays.merge > 0 else left
 
     def merge(self, members):
-        """Let neighbours that agree become one: mean and covariance of the mixture of two."""
+        """Merge neighbouring hypotheses that agree: mean and covariance of their mixture."""
         merged = members[:1]
         for other in members[1:]:
             one = merged[-1]
@@ -350,7 +350,7 @@ class SlowFastSlam:
         return Member(*kalman(member.mean, member.covariance, nu, H, S), member.weight)
 
     def correct_ray(self, pose, members, bearing):
-        """Weigh every member, share the bearing among them or not, prune."""
+        """Weigh all hypotheses, update each with a share of the bearing or all of it, and prune."""
         logs = self.log_lambdas(Particle(pose, np.zeros((3, 3))), members, bearing)
         shares = self.shares(members, logs)
         if self.settings.mixture == "exact":
@@ -366,7 +366,7 @@ class SlowFastSlam:
     # Initialisation, Eqs. (16) and (17)
 
     def placed(self, pose, distance, bearing, range_variance=None):
-        """A landmark at a range and bearing from a pose that is known."""
+        """Return a landmark at a range and bearing from a known pose."""
         variance = self.range_variance if range_variance is None else range_variance
         c, s = math.cos(pose[2] + bearing), math.sin(pose[2] + bearing)
         Gz = np.array([[c, -distance * s], [s, distance * c]])
@@ -383,7 +383,7 @@ class SlowFastSlam:
     # Resampling, Eq. (15)
 
     def resample(self, uniform):
-        """Stratified: one point in each of as many equal strata as there are particles."""
+        """Stratified resampling: a point in each of as many equal strata as there are particles."""
         weights, count = self.weights, len(self.particles)
         if 1 / sum(weights**2) >= self.settings.resample_below * count:
             return

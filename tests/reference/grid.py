@@ -1,8 +1,8 @@
-"""The exact posterior of a short drive past one landmark, by brute force.
+"""Exact posterior of a short drive past a landmark, by numerical integration.
 
-Everything unknown is a standard normal number: the landmark's range and bearing from the start,
-which is known, and the noise of each control. The posterior of these is integrated on a grid laid
-along its own axes: for a smooth bell a lattice one deviation apart is exact to 1e-8.
+All unknowns are standard normal: the landmark's range and bearing from the known start, and the
+noise of each control. Their posterior is integrated on a lattice along its principal axes: for a
+smooth density a spacing of a standard deviation is accurate to 1e-8.
 """
 
 import math
@@ -27,7 +27,7 @@ def drive(start, controls, dt, stds, wheelbase, noise):
 class Posterior:
     """Moments of the last pose and the landmark given rows (range or NaN, bearing) per pose.
 
-    The first row places the landmark: at its range, or at ranges (mean, std), one case each.
+    The first row initialises the landmark: at its range, or at several ranges (mean, std) in turn.
     """
 
     def __init__(self, start, controls, dt, stds, wheelbase, rows, range_std, bearing_std):
@@ -36,7 +36,7 @@ class Posterior:
         self.unknown = 2 + 2 * len(controls)
 
     def state(self, u, placed):
-        """Last pose and landmark (5, n), and residuals of the later rows in deviations."""
+        """Last pose and landmark (5, n), and residuals of the later rows in standard deviations."""
         poses = drive(*self.drive, u[2:])
         distance = placed[0] + placed[1] * u[0]
         direction = poses[0, 2] + self.rows[0][1] + self.bearing_std * u[1]
@@ -50,11 +50,11 @@ class Posterior:
         return np.concatenate([poses[-1], point]), np.array(residuals)
 
     def objective(self, u, placed):
-        """Everything that is squared and summed, (n): prior and residuals."""
+        """Stacked residuals of prior and measurements, for least squares."""
         return np.concatenate([u, self.state(u, placed)[1]])
 
     def centre(self, placed):
-        """The most probable noises, and the axes of the posterior there."""
+        """The most probable noises, and the principal axes of the posterior there."""
         u, units = np.zeros((self.unknown, 1)), 1e-6 * np.eye(self.unknown)
         for _ in range(20):
             J = self.objective(u + units, placed) - self.objective(u - units, placed)
@@ -63,7 +63,7 @@ class Posterior:
         return u, np.linalg.inv(np.linalg.cholesky(J.T @ J)).T
 
     def one(self, placed):
-        """Evidence, mean (5) and second moment (5, 5) for one placing."""
+        """Evidence, mean (5) and second moment (5, 5) for a single initial range."""
         centre, axes = self.centre(placed)
         nodes = np.arange(-HALF_WIDTH, HALF_WIDTH + 1.0)
         inner = np.array(np.meshgrid(*[nodes] * (self.unknown - 1))).reshape(self.unknown - 1, -1)
@@ -80,7 +80,7 @@ class Posterior:
         return volume * total, volume * mean, volume * second
 
     def moments(self, placings=None):
-        """Mean (5), covariance (5, 5) and each placing's probability, all alike before."""
+        """Mean (5), covariance (5, 5) and probability of each initial range, equal beforehand."""
         placings = placings or [(self.rows[0][0], self.range_std)]
         parts = [self.one(placed) for placed in placings]
         total = sum(part[0] for part in parts)

@@ -1,7 +1,8 @@
 """Right-invariant EKF-SLAM, slowly: every step over the whole state, the group by its matrices.
 
-The error is that of Zhang et al. (2017): rotation, position and landmarks are one matrix of
-SE_n(2), the truth is exp(xi) times the estimate. Rays and bookkeeping are those of the slow EKF.
+The error is the right-invariant error of Zhang et al. (2017): rotation, position and landmarks are
+a matrix of SE_n(2), the truth is exp(xi) times the estimate. Rays and bookkeeping are inherited
+from the slow EKF.
 """
 
 import numpy as np
@@ -13,12 +14,12 @@ QUARTER = np.array([[0.0, -1.0], [1.0, 0.0]])
 
 
 class SlowInvariantEkfSlam(SlowEkfSlam):
-    """The state is kept about the origin of the world; P is that of xi, blocks as in the state."""
+    """Right-invariant EKF about the origin of the world; P is the covariance of xi."""
 
     turns = 0.0
 
     def points(self):
-        """Where the positions lie in the state: the vehicle's, then each member's."""
+        """Indices of the positions in the state: the vehicle's, then each hypothesis's."""
         return [slice(0, 2), *(self.at(block) for block in self.all_members())]
 
     def start(self, mean, covariance):
@@ -27,7 +28,7 @@ class SlowInvariantEkfSlam(SlowEkfSlam):
         return self
 
     def change(self):
-        """Jacobian of xi by the linear error: a position's share is less what heading turns."""
+        """Jacobian of xi by the linear error: each position minus its rotation by the heading."""
         T = np.eye(self.X.size)
         for point in self.points():
             T[point, 2] -= QUARTER @ self.X[point]
@@ -52,13 +53,13 @@ class SlowInvariantEkfSlam(SlowEkfSlam):
         return np.array(means), np.array(covariances)
 
     def predicted(self, block):
-        """No column of heading: the measured point turns about the vehicle, and it with it."""
+        """Range and bearing without a Jacobian by heading, as the point turns with the vehicle."""
         d, bearing, H = SlowEkfSlam.predicted(self, block)
         H[:, 2] = 0.0
         return d, bearing, H
 
     def correct(self, block, nu, H, R, inflation=1.0):
-        """Move the estimate by the exponential of K nu, all positions by one matrix."""
+        """Update the estimate by the exponential of K nu, all positions by a single matrix."""
         S = H @ self.P @ H.T + R
         K = self.P @ H.T @ np.linalg.inv(S)
         xi, points = K @ nu, self.points()
@@ -75,7 +76,7 @@ class SlowInvariantEkfSlam(SlowEkfSlam):
         self.P = (self.P + self.P.T) / 2
 
     def point(self, distance, bearing):
-        """A new point shifts with the vehicle and with noise of its own, and never turns."""
+        """Position at a range and bearing, shifted by vehicle and noise but never turned."""
         at, G, by_measurement = SlowEkfSlam.point(self, distance, bearing)
         G[:, 2] = 0.0
         return at, G, by_measurement

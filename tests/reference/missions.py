@@ -1,4 +1,4 @@
-"""Made-up missions: a noisy drive among landmarks, measured with Gaussian noise."""
+"""Synthetic missions: a noisy drive among landmarks, measured with Gaussian noise."""
 
 from dataclasses import dataclass, replace
 
@@ -27,7 +27,7 @@ SENSING = {
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Mission:
-    """Truth and what a filter is given; landmark i (from 0) bears the label i + 1.
+    """True world of a mission and input of a filter; landmark i (from 0) has the label i + 1.
 
     `path` holds the start, then the pose at each frame; `controls` (frames, 4, c) are nominal.
     """
@@ -56,7 +56,7 @@ def draw_mission(
     """Draw a mission from a Gaussian start.
 
     Landmarks nearer than `reach` and inside the beam give range and bearing, others nearer than
-    `hearing` a bearing only, in a random order; a share of `outliers` has a random bearing.
+    `hearing` a bearing only, in random order; a share of `outliers` has a random bearing.
     """
     path, scans = [rng.multivariate_normal(start.mean, start.covariance)], []
     for frame, nominal in enumerate(controls, start=1):
@@ -81,12 +81,12 @@ def draw_mission(
 
 
 def steady(control, frames):
-    """Return the same control at every step."""
+    """Return the same control for every step."""
     return np.tile(np.asarray(control, float), (frames, STEPS_PER_FRAME, 1))
 
 
 def scattered(rng, count, radius=25.0, spacing=3.0):
-    """Return positions in a disc, at least `spacing` apart."""
+    """Draw positions in a disc, with a minimum distance `spacing`."""
     points = []
     while len(points) < count:
         point = rng.uniform(-radius, radius, size=2)
@@ -102,7 +102,7 @@ def scan_of(*rows, time=0.0):
 
 
 def scan_with(label=(), bearing=(), distance=None, *, time=0.0, **columns):
-    """Return a scan of columns, of the paper's noise; without ranges it is passive."""
+    """Return a scan of columns, with the paper's noise; without ranges it is passive."""
     known = {"range_std": 0.2, "bearing_std": 0.15} | columns
     if distance is not None:
         known["range"] = np.array(distance, float)
@@ -110,12 +110,12 @@ def scan_with(label=(), bearing=(), distance=None, *, time=0.0, **columns):
 
 
 def measured_to(scan, range_std, bearing_std):
-    """Return the scan, measured with this noise whatever it says itself."""
+    """Return a scan with its standard deviations replaced."""
     return with_columns(scan, range_std=range_std, bearing_std=bearing_std)
 
 
 def map_with(label=(), mean=None, covariance=None, weight=None):
-    """Return a map of columns; unless given, every row is certain to be at the origin."""
+    """Return a map of columns; by default every row is a certain position at the origin."""
     h = len(label)
     return Landmarks(
         landmark=np.array(label, dtype=np.int64),
@@ -128,12 +128,12 @@ def map_with(label=(), mean=None, covariance=None, weight=None):
 
 
 def ray_config(**changes):
-    """Return the rays of Table I, with tau and n fixed, whatever value is being fitted."""
+    """Return the rays of Table I, with fixed tau and n even while defaults are being fitted."""
     return RayConfig(**({"prune": 1e-3, "power": 1.0} | changes))
 
 
 def assuming(kind):
-    """Make of a filter one for which all was measured so, whatever a scan says."""
+    """Derive a filter class that assumes the paper's noise for all scans."""
 
     @dataclass(frozen=True, kw_only=True)
     class Assuming(kind):
@@ -151,7 +151,7 @@ KINDS = {kind: assuming(kind) for kind in (EkfSlam, InvariantEkfSlam)}
 
 
 def paper_filter(kind=EkfSlam, **changes):
-    """Return the filter with the paper's settings, but for the changes."""
+    """Return a filter with the paper's settings, except for the changes."""
     return replace(KINDS[kind](motion=BICYCLE, rays=ray_config()), **changes)
 
 

@@ -1,4 +1,4 @@
-"""A drive told in another way: what its controls come to, as motions from pose to pose."""
+"""Drives converted to odometry by relative motions from pose to pose."""
 
 from dataclasses import replace
 
@@ -13,7 +13,7 @@ UPPER = ([0, 0, 0, 1, 1, 2], [0, 1, 2, 1, 2, 2])
 
 
 def as_motions(motion, controls, dt):
-    """Return the motion of each step and its covariance, (k, 9), by the slow reference."""
+    """Return the relative motion of each step and its covariance, (k, 9), by the slow reference."""
     rows = []
     for control, step in zip(controls, dt, strict=True):
         way, _, U = moved(motion, np.zeros(3), control, step)
@@ -22,18 +22,18 @@ def as_motions(motion, controls, dt):
 
 
 def by_poses(motion):
-    """Return the motion model of the same vehicle, told by poses; no motion is as noisy as it."""
+    """Return the motion model of relative poses for a vehicle, with unused default noise."""
     return Motion(model="poses", control_std=(9.0, 8.0, 7.0), noise_at_rest=motion.noise_at_rest)
 
 
 def as_poses(drive):
-    """Return a drive told by poses."""
+    """Convert a drive's controls to relative motions."""
     controls = as_motions(drive.motion, drive.controls, np.diff(drive.time))
     return replace(drive, motion=by_poses(drive.motion), controls=controls)
 
 
 def wandering(rng, count, *, stated, silent=0.3):
-    """Return motions that go ahead, aside and about, some of them none; some say how surely."""
+    """Draw random relative motions, some of them zero; with `stated`, most have covariances."""
     motions = rng.uniform([-0.05, -0.05, -0.3], [0.12, 0.05, 0.3], (count, 3))
     motions[rng.random(count) < 0.3] = 0.0
     if not stated:
@@ -45,7 +45,7 @@ def wandering(rng, count, *, stated, silent=0.3):
 
 
 def poses_file(start, motions, time):
-    """Return ``odometry.csv`` of a drive by poses that begins anywhere."""
+    """Return ``odometry.csv`` with the absolute poses of a drive from an arbitrary start."""
     pose, rows = np.array(start, float), []
     told = np.vstack([np.full(6, np.nan), motions[:, 3:]]) if motions.shape[1] > 3 else None
     for k, stamp in enumerate(time.tolist()):

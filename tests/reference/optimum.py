@@ -1,4 +1,4 @@
-"""The smoother's problem solved from the truth: what it should have found from its own poses."""
+"""The smoother's problem solved from the true poses, for comparison with its solution."""
 
 from dataclasses import replace
 
@@ -9,10 +9,10 @@ from pipistrelle.estimation.smoother.records import Stack
 
 
 def from_the_truth(belief, path, places):
-    """Return the best solution as the belief has it, and as it is reached from the true poses.
+    """Return a smoother's best solution, and the optimum reached from the true poses.
 
     `path` (k + 1, 3) holds the true pose at the start and after each step, `places` the true
-    place of each landmark by its label.
+    position of each landmark by its label.
     """
     history = belief.history
     steps = np.append(0, history.legs.entries(4)[1:, 1])

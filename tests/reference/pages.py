@@ -1,4 +1,4 @@
-"""What a browser says of a page."""
+"""Measurements of a rendered page in a browser."""
 
 _CONTRASTS = """(texts) => {
   const light = ([r, g, b]) => [r, g, b].map((v) => v / 255).map(
@@ -20,8 +20,8 @@ _CONTRASTS = """(texts) => {
 
 
 def contrasts(page, texts):
-    """Contrasts of what is written in the elements of a selector, the least first, and on what.
+    """Return the contrast of text and background of the selected elements, lowest first.
 
-    At least 4.5 to 1 is what the accessibility guidelines ask for.
+    The accessibility guidelines require at least 4.5 to 1.
     """
     return page.evaluate(_CONTRASTS, texts)

@@ -1,4 +1,4 @@
-"""Folders of results made up: missions with paths that are known, studies with numbers that are."""
+"""Synthetic result folders: missions with known paths, studies with known scores."""
 
 import numpy as np
 
@@ -19,7 +19,7 @@ LABELS, PLACES = np.array([1, 2, 3]), np.array([[1.0, 1.0], [5.0, 2.0], [-4.0, 3
 
 
 def loop(phase=0.0):
-    """A round of 7.4 m, its headings through half a turn."""
+    """Return an arc of 6 rad with a radius of 7.4 m, with headings wrapped at pi."""
     angle = phase + np.linspace(0.0, 6.0, STEPS + 1)
     return np.column_stack(
         [7.4 * np.sin(angle), -7.4 * np.cos(angle), np.angle(np.exp(1j * angle))]
@@ -27,7 +27,7 @@ def loop(phase=0.0):
 
 
 def turned(path, angle, shift=(0.0, 0.0)):
-    """A path moved by one rigid motion."""
+    """Apply a rigid motion to a path."""
     c, s = np.cos(angle), np.sin(angle)
     xy = path[:, :2] @ np.array([[c, s], [-s, c]]) + shift
     return np.column_stack([xy, path[:, 2] + angle])
@@ -37,7 +37,7 @@ TRUTH = Truth(time=TIME, path=loop(), landmarks=(LABELS, PLACES))
 
 
 def mission_folder(folder, paths, *, truth=TRUTH, config=None, time=TIME, gated=0):
-    """Write what `run` leaves of estimates, `paths` (k, 3) by strategy and filter."""
+    """Write a result folder as `run` does, with estimates `paths` (k, 3) by strategy and filter."""
     config, scans = config or Config(), (scan_with([1], [0.1], [4.0], time=time[4]),)
     trials = []
     for (strategy, name), path in paths.items():
@@ -58,7 +58,7 @@ def mission_folder(folder, paths, *, truth=TRUTH, config=None, time=TIME, gated=
 
 
 def study_folder(folder, plan, number, worlds=None):
-    """Write a study whose errors are `number(case, world)` [m]: NaN diverged, None failed."""
+    """Write a study with errors `number(case, world)` [m]: NaN for diverged, None for failed."""
     open_store(folder, plan)
     for world in range(plan.iterations) if worlds is None else worlds:
         records = [_record(case, number(case, world)) for case in cases_of(plan)]
@@ -67,7 +67,7 @@ def study_folder(folder, plan, number, worlds=None):
 
 
 def _record(case, value):
-    """What is kept of a trial."""
+    """Return the record of a trial with a given error."""
     nothing = {"steps": np.empty((0, 5)), "landmark": np.empty(0, int), "full": np.empty(0, bool)}
     common = {"case": case, "beamwidth_deg": None if case.strategy == "passive" else 33.0}
     common |= nothing | {"landmark_error": np.empty(0)}

@@ -1,6 +1,6 @@
-"""A caller that moves: made-up missions, and what the slow EKFs do with it.
+"""A moving caller: synthetic missions, and its tracking by the slow EKFs.
 
-How it goes is solved by matrix exponentials (Van Loan, 1978), not by the closed forms.
+Its motion is computed by matrix exponentials (Van Loan, 1978), not by the closed forms.
 """
 
 from dataclasses import replace
@@ -13,15 +13,15 @@ from reference.missions import STEP, STEPS_PER_FRAME
 from reference.timed_ekf import SlowTimedEkfSlam, SlowTimedInvariantEkfSlam
 
 BOAT = 90
-"""Label of the caller that moves."""
+"""Label of the moving caller."""
 FRAME = STEP * STEPS_PER_FRAME
 
 
 def drift(blocks, velocity_of, seconds, walk_std):
-    """Transition and noise of numbers of which some are velocities, x and y each, of others.
+    """Transition and noise of 2D blocks, some of them velocities of others, driven by white noise.
 
-    ``velocity_of``: the velocity's place of each block that has one; the white noise of a velocity
-    is that of all its blocks.
+    ``velocity_of`` gives the index of each block's velocity; blocks with the same velocity share
+    its noise.
     """
     size = 2 * blocks
     A, G = np.zeros((size, size)), np.zeros((size, size))
@@ -35,7 +35,7 @@ def drift(blocks, velocity_of, seconds, walk_std):
 
 
 def wandering(rng, frames, start, speed_std, walk_std):
-    """Return where a caller is at each frame, drawn by the model, as it begins with `start`."""
+    """Draw a caller's position at each frame by its motion model, from `start`."""
     F, Q = drift(2, {0: 1}, FRAME, walk_std)
     L = np.linalg.cholesky(Q + 1e-15 * np.eye(4))
     state, path = np.concatenate([start, speed_std * rng.normal(size=2)]), []
@@ -46,10 +46,10 @@ def wandering(rng, frames, start, speed_std, walk_std):
 
 
 def with_boat(mission, path, rng, *, bearing_std=0.05, excess_path_std=0.05, direct=1.0):
-    """Return the mission with a caller at a place for each frame, and its excess paths.
+    """Return a mission with a caller at a position for each frame, and its excess paths.
 
-    It is heard to call from a bearing, in a share of the frames; what it lights up is what the
-    scan holds.
+    Its bearing is measured in a share `direct` of the frames; it gives an excess path to each
+    landmark of the scan.
     """
     scans = []
     for scan, pose, boat in zip(mission.scans, mission.path[1:], path, strict=True):
@@ -77,7 +77,7 @@ def with_boat(mission, path, rng, *, bearing_std=0.05, excess_path_std=0.05, dir
 
 
 class Roaming:
-    """What a slow EKF does with a caller that moves, besides the rest."""
+    """Tracking of a moving caller, added to a slow EKF."""
 
     speed_std, walk_std = 1.0, 0.2
 

@@ -1,7 +1,7 @@
-"""A stand-in for ROS 2 in Python: a node whose messages are handed to it, and kept as it told them.
+"""Fake ROS 2 in Python: a node that receives given messages and stores the published ones.
 
-Messages are plain objects with the fields that rosbags knows of each type; a field that a type does
-not have is an error, as `rosidl_runtime_py` makes it one.
+Messages are plain objects with the fields that rosbags knows of each type; an unknown field is an
+error, as in `rosidl_runtime_py`.
 """
 
 import sys
@@ -16,7 +16,7 @@ PLAIN = {"string": str, "bool": bool, "float32": float, "float64": float}
 
 
 class Message:
-    """A message with all its fields zero."""
+    """A message with all fields zero."""
 
     def __init__(self, kind):
         self._kind = kind
@@ -57,10 +57,10 @@ def filled(message, fields):
 
 
 class Node:
-    """What `rclpy.node.Node` is to a node that subscribes, publishes and warns."""
+    """Fake `rclpy.node.Node` with subscriptions, publishers and warnings."""
 
     given = MappingProxyType({})
-    """Parameters."""
+    """Parameters of the node."""
 
     def __init__(self, name):
         self.name, self.takes, self.told, self.warned = name, {}, {}, []
@@ -80,14 +80,14 @@ class Node:
 
 
 class Broadcaster:
-    """What `tf2_ros.TransformBroadcaster` is to a node."""
+    """Fake `tf2_ros.TransformBroadcaster`."""
 
     def __init__(self, node):
         self.sendTransform = node.told.setdefault("/tf", []).append
 
 
 def install(monkeypatch, **parameters):
-    """Put the stand-in where ROS would be, with the parameters that a node is started with."""
+    """Install the fake modules of ROS, with the parameters of a node."""
     monkeypatch.setattr(Node, "given", parameters)
     quality = {"QoSProfile": SimpleNamespace}
     for name in ("QoSDurabilityPolicy", "QoSReliabilityPolicy"):

@@ -1,7 +1,7 @@
-"""Recordings of a point source at microphones in a room, by pyroomacoustics: a second opinion.
+"""Recordings of a point source at microphones in a room, by pyroomacoustics, as a second opinion.
 
-Nothing of the package's own propagation is used: spherical waves, images behind the walls, delays
-by windowed sincs, real samples; and all that is known of them is a recording, a folder of files.
+They use no sound propagation of the package: spherical waves, image sources behind the walls,
+windowed-sinc delays, real samples. The package only reads the recordings, as folders of files.
 """
 
 import numpy as np
@@ -15,22 +15,22 @@ from pipistrelle.geometry import wrap
 from reference.sounds import write_beside
 
 RATE, TONE, LENGTH, C = 200_000, 35e3, 2.8e-3, 343.0
-"""Samples in a second; frequency [Hz] and length [s] of the call; speed of sound [m/s]."""
+"""Sample rate [Hz]; frequency [Hz] and duration [s] of the call; speed of sound [m/s]."""
 ROOM, CENTRE = np.array([9.0, 8.0]), np.array([4.2, 3.9])
-"""Size of the room and where the array is in it [m]."""
+"""Size of the room, and position of the array in it [m]."""
 TURN = np.arange(8) * np.pi / 4
 ARM = np.array([-5, -3, -1, 1, 3, 5]) * 0.00175
 ANGLE_LIMIT = np.radians(75.0)
-"""From its normal to this a face is asked: `detection.angle_limit_deg`."""
+"""Largest angle from its normal at which a face is used: `detection.angle_limit_deg`."""
 
 
 def free(places):
-    """Return microphones that hang free."""
+    """Return microphones without faces."""
     return microphones_of([(x, y, 0.0, 0.0, "") for x, y in places])
 
 
 def square():
-    """Return the paper's square with its faces where they are: 25 mm from the centre."""
+    """Return the paper's square with its faces at their true distance of 25 mm from the centre."""
     along, rows = (np.arange(10) - 4.5) * 0.0049, []
     for name, normal in (("front", 0.0), ("left", 0.5), ("back", 1.0), ("right", 1.5)):
         ahead = np.array([np.cos(normal * np.pi), np.sin(normal * np.pi)])
@@ -47,11 +47,11 @@ ARRAYS = {
 
 
 def heard(layout, bearing, distance, *, absorption=None, order=0, seconds=0.0):
-    """Return the samples of every microphone of a call from a place, without noise.
+    """Return each microphone's noise-free samples of a call from a given position.
 
-    A face hears nothing from behind. `absorption`: share of the energy that a wall takes; None:
-    there are no walls; `seconds`: how long is recorded after the call has come. And where the
-    images of the source behind the walls are, the source among them, from the array [m].
+    Faces receive nothing from behind. `absorption` is the share of the energy that a wall absorbs;
+    None means no walls. `seconds` are recorded after the arrival of the call. Also returns the
+    positions of the source and its images, relative to the array [m].
     """
     import pyroomacoustics as pra
 
@@ -76,13 +76,13 @@ def heard(layout, bearing, distance, *, absorption=None, order=0, seconds=0.0):
 
 
 def noise_for(samples, snr_db):
-    """Return the noise with which a microphone has some SNR after the matched filter."""
+    """Return the noise that gives a microphone an SNR [dB] after the matched filter."""
     energy = (samples**2).sum(axis=0)
     return np.sqrt(0.5 * energy[energy > 0.0].mean()) / 10.0 ** (snr_db / 20.0)
 
 
 def record(folder, name, sounds, noise_std, rng):
-    """Write a recording by an array: the vehicle calls where each of some sounds begins."""
+    """Write a recording of an array, with a call of the vehicle at the start of each sound."""
     import soundfile
 
     folder.mkdir(exist_ok=True)
@@ -98,7 +98,7 @@ def record(folder, name, sounds, noise_std, rng):
 
 
 def rows_of(folder, calls):
-    """Hear a recording; return the rows, and which of so many calls each came after."""
+    """Process a recording; return the measurements, and the index of the call before each."""
     rows = pipistrelle.hear(folder).measurements
     assert rows["caller"].is_null().all() or (rows["caller"] == "").all()
     time = np.sort(np.unique(rows["time"]))
@@ -107,14 +107,14 @@ def rows_of(folder, calls):
 
 
 FAR, CUT = 40.0, 0.1
-"""At this distance a face 25 mm from the centre hears from nearly the centre's bearing [m]; the
-vehicle calls so long after the source [s]."""
+"""Distance at which a face 25 mm from the centre has nearly the centre's bearing [m]; delay of the
+vehicle's call after the source's [s]."""
 
 
 def bounds(layout, bearing, snr_db):
-    """Return the Cramer-Rao bounds of bearing [rad] and, of block sums, of delay [s].
+    """Return the Cramer-Rao bounds of bearing [rad] and, for block sums, of delay [s].
 
-    Of the mean of the faces that hear, which is a row.
+    They hold for a measurement, the mean over the faces that receive it.
     """
     across, late, faces = 0.0, 0.0, 0
     for g in range(layout.normal.size):
@@ -130,7 +130,7 @@ def bounds(layout, bearing, snr_db):
 
 
 def anywhere(layout, rng):
-    """Draw a bearing at which chance does not say whether a face is asked."""
+    """Draw a bearing that is clearly inside or outside the angle limit of every face."""
     while True:
         bearing = rng.uniform(-np.pi, np.pi)
         angle = np.abs(wrap(bearing - layout.normal))
@@ -139,10 +139,10 @@ def anywhere(layout, rng):
 
 
 def errors(folder, name, snr_db, places, draws, *, order=slice(None)):
-    """Record a source far away and hear it; return errors of bearing and delay, a row each.
+    """Record and process a distant source; return errors of bearing and delay, a row each.
 
-    In units of their bounds, and of what the rows state, but for the floors. `order`: in which the
-    channels are recorded.
+    The first two are in units of their bounds, the others of the measured standard deviations
+    without their floors. `order` selects the channels.
     """
     layout, rng, truth = scattered(ARRAYS[name]), np.random.default_rng(int(snr_db)), []
 
@@ -155,12 +155,12 @@ def errors(folder, name, snr_db, places, draws, *, order=slice(None)):
     truth = [(anywhere(layout, rng), FAR + rng.uniform(0.0, 0.07)) for _ in range(places)]
     noise_std = noise_for(heard(layout, *truth[0])[0], snr_db)
     rows, call = rows_of(record(folder, name, sounds(), noise_std, rng), places * draws)
-    loudest = np.lexsort((-rows["level_db"].to_numpy(), call))  # noise makes others
+    loudest = np.lexsort((-rows["level_db"].to_numpy(), call))  # others are noise
     rows = rows[loudest[np.unique(call[loudest], return_index=True)[1]]]
     bearing, distance = np.repeat(truth, draws, axis=0).T
     least = np.array([bounds(layout, one, snr_db) for one in bearing]).T
     off = wrap(rows["bearing"].to_numpy() - bearing)
-    late = 2.0 * rows["range"].to_numpy() / C + 0.5 / RATE  # a sample's middle
+    late = 2.0 * rows["range"].to_numpy() / C + 0.5 / RATE  # centre of a sample
     after = late + CUT - distance / C
     off_std = np.sqrt(rows["bearing_std"].to_numpy() ** 2 - BEARING_FLOOR[0] ** 2)
     after_std = np.sqrt(rows["range_std"].to_numpy() ** 2 - RANGE_FLOOR**2) * 2.0 / C

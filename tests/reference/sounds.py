@@ -1,4 +1,4 @@
-"""Sound recordings that are small: a short drive, heard by few microphones."""
+"""Small sound recordings: a short drive, recorded by few microphones."""
 
 from contextlib import redirect_stdout
 from io import StringIO
@@ -57,10 +57,10 @@ def foreign(
     faces=True,
     seed=1,
 ):
-    """Write a recording as another program would: point source, places, delays, by definition.
+    """Write a recording as another program would: point source, positions, delays, by definition.
 
-    Each of sixteen microphones on four sides hears the call itself, and the echo of one point
-    [m], as real sound at its own distance; behind a face nothing, without faces all around.
+    Each of sixteen microphones on four sides records the call itself, and the echo of a point [m],
+    as real sound at its true distance; behind a face nothing, without faces all directions.
     """
     import soundfile
 
@@ -94,9 +94,9 @@ def foreign(
 
 
 def write_beside(folder, frequency, duration, speed, array, calls, *, until):
-    """Write what lies beside the sound: what it is, the array's text, the calls, a vehicle at rest.
+    """Write the other files of a recording: description, array, calls, a vehicle at rest.
 
-    `until` [s]: to when the odometry lasts, or somewhat longer; the sound begins at 10 s.
+    `until` [s] is the minimum end of the odometry; the sound begins at 10 s.
     """
     about = ABOUT.format(frequency=frequency, duration=duration, speed=speed)
     (folder / "recording.toml").write_text(about)
@@ -113,10 +113,10 @@ def _pulse(time, frequency, duration):
 
 
 def swept(folder, late, *, deaf=3e-3, faint=10e-3, period=0.05, rate=96_000, loud=3.0, seed=1):
-    """Write a recording of a sweep by eight microphones in a circle of 2 cm, as others would.
+    """Write another program's recording of a sweep by eight microphones in a circle of 2 cm.
 
-    After each call an echo from ahead comes so late as `late` has it [s], 75 dB over the noise in
-    a beam, and from the left a faint one. Returns the folder, and when each call comes.
+    Each call has an echo from ahead after the delay in `late` [s], 75 dB above the noise of a beam,
+    and a faint echo from the left. Returns the folder, and the time of each call.
     """
     import soundfile
 
@@ -146,7 +146,7 @@ def swept(folder, late, *, deaf=3e-3, faint=10e-3, period=0.05, rate=96_000, lou
 
 
 def _swept(time, duration):
-    """Return a sweep from 36 to 22 kHz at times since its start [s]; its ends fade."""
+    """Return a sweep from 36 to 22 kHz with faded ends, at times since its start [s]."""
     inside, share = (time >= 0.0) & (time < duration), np.clip(time / duration, 0.0, 1.0)
     edge = np.sin(0.5 * np.pi * np.clip(np.minimum(share, 1.0 - share) / 0.1, 0.0, 1.0)) ** 2
     return np.where(inside, edge * np.sin(2.0 * np.pi * (36e3 - 7e3 * share) * time), 0.0)

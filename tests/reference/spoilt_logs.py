@@ -1,4 +1,4 @@
-"""Logs of a made-up drive whose columns are written rightly, or wrongly in one way."""
+"""Logs of a synthetic drive with correct columns, or with a single convention violated."""
 
 import numpy as np
 
@@ -22,11 +22,12 @@ SPOILED = {
     "centimetres": lambda b, r, h: (b, 1e2 * r),
     "kilometres": lambda b, r, h: (b, 1e-3 * r),
 }
-"""How rows are written wrongly, by words that name it; the heading is the true one."""
+"""Wrong conventions of bearing and range, by a phrase that names them; the heading is the true
+one."""
 
 
 def noisy_log(*, turn_rate=0.25, speed=0.5, labels=True, seed=5, spoil=None, clutter=0, steps=240):
-    """A noisy drive among twelve landmarks, a scan of their front half each half second."""
+    """A noisy drive among twelve landmarks, with a scan of the front half every half second."""
     rng = np.random.default_rng(seed)
     middle = 0.25 * steps * STEP * speed
     landmarks = rng.uniform([middle - 6.0, -6.0], [middle + 6.0, 6.0], (12, 2))

@@ -1,4 +1,4 @@
-"""A study that takes a second, its results without their timings, and tasks that do not survive."""
+"""A study that takes a second, its results without their timings, and tasks that are killed."""
 
 import os
 import signal
@@ -31,7 +31,7 @@ filters = ["ekf"]
 steps = 8
 landmarks = 5
 """
-"""One world of two frames, one case in it."""
+"""A world of two frames with a single case."""
 TIMINGS = ("wall_s", "cpu_s")
 
 
@@ -43,7 +43,7 @@ def plan_of(folder, text=SMALL, **given):
 
 
 def results(folder):
-    """All that a study found, but for the time that it took, in one order."""
+    """Return all results of a study, sorted, without run times."""
     study = load_study(Path(folder))
     found = {name: getattr(study, name).collect() for name in TABLES}
     found["trials"] = found["trials"].drop(TIMINGS)
@@ -53,7 +53,7 @@ def results(folder):
 
 
 def assert_same(one, other):
-    """Every value of two studies is the same; not a number equals itself."""
+    """Assert that all values of two studies are equal, with NaN equal to NaN."""
     for name in TABLES:
         assert one[name].schema == other[name].schema
         assert len(one[name]) > 0
@@ -61,27 +61,27 @@ def assert_same(one, other):
 
 
 def contents(folder):
-    """Every file of a folder and what is in it."""
+    """Return the bytes of every file in a folder, by relative path."""
     return {p.relative_to(folder): p.read_bytes() for p in Path(folder).rglob("*") if p.is_file()}
 
 
 def leftovers(folder):
-    """Files that were never put in place."""
+    """Return the temporary files that were never renamed."""
     return sorted(Path(folder).rglob("*.partial"))
 
 
 def fatal(worlds, iteration):
-    """Do a world's work, unless it is one that takes its process with it."""
+    """Compute a world, or kill the process if the world is in `worlds`."""
     if iteration in worlds:
         os.kill(os.getpid(), signal.SIGKILL)
     return [(f"world {iteration}", None)]
 
 
 def lost(iteration):
-    """Record a world that cannot be had."""
+    """Return the failed trial of a world."""
     return [(f"world {iteration}", "lost")]
 
 
 def as_rows(table: pl.DataFrame):
-    """A table's rows as dictionaries."""
+    """Return a table's rows as dictionaries."""
     return table.rows(named=True)

@@ -1,4 +1,4 @@
-"""Swarms to test: FastSLAM 2.0 as the paper sets it, small enough for its slow reference."""
+"""FastSLAM 2.0 filters with the paper's settings, small enough for the slow reference."""
 
 from dataclasses import dataclass, replace
 
@@ -29,9 +29,9 @@ PACKED = ([0, 0, 1, 0, 1, 2], [0, 1, 1, 2, 2, 2])
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Particles:
-    """A belief's particles one by one: what their blocks hold, in the usual arrays.
+    """Particles of a belief, unpacked from its blocks into the usual arrays.
 
-    Poses (p, 3) and (p, 3, 3), counts (p, n), members (p, c, 6): x, y, xx, xy, yy, log weight.
+    Poses (p, 3) and (p, 3, 3), counts (p, n), hypotheses (p, c, 6): x, y, xx, xy, yy, log weight.
     """
 
     mean: np.ndarray
@@ -44,7 +44,7 @@ class Particles:
 
 
 def particles_of(belief):
-    """Take a belief's blocks apart."""
+    """Unpack the blocks of a belief."""
     number, blocks = belief.log_weight.size, len(belief.poses)
     poses = belief.poses.reshape(blocks, 9, LANES).swapaxes(1, 2).reshape(-1, 9)[:number]
     covariance = np.empty((number, 3, 3))
@@ -66,7 +66,7 @@ def particles_of(belief):
 
 
 def with_particles(belief, **changes):
-    """Put particles back into their blocks, some of their arrays changed."""
+    """Pack particles into the blocks of a belief, with some arrays changed."""
     particles, blocks = replace(particles_of(belief), **changes), len(belief.poses)
     lanes = np.minimum(np.arange(blocks * LANES), particles.log_weight.size - 1)
     poses = np.column_stack([particles.mean, particles.covariance[:, *PACKED]])[lanes]
@@ -83,7 +83,7 @@ def with_particles(belief, **changes):
 
 
 class Drawn:
-    """A generator that draws what it is told."""
+    """A random generator that returns given numbers."""
 
     def __init__(self, normal, uniform):
         self.normal, self.uniform = np.array(normal), np.array(uniform)
@@ -99,7 +99,7 @@ class Drawn:
 
 @dataclass(frozen=True, kw_only=True)
 class AssumingFastSlam(FastSlam):
-    """The filter for tests that try other noise: whatever a scan says, it was measured so."""
+    """FastSLAM that assumes the given noise for all scans."""
 
     range_std: float = 0.2
     bearing_std: float = 0.15
@@ -117,7 +117,7 @@ def swarm_filter(
     resampled_rays="kept",
     **changes,
 ):
-    """Return the filter with the paper's settings, but for the changes."""
+    """Return a filter with the paper's settings, except for the changes."""
     swarm = FastSlamConfig(
         particles=particles,
         mixture=mixture,
@@ -130,7 +130,7 @@ def swarm_filter(
 
 
 def never_resampling(slam):
-    """Return the same filter without its last step."""
+    """Return the same filter without resampling."""
     return replace(slam, settings=slam.settings.model_copy(update={"resample_below": 0.0}))
 
 
@@ -165,7 +165,7 @@ def followed(slam, mission, rng, start=START):
 
 
 def all_members(belief):
-    """Return (p, c, 6) members, log weights last, with zeros in the columns that are not used."""
+    """Return (p, c, 6) hypotheses, log weights last, with zeros in unused columns."""
     particles = particles_of(belief)
     width = np.diff(belief.first)
     offset = np.arange(belief.member.shape[1]) - np.repeat(belief.first[:-1], width)
@@ -174,12 +174,12 @@ def all_members(belief):
 
 
 def weighted(member):
-    """Return members with their weights in place of the logs."""
+    """Return hypotheses with weights instead of their logarithms."""
     return np.concatenate([member[..., :5], np.exp(member[..., 5:])], axis=-1)
 
 
 def members(belief, particle, label):
-    """Return one particle's members of a landmark, (h, 6): x, y, xx, xy, yy, weight."""
+    """Return a particle's hypotheses of a landmark, (h, 6): x, y, xx, xy, yy, weight."""
     (block, lane), n = divmod(particle, LANES), belief.landmark.tolist().index(label)
     first = belief.first[n]
     rows = belief.member[block, first : first + belief.count[block, n, lane]]
@@ -194,14 +194,14 @@ def arrays_of(belief):
 
 
 def assert_same(belief, other):
-    """Two beliefs are equal to the last bit."""
+    """Assert that two beliefs are equal to the last bit."""
     for mine, yours in zip(arrays_of(belief), arrays_of(other), strict=True):
         np.testing.assert_array_equal(mine, yours)
     assert (belief.full, belief.gated) == (other.full, other.gated)
 
 
 def assert_sound(belief):
-    """Finite numbers, weights that sum to one, covariances that are covariances."""
+    """Assert finite numbers, weights that sum to 1, and positive definite covariances."""
     rows = belief.landmarks()
     for values in (belief.cloud(), belief.pose().mean, belief.pose().covariance, rows.mean):
         assert np.isfinite(values).all()
@@ -221,5 +221,5 @@ def drawing(seed=1):
 
 
 def began(slam, *rows, start=START, seed=1):
-    """The belief after a first scan."""
+    """Return the belief after a first scan."""
     return slam.update(slam.init(start), scan_of(*rows), drawing(seed))

@@ -16,7 +16,7 @@ FARTHEST = 1e4
 
 
 def excess_path(vehicle, landmark, caller):
-    """How much longer the way over the landmark is than the straight one."""
+    """Length of the path over a landmark, minus the direct path."""
     return math.dist(caller, landmark) + math.dist(landmark, vehicle) - math.dist(caller, vehicle)
 
 
@@ -32,7 +32,7 @@ def slopes(function, z):
 
 
 def range_on_ray(vehicle, direction, other, e, *, of_caller):
-    """Where on a ray a point has an excess path, by search; NaN where none has."""
+    """Range of the point on a ray with a given excess path, by search; NaN without such a point."""
     u = np.array([math.cos(direction), math.sin(direction)])
 
     def off(r):
@@ -46,7 +46,7 @@ def range_on_ray(vehicle, direction, other, e, *, of_caller):
 
 
 class Timed:
-    """What a slow EKF does with excess paths, besides the rest."""
+    """Excess paths, added to a slow EKF."""
 
     excess_path_variance = math.nan
 
@@ -75,10 +75,10 @@ class Timed:
             self.take(*told)
         self.X[2] = (self.X[2] + math.pi) % (2 * math.pi) - math.pi
 
-    # Placing
+    # Initialisation
 
     def placed_by_excess_path(self, label, distance, bearing):
-        """Place what has not one member by the excess path that tells its range most surely."""
+        """Initialise a landmark by the excess path with the smallest relative range error."""
         members = self.members(label)
         if len(members) == 1 or not math.isnan(distance):
             return False
@@ -108,7 +108,7 @@ class Timed:
         return True
 
     def where(self, block, e, bearing, *, of_caller):
-        """Share of the range that it is unsure by, the point, its Jacobian by the state, noise."""
+        """Relative standard deviation of the range, the point, its Jacobian by the state, noise."""
         pose, place = self.at(POSE), self.at(block)
         z = np.concatenate([self.X[pose], self.X[place], [bearing, e]])
 
@@ -139,7 +139,7 @@ class Timed:
             (noise @ R @ noise.T)[:2, :2],
         )
 
-    # Correcting and weighing
+    # Update and weights
 
     def take(self, label, caller, e):
         members, callers = self.members(label), self.members(caller)
@@ -171,7 +171,7 @@ class Timed:
         self.prune(ray[0][1])
 
     def expected(self, block, caller, e):
-        """Innovation less what is bent, Jacobian by the state, and variance with what is bent."""
+        """Innovation, Jacobian by the state, and variance, corrected for curvature."""
         where = [slice(0, 2), self.at(block), self.at(caller)]
         z = np.concatenate([self.X[part] for part in where])
         H = np.zeros((1, self.X.size))
@@ -190,7 +190,7 @@ class Timed:
         return nu, H, S
 
     def bend(self, a, b):
-        """Variance across the way between two points, over its length."""
+        """Variance perpendicular to the path between two points, divided by its length."""
         way = self.X[a] - self.X[b]
         D = np.zeros((2, self.X.size))
         D[:, a], D[:, b] = np.eye(2), -np.eye(2)

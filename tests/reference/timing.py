@@ -1,4 +1,4 @@
-"""Made-up missions whose callers are heard: echoes come later than calls, by an excess path."""
+"""Synthetic missions with excess paths: echoes that arrive later than their calls."""
 
 from dataclasses import replace
 
@@ -8,18 +8,18 @@ from pipistrelle.detection.scans import COLUMNS, EXCESS_PATH, EXCESS_PATH_STD, N
 
 
 def excess_paths_to(points, vehicle, caller):
-    """How much longer the way over each point (n, 2) is than that straight from the caller."""
+    """Length of the path over each point (n, 2), minus the direct path from the caller."""
     over = np.hypot(*(points - caller).T) + np.hypot(*(points - vehicle).T)
     return over - np.hypot(*(caller - vehicle))
 
 
 def timed(mission, callers, rng, *, std=0.05, off=None, share=1.0, least=0.0, direct=True):
-    """Return a mission whose echoes have excess paths of callers, each a landmark by its label.
+    """Add excess paths of callers, which are landmarks by label, to the scans of a mission.
 
-    A row has that of the first caller, unless it is heard from there; those of others are rows
-    without a bearing. All are told to be good to `std`, and off by it, or by `off`; of excess paths
-    longer than `least` [m] that share is heard, and unless `direct` is False only where the scan
-    holds the caller itself.
+    Each row has the excess path of the first caller, except the caller's own row; other callers
+    have rows without bearing. The stated standard deviation is `std`, the true noise `off` (default
+    `std`). A `share` of the excess paths longer than `least` [m] is measured and, unless `direct`
+    is False, only in scans with the caller itself.
     """
     off = std if off is None else off
     scans = [
@@ -30,7 +30,7 @@ def timed(mission, callers, rng, *, std=0.05, off=None, share=1.0, least=0.0, di
 
 
 def _timed(scan, vehicle, landmarks, callers, rng, std, off, kept):
-    """Give a scan the excess paths over what is in it, of all callers that are in it."""
+    """Add to a scan the excess paths over its landmarks, for each caller in it."""
     share, least, direct = kept
     numbers, landmark, caller = (
         [scan.numbers.copy()],

@@ -1,4 +1,4 @@
-"""Made-up missions in which a caller moves as filters take it to: its velocity strays at random."""
+"""Synthetic missions with a moving caller that follows the filters' random-walk model."""
 
 from dataclasses import replace
 
@@ -20,27 +20,27 @@ from reference.missions import (
 from reference.timing import excess_paths_to
 
 CALLER = 99
-"""The label of the caller that moves; it calls as number 1."""
+"""Label of the moving caller; its caller number is 1."""
 FRAME = STEP * STEPS_PER_FRAME
 
 
 def scaled(scale):
-    """Motion and start of the paper's drive, their noise scaled."""
+    """Motion and start of the paper's drive, with their noise scaled."""
     motion = replace(BICYCLE, control_std=(0.1 * scale, 0.03 * scale))
     return motion, replace(START, covariance=scale**2 * START.covariance)
 
 
 def walk_covariance(seconds, std):
-    """Covariance of place and velocity after a time, of a velocity that strays by `std` a second.
+    """Covariance of position and velocity after a time, for a velocity with white noise `std`.
 
-    By the law itself: velocity is the integral of white noise, place that of velocity.
+    By definition: velocity is the integral of white noise, position the integral of velocity.
     """
     axis = np.array([[seconds**3 / 3.0, seconds**2 / 2.0], [seconds**2 / 2.0, seconds]])
     return std**2 * np.kron(axis, np.eye(2))
 
 
 def draw_walk(rng, start, frames, *, speed_std, walk_std):
-    """Draw places (frames + 1, 2), the first given, with a frame between them."""
+    """Draw positions (frames + 1, 2), a frame after each other, from a given start."""
     F = np.kron([[1.0, FRAME], [0.0, 1.0]], np.eye(2))
     state = np.append(start, rng.normal(0.0, speed_std, 2))
     places = [state[:2]]
@@ -62,11 +62,11 @@ def roaming_mission(
     ranges=0,
     start=(5.0, -3.0),
 ):
-    """Draw a mission with one caller that moves; returns it and the caller's places, by frames.
+    """Draw a mission with a moving caller; return it and the caller's positions, by frame.
 
-    The caller's bearing is heard at each frame, and its range at the first few. Whatever is heard
-    of the landmarks has an excess path. All noise but the caller's own is scaled, the controls' and
-    the start's, too (`scaled`).
+    The caller's bearing is measured at each frame, its range only at the first `ranges`. Each
+    landmark measurement has an excess path. All noise except the caller's motion is scaled,
+    including controls and start (`scaled`).
     """
     motion, begin = scaled(scale)
     bearing_std, range_std, excess_path_std = (scale * std for std in (0.05, 0.2, 0.5))

@@ -1,9 +1,9 @@
 """Missions and logs on trial: worlds drawn, heard, mapped, scored and kept.
 
-`runs.trial` is the file to read first: a mission on one screen (Bradley & Abaid, Sec. IV).
-`hearing` draws its world and hears it; a drive (`drives`) is what a filter is given; `runs` puts
-it, or a recorded log, to the filters; `results` scores and keeps what came of it; `studies` does
-so in many worlds.
+Read `runs.trial` first: a mission from the drawn world to its scores (Bradley & Abaid, Sec. IV).
+`hearing` draws a world and simulates its scans. `drives` holds the input of an estimator and the
+truth. `runs` runs estimators on a simulated mission or a recorded log, `results` scores and stores
+their estimates, and `studies` repeats this in many worlds.
 """
 
 from lazy_loader import attach

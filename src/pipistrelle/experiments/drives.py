@@ -1,7 +1,4 @@
-"""A drive, simulated or recorded: what a filter is given, and the truth to score it by.
-
-No filter is handed a `Truth`: a trial takes it from the drive when the estimate is made.
-"""
+"""Drives, simulated or recorded: the input of an estimator, and the truth for scoring only."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -22,17 +19,10 @@ Pose = tuple[float, float, float]
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Truth:
-    """What is known of the truth of a drive, for scoring and drawing alone.
+    """True trajectory, landmarks and callers of a drive, for scoring and drawing only.
 
-    Attributes
-    ----------
-    time : (k) [s]
-        Times of the track: the start, then the end of each step.
-    path : (k, 3) [m, m, rad] or None
-        True poses; NaN where they are not known.
-    landmarks : labels (n) and positions (n, 2) [m], or None
-    callers : dict of label to (k, 2) [m]
-        Paths of the callers that move.
+    `time` [s] is the start, then the end of each control step. `path` [m, m, rad] is NaN where
+    unknown. `callers` are the positions [m] of the moving callers, by label.
     """
 
     time: Float[np.ndarray, " k"]
@@ -42,31 +32,29 @@ class Truth:
 
 
 NO_TRUTH = Truth(time=np.empty(0))
-"""Nothing is known of the truth."""
+"""A drive without ground truth."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Drive:
-    """What a filter is given of a drive, simulated or recorded, and the truth to score it by.
+    """Input of an estimator for a drive, simulated or recorded, with the truth for scoring.
 
     Attributes
     ----------
-    motion : Motion
-    start : Gaussian of (3) and (3, 3)
     time : (k + 1) [s]
-        Of the start and of the end of each step.
+        The start, then the end of each control step.
     controls : (k, c)
-        Of each step, as the motion model has them.
+        Controls of each step, as the motion model takes them.
     truth : Truth
-        At the same times; nothing of it, by default. Its landmarks are those that stand.
+        Truth at the same times; its landmarks include callers that do not move.
     known : Landmarks
-        Where landmarks stand that are known beforehand, and how surely.
+        Landmarks known beforehand.
     callers : (c)
-        Label of each caller as a landmark, by its number, where there are others than the vehicle.
+        Landmark label of each caller, by caller number; empty if only the vehicle calls.
     moving : dict of label to str
-        Names of the callers that move: no landmarks, though heard.
+        Names of the moving callers, which are no landmarks of the map.
     sensor : (3) [m, m, rad]
-        Where the sensor is in the vehicle: ahead, to the left, and turned to the left.
+        Pose of the sensor in the vehicle's axes: ahead, left, counter-clockwise.
     """
 
     motion: Motion
@@ -81,23 +69,12 @@ class Drive:
 
 
 def split_at(drive: Drive, times: Sequence[float]) -> tuple[Drive, Int[np.ndarray, " t"]]:
-    r"""Split the steps of a drive in which something happened between their ends.
+    r"""Split control steps at scan times [s] that fall inside them.
 
-    A part of a step goes that share :math:`\lambda` of its way, in a straight line, turning
-    evenly, with the share :math:`\lambda` of its covariance. Controls are then motions from pose to
-    pose (`pipistrelle.estimation.motion`).
-
-    Parameters
-    ----------
-    drive : Drive
-    times : sequence of [s]
-
-    Returns
-    -------
-    Drive
-        The same where nothing happened between the steps' ends.
-    (t)
-        Where the times of the drive stand among those of the result.
+    The part that covers a share :math:`\lambda` of a step's time has that share of its
+    displacement, turn and covariance. The controls of the result are relative motions with
+    covariances (`pipistrelle.estimation.motion`). Also returns the index of each original time in
+    the result. A drive without a scan inside a step is returned as given.
     """
     time, controls, inside = drive.time, drive.controls, np.array(times, dtype=float)
     inside = inside[(inside > time[0]) & (inside < time[-1])]
@@ -129,25 +106,13 @@ def split_at(drive: Drive, times: Sequence[float]) -> tuple[Drive, Int[np.ndarra
 
 
 def at_sensor(drive: Drive) -> Drive:
-    r"""Return the drive of the sensor itself, in place of the vehicle that carries it.
+    """Convert a vehicle's drive to the drive of its sensor, mounted at `drive.sensor`.
 
-    Where the sensor sits at :math:`S` in the vehicle, the motion D of the vehicle is that of
-    :math:`S^{-1} D S` of the sensor, whatever the motion model. Controls are then motions from
-    pose to pose with their covariances (`pipistrelle.estimation.motion`), and estimators need not
-    know where a sensor sits.
+    With the sensor at pose :math:`S` in the vehicle, a vehicle motion D becomes the sensor motion
+    :math:`S^{-1} D S`. The controls of the result are relative motions with covariances
+    (`pipistrelle.estimation.motion`), so estimators need no sensor pose.
 
-    Parameters
-    ----------
-    drive : Drive
-
-    Returns
-    -------
-    Drive
-        The same where the sensor is where the vehicle is.
-
-    Examples
-    --------
-    A sensor 2 m ahead of a vehicle that turns on the spot goes sideways.
+    A sensor 2 m ahead of a vehicle that turns on the spot moves sideways:
 
     >>> motion = Motion(model="unicycle", control_std=(0.1, 0.1))
     >>> start = Gaussian(mean=np.zeros(3), covariance=np.zeros((3, 3)))
@@ -179,7 +144,7 @@ def at_sensor(drive: Drive) -> Drive:
 
 
 def at_vehicle(track: Track, sensor: Pose) -> Track:
-    """Return the track of a vehicle by that of the sensor that it carries at `sensor`."""
+    """Convert the track of a sensor, mounted at pose `sensor`, to the track of its vehicle."""
     if not any(sensor):
         return track
     vehicle = vehicle_in(sensor)
@@ -196,14 +161,14 @@ def at_vehicle(track: Track, sensor: Pose) -> Track:
 
 
 def vehicle_in(sensor: Pose) -> Pose:
-    """Return where the vehicle is in the axes of a sensor that it carries."""
+    """Invert a sensor's pose in the vehicle: return the vehicle's pose in the sensor's axes."""
     x, y, turned = sensor
     c, s = np.cos(turned), np.sin(turned)
     return -c * x - s * y, s * x - c * y, -turned
 
 
 def carried(path: Gaussian, place: Pose) -> Gaussian:
-    """Return where something is that poses carry at a place in their axes."""
+    """Compose each Gaussian pose with a fixed offset in the pose's axes, to first order."""
     x, y, turned = place
     heading = path.mean[..., 2]
     c, s = np.cos(heading), np.sin(heading)

@@ -1,4 +1,4 @@
-"""Cores and memory of this machine, and refusals of missions that need more memory."""
+"""Cores and memory of this machine, and checks that a mission fits into its memory."""
 
 import math
 import os
@@ -17,16 +17,17 @@ from pipistrelle.estimation.rays import ray_members
 from pipistrelle.experiments.hearing.scenario import Scenario
 
 STEP_NUMBERS, TRACK_NUMBERS, ROW_NUMBERS = 18, 12, 9
-"""Numbers of a step (true and noisy pose, controls, time, bound), of a step of each track (pose and
-covariance), and of a row that is heard (`detection.scans.Scan`)."""
+"""Numbers stored for each control step (true and noisy pose, controls, time, bound), for each
+step of each track (pose and covariance), and for each measurement (`detection.scans.Scan`)."""
 LIMIT = Path("/sys/fs/cgroup/memory.max")
-"""The file with the memory limit of a container: a number of bytes, or a word."""
+"""File with the memory limit of a container [bytes]; it may hold a word instead."""
 MALLOPT = ((-3, 32 << 20), (-1, 256 << 20))
-"""Of the GNU C library: arrays up to 32 MB come from the heap; it shrinks when 256 MB are free."""
+"""Parameters of the GNU C library's mallopt: allocate arrays up to 32 MB from the heap, and return
+memory to the system only when 256 MB are free."""
 
 
 def cores() -> int:
-    """Count the cores that this process may use."""
+    """Count the processor cores that this process may use."""
     if hasattr(os, "sched_getaffinity"):
         return len(os.sched_getaffinity(0))
     return os.cpu_count() or 1
@@ -40,10 +41,10 @@ def check_memory(
     passive: bool,
     workers: int = 1,
 ) -> None:
-    """Refuse landmarks whose estimate may need more memory than this machine has.
+    """Raise if the maps of the estimators may need more memory than this machine has.
 
-    With passive rows a landmark may be a whole ray. So many workers on this machine (0: elsewhere)
-    each need as much.
+    With passive bearings each landmark may be a whole ray of hypotheses. `workers` processes on
+    this machine each need as much; 0 skips the check.
 
     >>> check_memory(["ekf", "fastslam"], 51, Config(), passive=True)
     """
@@ -60,10 +61,7 @@ def check_memory(
 def check_length(
     setup: ScenarioConfig, *, strategies: int = 1, filters: int = 1, workers: int = 1
 ) -> None:
-    """Refuse a drive whose scans and tracks may need more memory than this machine has.
-
-    Those of so many strategies and filters are kept, by each of so many workers on this machine (0:
-    elsewhere).
+    """Raise if the scans and tracks of a drive may need more memory than this machine has.
 
     >>> check_length(ScenarioConfig(), strategies=3, filters=2)
     """
@@ -82,10 +80,7 @@ def check_recording(
     *,
     workers: int = 1,
 ) -> None:
-    """Refuse a world of which one frame's recording may need more memory than this machine has.
-
-    So many workers on this machine (0: elsewhere) each need as much.
-    """
+    """Raise if the recording of a frame may need more memory than this machine has."""
     setup, path = config.scenario, _farthest(scenario.path[:, :2])
     driven = "scenario.start" if math.hypot(*setup.start[:2]) > path / 2.0 else "scenario.step"
     reach = {
@@ -100,12 +95,12 @@ def check_recording(
         },
     }
     key = max(reach, key=reach.__getitem__)
-    # To a landmark and home: at most twice across the circle around the centre that holds all.
+    # Path to a landmark and back: at most 4 radii of the circle around the centre that holds all.
     length = {
         key: 4.0 * reach[key] / settled.speed_of_sound,
         "emitter.pulse": settled.pulse * settled.interval,
     }
-    numbers = 2 * settled.tones.size  # complex, of each tone's sums
+    numbers = 2 * settled.tones.size  # complex sums of each tone
     if settled.dense:  # samples and each tone's filter, in single precision
         length |= {"scenario.step": max(length.get("scenario.step", 0.0), _period(setup))}
         numbers = (1 + settled.tones.size) * settled.block
@@ -116,17 +111,17 @@ def check_recording(
 
 
 def _farthest(places: Any) -> float:
-    """Return the largest distance of places from the centre [m]; 0 where there are none."""
+    """Return the largest distance of points from the centre [m]; 0 if there are none."""
     return float(np.hypot(*np.reshape(places, (-1, 2)).T).max(initial=0.0))
 
 
 def _period(setup: ScenarioConfig) -> float:
-    """Return the time between two calls [s]."""
+    """Return the time between two calls of the vehicle [s]."""
     return setup.step * setup.steps_per_frame
 
 
 def _refuse_beyond(what: str, need: float, workers: int) -> None:
-    """Refuse what may need more memory [bytes], in each of so many workers, than there is."""
+    """Raise if all workers together need more memory [bytes] than this machine has."""
     if need * workers <= (have := installed()):
         return
     each = f" in each of {workers} workers" if workers > 1 else ""
@@ -137,7 +132,7 @@ def _refuse_beyond(what: str, need: float, workers: int) -> None:
 
 
 def installed() -> float:
-    """Return the memory of this machine, or of its share in a container [bytes]; else infinity."""
+    """Return the memory of this machine or its container [bytes]; infinity if unknown."""
     have = float("inf")
     with suppress(AttributeError, ValueError, OSError):
         have = float(os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES"))
@@ -147,11 +142,11 @@ def installed() -> float:
 
 
 def keep_freed_memory() -> None:
-    """Let this process keep freed memory, where the C library allows it.
+    """Configure the C library, where possible, to keep freed memory for later arrays.
 
-    A filter makes its arrays anew in every frame. Those above a megabyte, such as the covariance
-    of 200 landmarks, would be given back to the system and asked for again each time, and cleared
-    page by page: several times the cost of the arithmetic on them.
+    A filter allocates new arrays in every frame. Without this, arrays above a megabyte (the
+    covariance of 200 landmarks) are returned to the system and mapped and cleared again each time,
+    which costs several times the arithmetic on them.
     """
     from ctypes import CDLL
 

@@ -1,10 +1,8 @@
-"""Settings by name, ``settings/NAME.toml``, and settings that are one estimator's alone.
+"""Presets (``settings/NAME.toml``) and estimator-specific settings.
 
-A named file holds settings as a user's file does, and the estimators that it is meant for. It lies
-beneath all that is given. In any file ``[own.iekf]`` holds what one estimator has alone, for what
-serves one harms another: it goes before what stands beneath, or beside it in the same file.
-
-A case: who is to map a world from what it hears, by its own calls, another's, or both.
+A preset lists settings, as a user's file does, and the estimators that it is meant for. All other
+sources override it. In any file ``[own.iekf]`` holds settings for that estimator only, which
+override the common settings of that file and of lower layers.
 """
 
 from collections.abc import Iterator, Sequence
@@ -30,16 +28,7 @@ from pipistrelle.settings import (
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Case:
-    """One combination to try: a sensing strategy and a filter, in one world.
-
-    Attributes
-    ----------
-    strategy : "active", "fused" or "passive"
-    filter : str
-        The name of an estimator (`estimation.catalogue.entry`).
-    iteration : int
-        Number of the world.
-    """
+    """A sensing strategy and an estimator (`estimation.catalogue.entry`) to try in a world."""
 
     strategy: Strategy
     filter: str
@@ -47,7 +36,7 @@ class Case:
 
 
 def shipped(room: str) -> tuple[str, ...]:
-    """Return the names of the TOML files in a folder of this room, in the order of the alphabet.
+    """List the TOML files of a folder of this package by name, in alphabetical order.
 
     >>> shipped("settings")
     ('best', 'paper', 'physics')
@@ -58,11 +47,11 @@ def shipped(room: str) -> tuple[str, ...]:
 
 NAMES = shipped("settings")
 PLANS = tuple(name for name in shipped("studies") if not name.endswith("_calibration"))
-"""Plans of studies that ship with the package."""
+"""Names of the study plans that ship with the package."""
 
 
 def settings_of(word: str, where: str) -> Layer:
-    """Return the settings that are given by a name, or by the path of a file; `where` it was given.
+    """Return the settings of a preset or a TOML file; `where` is the option that names it.
 
     >>> settings_of("best", "--settings")
     {('settings',): Given(value='best', where='--settings')}
@@ -85,7 +74,7 @@ def settings_of(word: str, where: str) -> Layer:
 
 
 def _unknown(given: Given, other: str = "") -> InputError:
-    """Return the refusal of a name that none of the named settings has."""
+    """Return the error for an unknown preset, with the nearest known name."""
     near = meant(str(given.value), NAMES)
     fix = f"did you mean {near}?" if near else "choose one"
     expected = f"{', '.join(NAMES)}{other}"
@@ -93,9 +82,9 @@ def _unknown(given: Given, other: str = "") -> InputError:
 
 
 def over_named(*layers: Layer, default: str | None = None) -> tuple[Layer, tuple[str, ...]]:
-    """Lay settings over those that they name, or over the default's.
+    """Merge settings over the preset that they name, else over `default`.
 
-    The estimators that the named settings are meant for are returned, too; none without a name.
+    Also returns the estimators that the preset is meant for; none without a preset.
 
     >>> layer, estimators = over_named({}, default="paper")
     >>> resolve(layer) == Config(settings="paper"), estimators
@@ -115,7 +104,7 @@ def over_named(*layers: Layer, default: str | None = None) -> tuple[Layer, tuple
 
 
 def laid(*layers: Layer) -> Layer:
-    """Lay settings over each other: the last one counts, over what is an estimator's own, too.
+    """Merge layers of settings; later layers win, also over values for single estimators.
 
     >>> own, common = ("own", "iekf", "rays", "power"), ("rays", "power")
     >>> list(laid({own: Given(8.0, "file")}, {common: Given(3.0, "flag")}))
@@ -129,12 +118,12 @@ def laid(*layers: Layer) -> Layer:
 
 
 def _own(key: tuple[str, ...]) -> bool:
-    """Tell whether a key is of a setting that is one estimator's alone."""
+    """Return whether a key is an estimator-specific setting (``own.NAME.…``)."""
     return key[:1] == OWN and len(key) > 2
 
 
 def parted(layer: Layer) -> tuple[Layer, dict[str, Layer]]:
-    """Part settings that all estimators have from those of one alone, by its name."""
+    """Separate common settings from settings for single estimators, by estimator name."""
     own: dict[str, Layer] = {}
     for key, given in layer.items():
         if _own(key):
@@ -143,7 +132,7 @@ def parted(layer: Layer) -> tuple[Layer, dict[str, Layer]]:
 
 
 def check_own(layer: Layer) -> None:
-    """Refuse what cannot be one estimator's alone, or is no value of its setting."""
+    """Raise if an estimator-specific setting is invalid or changes the simulated measurements."""
     _, own = parted(layer)
     for name, settings in own.items():
         for key, given in settings.items():
@@ -155,7 +144,7 @@ def check_own(layer: Layer) -> None:
 
 
 def own_config(config: Config, name: str) -> Config:
-    """Return the settings that an estimator has: those of all, and its own over them.
+    """Return the settings of an estimator: the common ones with its overrides applied.
 
     >>> own = {"iekf": {"rays": {"power": 8.0}}}
     >>> [own_config(Config(own=own), name).rays.power for name in ("ekf", "iekf")]
@@ -168,7 +157,7 @@ def own_config(config: Config, name: str) -> Config:
 
 
 def of_estimators(config: Config, names: Sequence[str]) -> Config:
-    """Return the settings of a mission of some estimators: what all have is no one's alone.
+    """Return the settings of a mission; overrides are merged if all its estimators agree.
 
     >>> config = Config(own={"iekf": {"rays": {"power": 8.0}}})
     >>> of_estimators(config, ["iekf"]).rays.power, of_estimators(config, ["ekf"]) == Config()
@@ -182,7 +171,7 @@ def of_estimators(config: Config, names: Sequence[str]) -> Config:
 
 
 def each_its_own(config: Config, names: Sequence[str]) -> Iterator[tuple[Config, tuple[str, ...]]]:
-    """Yield the settings of some estimators, and the names of those that have them."""
+    """Group estimators that have equal settings; yield the settings and the names of each group."""
     left = list(names)
     while left:
         own = own_config(config, left[0])

@@ -1,4 +1,5 @@
-"""A world and what is heard in it: `scenario` draws it, `listening` hears it.
+"""Simulated worlds and their scans: `scenario` draws a world, `listening` simulates its frames.
 
-`oracle` labels what was heard, the one place where the truth does so.
+`oracle` labels detections by the true arrivals. `world_folder` reads and writes worlds as text
+files, and `sound_recorder` writes the microphones' samples.
 """

@@ -1,17 +1,17 @@
-r"""Where others call from: a place that is given or drawn, a circle, a line, a walk, a route.
+r"""Positions and paths of callers: given or drawn points, circles, lines, walks, routes, missions.
 
-Path and landmarks of a world do not depend on who calls in it: callers are drawn after both, each
-from a stream of its own, so that one more changes none of the rest. The first is drawn as the
-paper's beacon; where it says nothing of its place, it is the beacon.
+Callers are drawn after the path and landmarks of the world, each from its own random stream, so
+adding a caller changes nothing else. The first is drawn as the paper's beacon, and without a
+position of its own it is the beacon.
 
-A walk has a velocity that is forgotten and drawn anew all the time (Ornstein and Uhlenbeck),
+The velocity of a walk is an Ornstein-Uhlenbeck process along each axis,
 
 .. math:: v_{k+1} = a v_k + \sqrt{1 - a^2} \, \sigma \, n_k, \qquad a = e^{-\Delta_t / \tau},
 
-along each axis, n normal, and is thrown back where it would leave the disc of the landmarks.
+with normal n; the caller is reflected at the edge of the landmarks' disc.
 
-A mission is another vehicle's: the course of the first, turned about the centre by an angle that is
-drawn, with noise of its own, clear of the landmarks as of the first vehicle.
+A mission is the drive of a second vehicle: the course of the first, rotated about the centre by a
+drawn angle, with other noise, clear of the landmarks and of the first vehicle.
 """
 
 import math
@@ -44,15 +44,14 @@ from pipistrelle.geometry import points_at, wrap
 from pipistrelle.settings import CALLERS, Layer
 
 WALK_STD, WALK_MEMORY = 0.5, 10.0
-"""Of a walk that says no other: the velocity along an axis [m/s], and how long it lasts [s]."""
+"""Defaults of a walk: standard deviation of the velocity along an axis [m/s] and its time constant
+[s]."""
 
 Points = Float[np.ndarray, "_ 2"]
 
 
 def with_routes(layer: Layer) -> Layer:
-    r"""Replace the file names of callers' routes by the rows in the files.
-
-    The settings returned need no other file.
+    r"""Replace the file names of callers' routes by the rows of these files.
 
     >>> from tempfile import TemporaryDirectory
     >>> from pipistrelle.settings import from_flags
@@ -70,10 +69,7 @@ def with_routes(layer: Layer) -> Layer:
 
 
 def routes_read(callers: Any, where: str) -> Any:
-    """Replace route files by their rows in a list of callers that is not validated yet.
-
-    `where` they were given is named in refusals.
-    """
+    """Replace route files by their rows in an unvalidated list of callers; errors name `where`."""
     if not isinstance(callers, (list, tuple)):
         return callers
     tables = [
@@ -89,7 +85,7 @@ def routes_read(callers: Any, where: str) -> Any:
 
 
 def _rows(path: str, where: str) -> list[list[float]]:
-    """Read a route."""
+    """Read the rows of a route file: time [s], x, y [m] and, if given, heading [rad]."""
     try:
         table = read_table(Path(path), ("time", "x", "y"), optional=("heading",))
         check_unique(table, "time")
@@ -110,17 +106,15 @@ def _rows(path: str, where: str) -> list[list[float]]:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Surroundings:
-    """World and settings into which callers are put."""
+    """Settings, path and landmarks of the world that callers join."""
 
     config: Config
     time: Float[np.ndarray, " t"]
-    """Time [s]."""
     path: Float[np.ndarray, "t 2"]
-    """Of the vehicle [m]."""
+    """Positions of the vehicle [m]."""
     landmarks: Points
-    """Landmarks [m]."""
     course: Course | None = None
-    """Of the vehicle, where it is not the one that the settings name."""
+    """Course of the vehicle; None: the course that the settings name."""
 
 
 def callers_among(
@@ -129,10 +123,10 @@ def callers_among(
     rng: np.random.Generator,
     first: np.random.Generator | None = None,
 ) -> tuple[Caller, ...]:
-    """Make callers at their given places, and draw what the settings leave open.
+    """Create the callers of the settings, and draw the positions that are not given.
 
-    `first`: stands in for the first child: as it was before the beacon was drawn. Callers have
-    a place, or one for each time; the vehicle is not among them.
+    `first` replaces the random stream of the first caller by the state of `rng` before the beacon
+    was drawn. Each caller has a position, or one for each time; the vehicle is excluded.
 
     >>> still = Surroundings(
     ...     config=Config(), time=np.arange(3.0), path=np.zeros((3, 2)), landmarks=np.empty((0, 2))
@@ -173,7 +167,7 @@ def callers_among(
 def _placeless(
     one: CallerConfig, name: str, before: Sequence[Caller], around: Surroundings
 ) -> Caller:
-    """Return the next caller with all but its place."""
+    """Return the next caller with its name, call and level, but no position yet."""
     config, key = around.config, f"callers.{len(before) + 1}"
     sent = _call(one, config.beacon, first=not before)
     if sent is None:
@@ -194,7 +188,7 @@ def _placeless(
 
 
 def _call(one: CallerConfig, beacon: BeaconConfig, *, first: bool) -> CallConfig | None:
-    """Return what a caller calls, with what it leaves open as the beacon has it; None: no tone."""
+    """Return the call of a caller, completed by the beacon's settings; None without a frequency."""
     given = one.model_dump(exclude_none=True, include=set(CallConfig.model_fields))
     usual = beacon.model_dump(include=set(CallConfig.model_fields))
     if not first:
@@ -211,9 +205,7 @@ def place_at(
     rng: np.random.Generator,
     clear_of: Iterable[Points],
 ) -> Float[np.ndarray, "2"] | None:
-    """Draw a place at a distance from the centre, clear of points.
-
-    `distance` [m]; `setup` gives the clearance; `clear_of` [m]. None where no place was found.
+    """Draw a position at a distance [m] from the centre, clear of points [m]; None if that fails.
 
     >>> place = place_at(3.0, ScenarioConfig(), np.random.default_rng(7), [np.zeros((1, 2))])
     >>> round(float(np.hypot(*place)), 9)
@@ -231,7 +223,7 @@ def place_at(
 def _stand(
     one: CallerConfig, around: Surroundings, taken: Sequence[Points], rng: np.random.Generator
 ) -> Float[np.ndarray, "2"] | None:
-    """Place of a standing caller: the given one, or one drawn clear of path and bodies."""
+    """Return the position of a fixed caller: given, or drawn clear of path and landmarks."""
     if one.place is not None:
         return np.array(one.place)
     setup = around.config.scenario
@@ -241,7 +233,7 @@ def _stand(
 def _circle(
     one: CallerConfig, around: Surroundings, taken: Sequence[Points], rng: np.random.Generator
 ) -> Float[np.ndarray, "t 2"] | None:
-    """Return the path on a circle at constant speed; the start is drawn."""
+    """Return a path on a circle at constant speed, with a drawn start."""
     setup = around.config.scenario
     radius = setup.beacon_distance if one.radius is None else one.radius
     turned = (setup.speed if one.speed is None else one.speed) / radius * around.time
@@ -257,7 +249,7 @@ def _circle(
 def _walk(
     one: CallerConfig, around: Surroundings, taken: Sequence[Points], rng: np.random.Generator
 ) -> Float[np.ndarray, "t 2"] | None:
-    """Return the path of a random walk over the disc of the landmarks."""
+    """Return the path of a random walk, reflected at the edge of the landmarks' disc."""
     setup = around.config.scenario
     std = WALK_STD if one.speed_std is None else one.speed_std
     kept = math.exp(-setup.step / (WALK_MEMORY if one.memory is None else one.memory))
@@ -297,18 +289,18 @@ def _line(
 def _route(
     one: CallerConfig, around: Surroundings, taken: Sequence[Points], rng: np.random.Generator
 ) -> Float[np.ndarray, "t 2"]:
-    """Return the path of a route; the caller stands before its first time and after its last."""
+    """Return the path of a route; the caller rests before its first time and after its last."""
     time, *place = np.array(_route_rows(one)).T
     return points_at(around.time, time, np.array(place[:2]).T)
 
 
 def _route_rows(one: CallerConfig) -> Any:
-    """Return the rows of a route, from its file where it is one."""
+    """Return the rows of a route, read from its file if a file is named."""
     return _rows(one.route, "callers") if isinstance(one.route, str) else one.route
 
 
 def _heading(one: CallerConfig, around: Surroundings) -> Float[np.ndarray, " t"] | None:
-    """Return the headings that a route states, if it does."""
+    """Return the headings that a route gives [rad], or None."""
     rows = np.array(_route_rows(one)) if one.way == "route" else np.empty((0, 0))
     if rows.shape[1] < 4:
         return None
@@ -318,7 +310,7 @@ def _heading(one: CallerConfig, around: Surroundings) -> Float[np.ndarray, " t"]
 def _mission(
     around: Surroundings, taken: Sequence[Points], rng: np.random.Generator
 ) -> tuple[Float[np.ndarray, "t 3"], Float[np.ndarray, "t-1 2"]] | None:
-    """Return the poses and controls of a second vehicle's drive; None without a clear place."""
+    """Draw the poses and controls of a second vehicle; None if no draw keeps the clearance."""
     setup, drive = around.config.scenario, around.config.motion
     motion, bias = motion_of(drive), (drive.speed_bias, drive.turn_bias)
     course = around.course or course_of(setup, motion)
@@ -344,14 +336,14 @@ _WAYS: dict[str, Callable[..., np.ndarray | None]] = {
 
 
 def _distance(one: CallerConfig, setup: ScenarioConfig) -> float:
-    """Return how far from the centre a caller is to be [m]."""
+    """Return the distance of a caller from the centre [m]; the beacon's by default."""
     return setup.beacon_distance if one.distance is None else one.distance
 
 
 def _times(
     key: str, one: CallerConfig, around: Surroundings, rng: np.random.Generator
 ) -> Float[np.ndarray, " m"] | None:
-    """Return when a caller with a clock of its own calls; None of one that has none."""
+    """Return the call times of a caller on an independent clock [s]; None without such a clock."""
     if not one.own_clock:
         return None
     if one.times is not None:
@@ -369,7 +361,7 @@ def _times(
 
 
 def _check_apart(callers: Sequence[Caller], around: Surroundings, where: str) -> None:
-    """Refuse the last caller where it is at another's place, or the vehicle's, at a call."""
+    """Raise if the last caller is at the vehicle or another caller when the vehicle calls."""
     *others, last = callers
     calls = slice(
         around.config.scenario.steps_per_frame, None, around.config.scenario.steps_per_frame
@@ -389,7 +381,7 @@ def _check_apart(callers: Sequence[Caller], around: Surroundings, where: str) ->
 
 
 def _check_speed(key: str, one: CallerConfig, config: Config) -> None:
-    """Refuse a caller that would outrun its own sound."""
+    """Raise if the speed of a caller is near or above the speed of sound."""
     c = config.medium.sound_speed
     for name, most in (("speed", c), ("speed_std", c / 5.0)):
         speed = getattr(one, name)
@@ -401,14 +393,14 @@ def _check_speed(key: str, one: CallerConfig, config: Config) -> None:
 
 
 def _standing(callers: Sequence[Caller]) -> Points:
-    """Return where callers stand."""
+    """Return the positions of the callers that do not move."""
     return np.array([c.place for c in callers if not moves(c)]).reshape(-1, 2)
 
 
 def _away_from_vehicle(
     drawn: Callable[[], Float[np.ndarray, "t 2"]], around: Surroundings
 ) -> Float[np.ndarray, "t 2"] | None:
-    """Draw a path until it keeps its distance from the vehicle at all times."""
+    """Draw a path until it keeps the clearance from the vehicle at all times."""
     for _ in range(MAX_DRAWS):
         path = drawn()
         offset = path - around.path
@@ -418,7 +410,7 @@ def _away_from_vehicle(
 
 
 def _no_place(key: str, one: CallerConfig, around: Surroundings) -> InputError:
-    """Return the error for a caller without a possible place, with the fix."""
+    """Return the error for a caller without a possible position, with the fix."""
     setup = around.config.scenario
     if one.way == "mission":
         what = "it comes nearer than that to the vehicle, a landmark or a caller in every drive"

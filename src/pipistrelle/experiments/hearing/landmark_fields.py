@@ -1,4 +1,4 @@
-"""How landmarks lie: over the paper's disc, in the rows of an orchard, at the corners of rooms."""
+"""Layouts of landmarks: the paper's disc, the rows of an orchard, the corners of rooms."""
 
 import math
 from collections.abc import Iterator
@@ -9,13 +9,13 @@ from jaxtyping import Float
 from pipistrelle.config import InputError, ScenarioConfig
 
 MAX_DRAWS = 2000
-"""Draws of one landmark before the request counts as impossible."""
+"""Draws of one landmark after which a position counts as impossible."""
 MAX_COVERAGE = math.pi / math.sqrt(12.0)
 """Largest share of the plane that equal discs can cover."""
 MAX_ROW_OFFSET = 0.1
-"""Of its distance to the next, how far a tree may stand off its row, or along it."""
+"""Largest offset of a tree along and across its row, as a share of the distance between trees."""
 ROOM_SIZE = (0.75, 1.5)
-"""Width and depth of rooms, in widths of the corridor: drawn between these."""
+"""Bounds of the drawn width and depth of rooms, in widths of the corridor."""
 
 Points = Float[np.ndarray, "_ 2"]
 
@@ -23,10 +23,10 @@ Points = Float[np.ndarray, "_ 2"]
 def landmarks_in(
     setup: ScenarioConfig, path: Points, callers: Points, rng: np.random.Generator
 ) -> Points:
-    """Draw the landmarks of a world, clear of what is there already.
+    """Draw the landmarks of a world, clear of the vehicle's path and of fixed callers.
 
-    `path` [m]: of the vehicle; `callers` [m]: that stand. Returns [m]: of an orchard or of rooms
-    those nearest the centre, from there on.
+    `path` and `callers` are positions [m]. Orchards and rooms give the landmarks nearest the
+    centre, in rising distance. Returns positions [m].
 
     Bradley & Abaid, Sec. IV: the disc.
 
@@ -52,10 +52,7 @@ def landmarks_in(
 
 
 def nearest(points: Points, place: Float[np.ndarray, "2"]) -> float:
-    """Return the distance of the nearest of the points [m]; infinite where there is none.
-
-    `points` [m]; `place` [m].
-    """
+    """Return the distance from a position to the nearest of some points [m], else infinity."""
     offset = points - place
     return math.sqrt(np.min(np.sum(offset * offset, axis=1), initial=math.inf))
 
@@ -63,7 +60,7 @@ def nearest(points: Points, place: Float[np.ndarray, "2"]) -> float:
 def _scattered(
     setup: ScenarioConfig, path: Points, callers: Points, rng: np.random.Generator
 ) -> Points:
-    """Draw landmarks uniformly over the disc, each until it keeps its distances."""
+    """Draw landmarks uniformly over the disc; repeat each until it keeps all distances."""
     placed = np.empty((setup.landmarks, 2))
     for i in range(setup.landmarks):
         for _ in range(MAX_DRAWS):
@@ -80,7 +77,7 @@ def _scattered(
 
 
 def _rows(setup: ScenarioConfig, rng: np.random.Generator) -> Iterator[tuple[float, float]]:
-    """Plant trees in rows along x, half a lane beside the lanes of a lawn-mower."""
+    """Yield the trees of rows along x, halfway between the lanes of a lawn-mower course."""
     if setup.spacing == 0.0:
         raise InputError(
             "scenario.spacing: found 0, expected the distance of two trees of a row [m]"
@@ -95,7 +92,7 @@ def _rows(setup: ScenarioConfig, rng: np.random.Generator) -> Iterator[tuple[flo
 
 
 def _corners(setup: ScenarioConfig, rng: np.random.Generator) -> Iterator[tuple[float, float]]:
-    """Build rooms on both sides of a corridor along x, and name their corners."""
+    """Yield the corners of rooms of drawn size on both sides of a corridor along x."""
     for side in (-1.0, 1.0):
         x, wall = -setup.radius, 0.5 * side * setup.lane
         while x < setup.radius:
@@ -110,13 +107,13 @@ def _is_clear(
     path: Points,
     callers: Points,
 ) -> bool:
-    """Tell whether a place is clear of the path and of all callers."""
+    """Return whether a position is clear of the path and of all callers."""
     at, least = np.asarray(place), setup.clearance
     return nearest(path, at) >= least and nearest(callers, at) >= least
 
 
 def _refuse_crowd(setup: ScenarioConfig) -> None:
-    """Refuse more landmarks than the area can hold."""
+    """Raise if there are more landmarks than the disc can hold."""
     half = 0.5 * setup.spacing
     most = MAX_COVERAGE * ((setup.radius + half) / max(half, 1e-100)) ** 2
     if setup.field == "disc" and setup.landmarks > max(most, 1.0):

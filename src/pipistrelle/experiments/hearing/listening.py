@@ -1,18 +1,16 @@
-"""Listening: a path through a world -> what is heard at each frame, by either engine.
+"""Simulated listening: measurements of each frame along a path, by the block or dense engine.
 
-The noise and the other callers' sound are those of the world and shared by all beamwidths, drawn
-once and keyed by the frame alone.
+A frame lasts from each call of the vehicle to the next. The noise is drawn once for all beamwidths,
+keyed by the number of the frame, and the arrivals from other callers are shared by all.
 
-The dense engine records until the vehicle calls again, 100,000 samples of 40 channels in the
-paper's half a second less the blanked call. The block engine stops after the last arrival. What
-follows is noise alone: no label could be given to anything in it, so the scans follow the same law,
-and only the count of clutter lacks the false alarms of the silence (about 0.01 a frame).
+The dense engine records until the vehicle calls again: 100,000 samples of 40 channels for the
+paper's half second, less the call itself, when the receiver is deaf. The block engine stops after
+the last arrival. The rest would be noise, which gets no label, so labelled scans have the same
+distribution; only the count of clutter lacks the false alarms of the silence (about 0.01 a frame).
 
-Frames: all that sounds from one call of the vehicle to the next.
-
-A caller without a clock of its own calls when the vehicle does. The calls of the others are heard
-in the frames in which their sounds arrive, one or two; what begins to arrive less than a call's
-length before the vehicle calls again is drowned.
+Callers without a clock call when the vehicle does. A call of a caller with a clock is received in
+the frames in which its sounds arrive; arrivals that begin less than the duration of a call before
+the vehicle's next call are lost.
 """
 
 import math
@@ -64,34 +62,34 @@ from pipistrelle.experiments.hearing.scenario import (
 )
 
 EMISSIONS_AT_ONCE = 25
-"""Emissions whose arrivals are computed at a time: arrays of a few thousand keep NumPy busy."""
+"""Emissions whose arrivals are computed together; a few thousand rows keep NumPy efficient."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class CallHeard:
-    """Arrivals that one call of a caller with its own clock brings to the vehicle."""
+    """Arrivals at the vehicle from a single call of a caller on an independent clock."""
 
     number: int
-    """Among all such calls of the world."""
+    """Number among all such calls of the world."""
     caller: int
     time: float
-    """When it is heard directly [s]."""
+    """Time of the direct arrival [s]."""
     until: float
-    """When the next call of the same caller is heard directly [s]."""
+    """Time of the direct arrival of the same caller's next call [s]."""
     sounds: list[Arrivals]
-    """One for each piston; their delays count from the time at which it is heard directly."""
+    """Arrivals for each piston, with delays from `time`."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Frame:
-    """All arrivals from one call of the vehicle to the next."""
+    """All arrivals from a call of the vehicle until its next call."""
 
     time: float
-    """Of the vehicle's call [s]."""
+    """Time of the vehicle's call [s]."""
     aimed: list[Arrivals]
-    """One for each piston; their delays count from the vehicle's call."""
+    """Arrivals for each piston, with delays from the vehicle's call."""
     calls: list[CallHeard]
-    """Of those with clocks of their own."""
+    """Calls from callers on independent clocks."""
 
 
 def frames_of(
@@ -101,10 +99,7 @@ def frames_of(
     beam: Callable[..., Arrivals],
     medium: Medium | None = None,
 ) -> Iterator[Frame]:
-    """Yield the arrivals in each frame of a path, for pistons of several radii [m].
-
-    `medium`: that of the settings by default.
-    """
+    """Yield the arrivals in each frame of a path, for pistons of several radii [m]."""
     setup, medium = config.scenario, medium or medium_of(config.medium)
     calls = calls_heard(scenario, setup, medium.speed_of_sound)
     begin = scenario.time[setup.steps_per_frame :: setup.steps_per_frame]
@@ -133,7 +128,7 @@ def _together(
     calls: Sequence[tuple[float, Arrivals]],
     span: float,
 ) -> Arrivals:
-    """Replace the arrivals of callers with own clocks by those of their calls, delayed by [s]."""
+    """Replace the arrivals of callers with clocks by the arrivals of `calls`, delayed by [s]."""
     parts = [arrivals_at(sounds, ~np.isin(sounds.caller, own_clock))]
     for after, heard in calls:
         shifted = replace(heard, delay=heard.delay + after)
@@ -149,7 +144,7 @@ def _calls_heard(
     beam: Callable[..., Arrivals],
     medium: Medium,
 ) -> list[CallHeard]:
-    """Return the arrivals of each call at the vehicle."""
+    """Return the arrivals at the vehicle of each call from callers on independent clocks."""
     following = dict.fromkeys(range(len(world.callers)), np.inf)
     until = []
     for call in reversed(calls):
@@ -186,10 +181,7 @@ def _emissions(
     beam: Callable[..., Arrivals],
     medium: Medium,
 ) -> Iterator[list[Arrivals]]:
-    """Yield the arrivals of a simultaneous call of all at a step, for each piston.
-
-    Many steps are computed at a time.
-    """
+    """Yield the arrivals of simultaneous calls of all callers, per given step and piston."""
     for first in range(0, len(steps), EMISSIONS_AT_ONCE):
         now = steps[first : first + EMISSIONS_AT_ONCE]
         poses, took = scenario.path[now], scenario.time[now] - scenario.time[now - 1]
@@ -210,9 +202,9 @@ def _emissions(
 
 
 Progress = Callable[[str, int, int], None]
-"""Called with a stage's name, the frames done and their number."""
+"""Called with the stage's name, the number of frames done and the total."""
 Keep = Callable[[int, Arrivals, np.ndarray], None]
-"""Called with a frame's number, its arrivals and the block sums or samples that were heard."""
+"""Called with a frame's number, its arrivals, and its block sums or samples."""
 
 
 def listen(
@@ -231,52 +223,46 @@ def listen(
     keep: Keep | None = None,
     progress: Progress | None = None,
 ) -> tuple[tuple[FrameMeasurements, ...], ...]:
-    """Hear every frame of a path, once for all beamwidths.
+    """Simulate and detect the echoes of every frame of a path, for all beamwidths at once.
+
+    Bradley & Abaid, Sec. II.
 
     Parameters
     ----------
     scenario : Scenario
-        Its callers count, not the settings' tones and levels.
+        Its callers are used, not the tones and levels of the settings.
     config : Config
     radii : sequence of [m]
         Radii of the vehicle's piston; ``config.emitter.radius`` is not used.
     iteration : int
         Number of the world, part of the noise's key.
     beam : callable, optional
-        Gives the vehicle's call its directivity, as `through_piston` does: by default the piston
-        with the off-axis loss of the settings.
-    layout : Layout or Scattered, optional
-        The arrays; those of the settings by default.
+        Directivity of the vehicle's call, as `through_piston`; by default the piston with the
+        settings' off-axis loss.
+    layout, medium : optional
+        Arrays and medium of the sound, by default from the settings. The front end still assumes
+        ``assumed.speed_of_sound``.
     call : callable
-        Makes the `Call` of each caller that has none, of its frequency [Hz] and duration [s].
-    medium : Medium, optional
-        What the sound travels through; that of the settings by default. The front end goes on
-        assuming ``assumed.speed_of_sound``.
-    find : callable
-        Finds calls in the matched filter's output, as `find_calls` does.
-    oracle : callable
-        Tells by the truth whose echo each detection is, as `label_detections` does.
+        Makes the `Call` of each caller that has none, from frequency [Hz] and duration [s].
+    find, oracle : callable
+        Detector of calls and labels of detections, as `find_calls` and `label_detections`.
     labels : bool
-        False: frames also hold their echoes without labels, for a stage of association to find
-        them (`pipistrelle.estimation.association`).
+        False: frames also hold their measurements without labels, for data association
+        (`pipistrelle.estimation.association`).
     keep : callable, optional
-        Given each frame's number, from 1 on, its arrivals and the block sums or real samples that
-        were heard, which the next frame overwrites.
+        Receives each frame's number, from 1 on, its arrivals, and its block sums or real samples,
+        which the next frame overwrites.
     progress : callable, optional
 
     Returns
     -------
-    tuple, one per radius, of tuples of FrameMeasurements
-        One per frame, and one per call that brings something of those who have clocks of their own.
+    tuple, for each radius, of tuples of FrameMeasurements
+        An item per frame, and per call from an independent clock that gives measurements.
 
     Raises
     ------
     InputError
-        When the sampling does not fit the tones, a path the times, or points of the world coincide.
-
-    Notes
-    -----
-    Bradley & Abaid, Sec. II.
+        If the sampling does not fit the tones, a path does not fit the times, or points coincide.
 
     Examples
     --------
@@ -321,29 +307,29 @@ def listen(
 
 
 class _Record(NamedTuple):
-    """The matched filter's output of a frame; the next frame overwrites it."""
+    """Matched-filter output of a frame, in buffers that the next frame overwrites."""
 
     matched: Complex[np.ndarray, "l f c e"]
     start: float
     """Delay of lag 0 [s]."""
     interval: float
-    """Between two lags [s]."""
+    """Time between two lags [s]."""
     pulse: int
-    """Lags in which the matched filter's answer falls off to either side."""
+    """Half width of the matched filter's response to a call, in lags."""
     sums: Complex[np.ndarray, "b f c e"] | Float[np.ndarray, "t f e"] | None = None
-    """The block sums, or real samples, that were filtered, where there are any."""
+    """Block sums or real samples before the filter, if available."""
     around: Callable[[], Complex[np.ndarray, "l f c e"]] | None = None
-    """Returns the output also where a call is only partly heard (`BandFilters.around`)."""
+    """Returns the output including calls that are only partly recorded (`BandFilters.around`)."""
 
     @property
     def lags(self) -> dict[str, Any]:
-        """The lags as keyword arguments of a detector."""
+        """Start, interval and pulse length, as a detector's keyword arguments."""
         return {"start": self.start, "interval": self.interval, "pulse": self.pulse}
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class _Rig:
-    """Everything that is the same for all frames of a path."""
+    """Settings, arrays, detector and buffers shared by all frames of a path."""
 
     config: Config
     layout: Layout | Scattered
@@ -358,7 +344,7 @@ class _Rig:
     own_clock: Bool[np.ndarray, " c"]
     workspace: Workspace
     filters: BandFilters | None
-    """Of real samples."""
+    """Matched filters for real samples."""
 
 
 def _rig(
@@ -370,7 +356,7 @@ def _rig(
     oracle: Callable[..., Int[np.ndarray, " d"]],
     labels: bool,
 ) -> _Rig:
-    """Make what is the same for all frames of a path."""
+    """Create the detector, limits and buffers shared by all frames of a path."""
     end = front_end(config, layout, settled.tones, calls=settled.calls if settled.real else ())
     own_clock = np.array([caller.calls is not None for caller in scenario.callers])
     return _Rig(
@@ -393,7 +379,7 @@ def _rig(
 def _faintest_db(
     end: FrontEnd, layout: Layout | Scattered, settled: Sampling, config: Config
 ) -> float:
-    """Return the level of the faintest arrival that can be matched [dB]."""
+    """Return the level of the faintest arrival that can be labelled [dB]."""
     if isinstance(end, Detector):
         threshold, elements = end.threshold, layout.shape[1]
     else:
@@ -413,7 +399,7 @@ def _faintest_db(
 def _of_call(
     call: CallHeard, time: float, record: "_Record", found: Detections, rig: _Rig
 ) -> Detections:
-    """Return the detections of one call in a frame; delays count from the call."""
+    """Select the detections of a caller's call in a frame; delays count from the call."""
     after, early = call.time - time, 0.5 * record.interval * record.pulse
     stretch = after - early, call.until - time - early
     part = call_in(record.matched, rig.front_end, found, call.caller, stretch, **record.lags)
@@ -460,9 +446,9 @@ def _unlabelled(
     heard: FrameMeasurements,
     rig: _Rig,
 ) -> FrameMeasurements:
-    """Return a frame whose echoes also stand without labels, with what caused them.
+    """Add the measurements without labels to a frame, with the true label of each.
 
-    An echo's cause is that of its strongest detection that has one; of a direct call its caller.
+    An echo's label is taken from its strongest labelled detection, a direct call's from its caller.
     """
     scan, echo = unlabelled_scan(time, detections, rig.config, rig.missable)
     causes = np.full(int(echo.max(initial=-1)) + 1, UNLABELLED)
@@ -474,7 +460,7 @@ def _unlabelled(
 
 
 def _blocks(aimed: Sequence[Arrivals], rig: _Rig, key: int) -> Iterator[_Record]:
-    """Yield the record of each beam's arrivals, from block sums."""
+    """Yield the matched-filter output of each beam's arrivals, from block sums."""
     layout, settled, space, pulse = rig.layout, rig.sampling, rig.workspace, rig.sampling.pulse
     own, others = _parted(aimed[0])
     shape = block_shape(blocks_to_hear(aimed[0], settled, layout), layout, settled)
@@ -483,7 +469,7 @@ def _blocks(aimed: Sequence[Arrivals], rig: _Rig, key: int) -> Iterator[_Record]
     lags = (shape[0] - pulse + 1, *shape[1:])
     for left, arrivals in zip(range(len(aimed) - 1, -1, -1), aimed, strict=True):
         signal = shared
-        if left:  # the last beam may write on what it shares
+        if left:  # the last beam may overwrite the shared sums
             signal = space.array("signal", shape)
             np.copyto(signal, shared)
         add_echo_blocks(signal, arrivals_at(arrivals, own), layout, settled)
@@ -498,7 +484,7 @@ def _blocks(aimed: Sequence[Arrivals], rig: _Rig, key: int) -> Iterator[_Record]
 
 
 def _parted(arrivals: Arrivals) -> tuple[slice | np.ndarray, slice | np.ndarray]:
-    """Split rows into those through a piston and those that all beamwidths share."""
+    """Split arrivals into two groups: through a piston, and shared by all beamwidths."""
     if arrivals.departure is None:
         own = np.count_nonzero(arrivals.caller == VEHICLE)  # they come first
         return slice(own), slice(own, None)
@@ -507,7 +493,7 @@ def _parted(arrivals: Arrivals) -> tuple[slice | np.ndarray, slice | np.ndarray]
 
 
 def _dense(aimed: Sequence[Arrivals], rig: _Rig, key: int) -> Iterator[_Record]:
-    """Yield the record of each beam's arrivals, from every sample, in single precision."""
+    """Yield the matched-filter output of each beam's arrivals, from single-precision samples."""
     settled, setup = rig.sampling, rig.config.scenario
     period = math.floor(setup.steps_per_frame * setup.step / settled.interval) - settled.pulse
     start = settled.pulse * settled.interval

@@ -1,10 +1,9 @@
-"""The oracle: known association, the one place where the truth labels a detection.
+"""The oracle: labels of detections from the true arrivals (known data association).
 
-The paper assumes that a measurement's landmark is known. A label is therefore attached from the
-true arrivals, after detection: by delay and bearing both, because a gate in bearing alone lets
-clutter match something most of the time. Without the oracle rows have no label, and an
-association (`pipistrelle.estimation.association`), which sees beliefs and scans, never the truth,
-decides which landmark each is of.
+The paper assumes that the landmark of each measurement is known. The label is therefore assigned
+after detection by the true arrivals, by delay and bearing, as a gate in bearing only would match
+most clutter to a landmark. Without the oracle an association (`pipistrelle.estimation.association`)
+labels the scans; it receives beliefs and scans, never the truth.
 """
 
 from typing import NamedTuple
@@ -21,7 +20,7 @@ from pipistrelle.geometry import wrap_angle
 from pipistrelle.jit import kernel
 
 _SAME_TIME = 1e-9
-"""Candidates as near as this, in squared gates, arrive together."""
+"""Difference in squared normalised distance below which two candidates count as simultaneous."""
 
 
 def label_detections(
@@ -33,37 +32,18 @@ def label_detections(
     pulse: float,
     faintest_db: float,
 ) -> Int[np.ndarray, " d"]:
-    """Label each detection with the landmark that caused it.
+    """Label each detection with the landmark that reflected it, from the true arrivals.
 
-    A true arrival of the same face and caller is a candidate if its delay and its bearing are
-    within the gates and its level is not hopeless. The strongest detection chooses first, the
-    nearest candidate in units of the gates; each arrival is given once per face. What a body in the
-    way throws on arrives with the call itself, which is then the one that was heard: of candidates
-    that arrive together the last is chosen, and a caller's own call comes after its echoes.
+    A true arrival of the same face and caller is a candidate if its delay and bearing are within
+    the gates and its level is at least `faintest_db` [dB]; the delay gate is a share of `pulse`
+    [s]. Detections choose in falling order of power, each the nearest candidate in units of the
+    gates, and each arrival is used once per face. Sound scattered by a body in the path arrives
+    together with the direct call; among simultaneous candidates the last is chosen, and a caller's
+    direct call follows its echoes. Clutter, which matches no arrival, is UNLABELLED.
 
-    Parameters
-    ----------
-    detections : Detections
-        (d) rows.
-    arrivals : Arrivals
-    layout : Layout or Scattered
-    gates : MatchingConfig
-    pulse : [s]
-    faintest_db : [dB]
-        Arrivals below this level cannot be matched.
-
-    Returns
-    -------
-    (d)
-        Labels; UNLABELLED where nothing matches: clutter.
-
-    Notes
-    -----
     Bradley & Abaid, Sec. III-B ("we assumed known data association").
 
-    Examples
-    --------
-    Heard are landmark 7, a little late and to the side, and what is an echo of nothing.
+    Two detections: landmark 7, slightly late and to the side, and clutter.
 
     >>> from pipistrelle.arrays.layout import square_of_four
     >>> from pipistrelle.config import Config
@@ -92,10 +72,10 @@ def label_detections(
 def faintest_level_db(
     threshold: float, *, elements: int, samples: int, noise_std: float, margin_db: float
 ) -> float:
-    """Return the level of an arrival that is expected a margin under the detection threshold.
+    """Return the level [dB] of an arrival expected `margin_db` [dB] below the detection threshold.
 
-    `threshold`: of the energy over a face's elements, each of unit noise variance; `samples`: per
-    call; `noise_std`: of one sample; `margin_db` [dB]. Returns [dB].
+    `threshold` applies to the energy over a face's elements, each of unit noise variance. `samples`
+    is the number per call, `noise_std` the noise of one sample.
 
     >>> settled = {"elements": 10, "samples": 560, "noise_std": 1.0}
     >>> round(faintest_level_db(32.7, margin_db=6.0, **settled), 1)
@@ -106,7 +86,7 @@ def faintest_level_db(
 
 
 class _True(NamedTuple):
-    """Arrivals, (a) rows, as the kernel takes them."""
+    """True arrivals, (a) rows, as arguments of the kernel."""
 
     caller: Int8[np.ndarray, " a"]
     delay: Float[np.ndarray, " a"]
@@ -116,7 +96,7 @@ class _True(NamedTuple):
 
 
 class _Gates(NamedTuple):
-    """How late [s] and how far off [rad] a detection may be, and the faintest arrival [dB]."""
+    """Gates in delay [s] and bearing [rad], and the level of the faintest arrival [dB]."""
 
     delay: float
     bearing: float
@@ -131,7 +111,7 @@ def _label(
     normal: Float[np.ndarray, " f"],
     gates: _Gates,
 ) -> Int[np.ndarray, " d"]:
-    """Match detections and arrivals one to one, greedily, the strongest detection first."""
+    """Match each detection to at most one arrival, greedily in falling order of power."""
     found, true = Columns(*detections), _True(*arrivals)
     face, bearing = found.face, found.bearing
     label = np.full(face.size, UNLABELLED, dtype=np.int64)
@@ -145,7 +125,7 @@ def _label(
             if true.level_db[a] < gates.faintest_db or taken[face[d], a]:
                 continue
             front = normal[face[d]]
-            one_sided = front == front  # NaN hears all around
+            one_sided = front == front  # a NaN normal receives all around
             if one_sided and abs(wrap_angle(true.bearing[a] - front)) > 0.5 * np.pi:
                 continue
             off = abs(wrap_angle(bearing[d] - true.bearing[a])) / gates.bearing

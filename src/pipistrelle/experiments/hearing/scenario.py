@@ -1,13 +1,10 @@
-"""The true world: a noisy drive, landmarks around it, and the callers.
+"""The true world of a simulated mission: a noisy drive, landmarks around it, and the callers.
 
-What is known of a world beforehand: its landmarks, its path, who calls there; or some of it.
+A `World` gives known parts (landmarks, course, callers); the rest is drawn into a `Scenario`.
 
-Callers with clocks of their own: when they call, and when each call is heard.
-
-Such a caller calls between the vehicle's calls, once in a frame, twice or not at all. What it calls
-is heard from when its sound comes straight to the vehicle; the geometry of a call, its echoes'
-among it, is that of this moment, for which the vehicle can know the time. Between two control steps
-everybody goes straight and turns evenly.
+Callers on independent clocks call between the vehicle's calls, zero or more times in a frame. Such
+a call is dated, and its geometry taken, at the arrival of its direct sound, a time that the vehicle
+can measure. Between control steps all motion is linear, with a constant turn rate.
 """
 
 from collections.abc import Mapping, Sequence
@@ -37,61 +34,41 @@ class World:
 
     name: str
     landmarks: Float[np.ndarray, "n 2"] | None = None
-    """Landmarks [m]."""
+    """Positions of the landmarks [m]."""
     bodies: Bodies | None = None
-    """Of these landmarks."""
+    """Shapes of these landmarks."""
     course: Course | None = None
     callers: tuple[CallerConfig, ...] | None = None
-    """Callers besides the vehicle, unless the settings list them."""
+    """Callers besides the vehicle, unless the settings list callers."""
     settings: Layer = field(default_factory=dict)
-    """Settings of the world, which all others override."""
+    """Settings of the world, with the lowest priority."""
     files: Mapping[str, bytes] = field(default_factory=dict)
-    """Files that the world was read from."""
+    """Contents of the files that define the world."""
 
 
 ALL_DRAWN = World(name="any")
-"""A world of which nothing is known beforehand: all is drawn."""
+"""A world without known parts."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Scenario:
-    """A true world: landmark i (from 0) has the label i + 1, caller j (from 1) the label n + j."""
+    """A drawn world: landmark i (from 0) has the label i + 1, caller j (from 1) the label n + j."""
 
     time: Float[np.ndarray, " t"]
-    """Time [s]."""
     path: Float[np.ndarray, "t 3"]
     """True poses, the start first [m, m, rad]."""
     controls: Float[np.ndarray, "t-1 2"]
-    """Nominal speed [m/s] and steering angle [rad] of each step, as the filters know them."""
+    """Nominal speed [m/s] and steering angle [rad] of each step, as the estimators know them."""
     landmarks: Float[np.ndarray, "n 2"]
-    """Landmarks [m]."""
     callers: tuple[Caller, ...]
-    """The vehicle first; paths have a place for each of the times."""
+    """The vehicle first; a moving caller has a position for each time."""
     bodies: Bodies | None = None
-    """Of the landmarks, where they are not as the settings have them."""
+    """Shapes of the landmarks; None: from the settings."""
 
 
 def world_of(config: Config, iteration: int = 0, world: World = ALL_DRAWN) -> Scenario:
-    """Draw the world of the settings' seed.
+    """Draw the world of the settings' seed and a number; raises InputError as `draw_scenario` does.
 
-    Parameters
-    ----------
-    config : Config
-    iteration : int
-        Number of the world.
-    world : World
-
-    Returns
-    -------
-    Scenario
-
-    Raises
-    ------
-    InputError
-        As `draw_scenario`.
-
-    Examples
-    --------
     >>> one, again, other = world_of(Config()), world_of(Config()), world_of(Config(), 1)
     >>> (one.path == again.path).all().item(), (one.path == other.path).all().item()
     (True, False)
@@ -101,12 +78,10 @@ def world_of(config: Config, iteration: int = 0, world: World = ALL_DRAWN) -> Sc
 
 
 def draw_scenario(config: Config, rng: np.random.Generator, world: World = ALL_DRAWN) -> Scenario:
-    """Draw a world: the path first, then the beacon and the landmarks clear of it.
+    """Draw a world: the path, then the beacon, the landmarks and the callers of the settings.
 
-    Where callers are listed, they are drawn last: path and landmarks are those of the paper's
-    beacon, whoever calls. Landmarks keep clear of callers that a world's folder puts somewhere.
-
-    What the `world` already knows is not drawn.
+    Listed callers are drawn last, so path and landmarks do not depend on them; landmarks keep clear
+    of caller positions given by a world's folder. Parts known to `world` are not drawn.
 
     Bradley & Abaid, Sec. IV.
 
@@ -144,10 +119,7 @@ def draw_scenario(config: Config, rng: np.random.Generator, world: World = ALL_D
 
 
 def _mission_of(world: Scenario, vehicle: int) -> Scenario:
-    """Return a world from the view of another vehicle; the first becomes its caller.
-
-    Each keeps its own tone and level.
-    """
+    """Exchange the vehicle with a caller that has a mission; each keeps its tone and level."""
     if vehicle == 1:
         return world
     others = [j for j, caller in enumerate(world.callers) if caller.mission is not None]
@@ -187,9 +159,7 @@ def _mission_of(world: Scenario, vehicle: int) -> Scenario:
 
 
 def landmark_count(scenario: Scenario) -> int:
-    """Return the number of landmarks to map: the landmarks and all callers but the vehicle.
-
-    The vehicle is no landmark of its own map; each other caller is one.
+    """Count the landmarks to map: the world's landmarks and all callers except the vehicle.
 
     >>> landmark_count(world_of(Config(scenario=ScenarioConfig(landmarks=12))))
     13
@@ -198,9 +168,7 @@ def landmark_count(scenario: Scenario) -> int:
 
 
 def standing_landmarks(scenario: Scenario) -> LabelledPoints:
-    """Return the labels and positions of the landmarks and of the callers that do not move.
-
-    Labels rise; positions are in metres.
+    """Return labels, rising, and positions [m] of the landmarks and of callers that do not move.
 
     >>> labels, places = standing_landmarks(world_of(Config()))
     >>> labels[[0, -1]], places.shape
@@ -214,9 +182,7 @@ def standing_landmarks(scenario: Scenario) -> LabelledPoints:
 
 
 def moving_callers(scenario: Scenario) -> dict[int, Caller]:
-    """Return the callers that move, by label; they are no landmarks of a map.
-
-    Labels rise.
+    """Return the callers that move, by rising label; they are no landmarks of a map.
 
     >>> moving_callers(world_of(Config()))
     {}
@@ -225,14 +191,12 @@ def moving_callers(scenario: Scenario) -> dict[int, Caller]:
 
 
 def _others(scenario: Scenario) -> dict[int, Caller]:
-    """Return all callers but the vehicle, by their labels as landmarks."""
+    """Return all callers except the vehicle, by landmark label."""
     return dict(enumerate(scenario.callers[VEHICLE + 1 :], start=len(scenario.landmarks) + 1))
 
 
 def caller_labels(scenario: Scenario) -> Int[np.ndarray, " c"]:
-    """Label of each caller as a landmark, by its number.
-
-    The vehicle's is UNLABELLED.
+    """Return each caller's label as a landmark, by caller number; the vehicle's is UNLABELLED.
 
     >>> caller_labels(world_of(Config()))
     array([-1, 51])
@@ -243,7 +207,7 @@ def caller_labels(scenario: Scenario) -> Int[np.ndarray, " c"]:
 
 
 def assumed_motion(config: Config) -> Motion:
-    """Return the motion model that the filters believe in.
+    """Return the motion model that the estimators assume: the true one with the `assumed` settings.
 
     >>> from pipistrelle.config import AssumedConfig
     >>> assumed_motion(Config(assumed=AssumedConfig(wheelbase=0.25))).wheelbase
@@ -254,13 +218,13 @@ def assumed_motion(config: Config) -> Motion:
 
 
 def _places(callers: Sequence[CallerConfig]) -> Float[np.ndarray, "n 2"]:
-    """Return the places of the callers whose place is given."""
+    """Return the given positions of callers that do not move."""
     places = [caller.place for caller in callers if caller.way == "stand" and caller.place]
     return np.array(places, dtype=float).reshape(-1, 2)
 
 
 def _sized(world: World) -> Float[np.ndarray, "n 2"]:
-    """Return the positions of a world's bodies whose size is stated."""
+    """Return the positions of a world's landmarks with a given radius."""
     if world.landmarks is None or world.bodies is None:
         return np.empty((0, 2))
     return world.landmarks[np.isfinite(world.bodies.radius)]
@@ -269,7 +233,7 @@ def _sized(world: World) -> Float[np.ndarray, "n 2"]:
 def _place_beacon(
     setup: ScenarioConfig, clear_of: Sequence[Float[np.ndarray, "_ 2"]], rng: np.random.Generator
 ) -> Float[np.ndarray, "2"]:
-    """Put the beacon at a random bearing, clear of the path and of bodies that have a size."""
+    """Draw the bearing of the beacon, clear of the path and of bodies with a size."""
     beacon = place_at(setup.beacon_distance, setup, rng, clear_of)
     if beacon is not None:
         return beacon
@@ -281,26 +245,26 @@ def _place_beacon(
 
 
 MICROSECOND = 1e-6
-"""Two times that are no farther apart are one [s]."""
+"""Largest difference between times that count as equal [s]."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class TimedCall:
-    """One call of a caller with its own clock."""
+    """A call of a caller on an independent clock."""
 
     caller: int
-    """Its number among the callers."""
+    """Index of the caller."""
     time: float
-    """When it is heard directly [s]."""
+    """Time of the direct arrival [s]."""
 
 
 def calls_heard(
     scenario: Scenario, setup: ScenarioConfig, speed_of_sound: float
 ) -> list[TimedCall]:
-    """List the calls of callers with their own clocks, in the order in which they are heard.
+    """List the calls from independent clocks that reach the vehicle, in order of direct arrival.
 
-    Nothing is heard before the vehicle's first call, which begins the first frame, and after the
-    path's end.
+    Arrivals before the vehicle's first call, which begins the first frame, or after the end of the
+    path are excluded.
     """
     first, last = setup.steps_per_frame * setup.step, float(scenario.time[-1])
     calls = []
@@ -308,7 +272,7 @@ def calls_heard(
         if caller.calls is not None:
             place = _places_at(caller.calls, scenario.time, np.asarray(caller.place))
             heard = caller.calls
-            for _ in range(4):  # the vehicle is far slower than sound
+            for _ in range(4):  # converges fast, as the vehicle is far slower than sound
                 away = place - path_at(heard.clip(0.0, last), scenario.time, scenario.path)[:, :2]
                 heard = caller.calls + np.hypot(*away.T) / speed_of_sound
             heard = _on_clock(heard, scenario.time)
@@ -317,7 +281,7 @@ def calls_heard(
 
 
 def with_times(scenario: Scenario, times: Sequence[float]) -> Scenario:
-    """Return a world with its paths interpolated at further times; controls are unchanged."""
+    """Interpolate the paths of a world at additional times; controls are unchanged."""
     time = np.union1d(scenario.time, np.array(times))
     path = path_at(time, scenario.time, scenario.path)
     callers = tuple(
@@ -330,7 +294,7 @@ def with_times(scenario: Scenario, times: Sequence[float]) -> Scenario:
 def _with_times(
     caller: Caller, time: Float[np.ndarray, " t"], clock: Float[np.ndarray, " n"]
 ) -> Caller:
-    """Return a caller with its path interpolated at other times."""
+    """Interpolate the path, velocity and heading of a caller at other times."""
     heading, velocity = caller.heading, caller.velocity
     return replace(
         caller,
@@ -351,7 +315,7 @@ def _on_clock(
 def _places_at(
     times: Float[np.ndarray, " m"], clock: Float[np.ndarray, " t"], place: np.ndarray
 ) -> Float[np.ndarray, "m 2"]:
-    """Return the places of a caller at some times, by linear interpolation."""
+    """Interpolate the position of a caller at given times."""
     if place.ndim == 1:
         return np.tile(place, (len(times), 1))
     return points_at(times, clock, place)

@@ -1,4 +1,4 @@
-"""Sound out: the microphones' samples of a mission, written frame by frame into a sound file."""
+"""Sound recordings of simulated missions: the microphones' samples, written frame by frame."""
 
 import math
 import shutil
@@ -27,9 +27,9 @@ from pipistrelle.files import OwnFiles, PiecesFile, make_folder, remove_empty
 
 SOUND_FILE = "recording.wav"
 HEADROOM = 4.0
-"""The largest amplitude that the file holds, in units of the loudest call's at 1 m."""
+"""Largest amplitude that the file can hold, in units of the loudest call's at 1 m."""
 _LARGEST_RIFF = 2**32 - 2**16
-"""Bytes of the samples above which sizes of 64 bits are written (RF64)."""
+"""Bytes of samples above which 64-bit sizes are written (RF64)."""
 _README = """A sound recording of Pipistrelle. Make a log of it with: pipistrelle hear FOLDER -o LOG
 
 recording.wav     the microphones' samples, a channel each; times `scale` they are amplitudes
@@ -49,23 +49,23 @@ SHA256SUMS        what was written here: nothing else is ever overwritten
 
 @dataclass(kw_only=True)
 class SoundRecorder:
-    """Writes what each frame's microphones hear; a frame at a time is in memory."""
+    """Writer of the microphones' samples, frame by frame."""
 
     own: OwnFiles
     config: Config
     frames: range
-    """Numbers of the frames that are kept, from 0 on."""
+    """Indices of the recorded frames, from 0 on."""
     bits: int = 32
-    """32: floats; 16: whole numbers."""
+    """32: floats; 16: integers."""
     clipped: int = 0
-    """Samples that were larger than the file holds."""
+    """Number of samples that exceeded the largest amplitude of the file."""
     late: int = 0
-    """Frames in which something was heard after the next call, which is left out."""
+    """Number of frames with arrivals after the next call, which are not recorded."""
     _file: PiecesFile | None = None
     _made: list[Path] = field(default_factory=list)
 
     def __post_init__(self) -> None:
-        """Place the frames in the file."""
+        """Compute the first sample of each frame."""
         setup = self.config.scenario
         self.layout = layout_of(self.config)
         self.channels = math.prod(self.layout.shape)
@@ -77,11 +77,11 @@ class SoundRecorder:
 
     @property
     def size(self) -> int:
-        """Bytes of the samples."""
+        """Size of the samples in bytes."""
         return int(self.first[-1]) * self.channels * self.bits // 8
 
     def check_room(self) -> None:
-        """Refuse a recording for which there is no room on the disk."""
+        """Raise if the disk has no room for the recording."""
         places = (self.own.folder, *self.own.folder.absolute().parents)
         there = next(place for place in places if place.exists())
         free = shutil.disk_usage(there).free
@@ -92,7 +92,7 @@ class SoundRecorder:
             )
 
     def begin(self, scenario: Scenario) -> None:
-        """Begin the file."""
+        """Create the file and write its header."""
         settled = sampling(self.config, scenario.callers)
         if settled.dense and not settled.real:
             raise InputError(
@@ -114,7 +114,7 @@ class SoundRecorder:
         self._file.write(wav_header(self.size, self.channels, settled.rate, self.bits))
 
     def keep(self, number: int, arrivals: Arrivals, sums: np.ndarray) -> None:
-        """Write a frame, if it is one of those that are kept; frames are numbered from 1 here."""
+        """Write the samples of a frame if its number, from 1 on, is in the recorded range."""
         index = number - 1
         if index not in self.frames or self._file is None:
             return
@@ -132,19 +132,19 @@ class SoundRecorder:
         self._file.write(samples.astype("<f4" if self.bits == 32 else "<i2").tobytes())
 
     def finish(self) -> PiecesFile:
-        """End the file."""
+        """Close the file and return it."""
         assert self._file is not None
         self._file.close()
         return self._file
 
     def discard(self) -> None:
-        """Remove the file, unless it was put in its place."""
+        """Delete the file, unless it has been moved to its final place."""
         if self._file is not None:
             self._file.discard()
             remove_empty(self._made)
 
     def notes(self) -> list[str]:
-        """Return what a user should know of the recording, a line each."""
+        """Return warnings about clipped and late samples, a line each."""
         notes = []
         if self.clipped:
             notes.append(
@@ -158,7 +158,7 @@ class SoundRecorder:
         return notes
 
     def files(self, scenario: Scenario, log: dict[str, Any]) -> dict[str, str | bytes | PiecesFile]:
-        """Return the files of the folder but odometry and truth; `log` is what log.toml says."""
+        """Return the files of the recording, except odometry and truth; `log` describes the log."""
         import tomli_w
 
         calls = {
@@ -176,11 +176,11 @@ class SoundRecorder:
         }
 
     def _description(self, scenario: Scenario) -> dict[str, Any]:
-        """Return ``recording.toml`` without the log's part."""
+        """Return the table of ``recording.toml`` without the section of the log."""
         config, labels = self.config, caller_labels(scenario).tolist()
         own, *others = scenario.callers
         medium = config.medium.model_dump(exclude_none=True)
-        medium |= {"speed_of_sound": config.medium.sound_speed}  # given or not
+        medium |= {"speed_of_sound": config.medium.sound_speed}  # also if it is derived
         return {
             "format": 1,
             "sound": [SOUND_FILE],
@@ -213,18 +213,18 @@ class SoundRecorder:
 
 
 def _call_files(scenario: Scenario) -> dict[str, RecordedCall]:
-    """Return the calls that are kept as files, by their names there."""
+    """Return the recorded calls of the callers, by file name."""
     sounds = {_call_file(caller): caller.sound for caller in scenario.callers}
     return {name: one for name, one in sounds.items() if isinstance(one, RecordedCall)}
 
 
 def _call_file(caller: Caller) -> str:
-    """Return the name of the file of a caller's call."""
+    """Return the name of the file with a caller's call."""
     return f"call_{caller.name}.wav"
 
 
 def _told(caller: Caller) -> dict[str, Any]:
-    """Return what a recording says of a caller's call beside its frequency."""
+    """Return the call of a caller as settings, or the name of its sound file."""
     told = settings_of(caller.sound)
     if isinstance(caller.sound, RecordedCall):
         return {"call": _call_file(caller)}
@@ -232,10 +232,10 @@ def _told(caller: Caller) -> dict[str, Any]:
 
 
 def wav_header(size: int, channels: int, rate: float, bits: int) -> bytes:
-    """Return what stands before the samples of a WAV file, with sizes of 64 bits if need be.
+    """Return the bytes before the samples of a WAV file, or of an RF64 file for 64-bit sizes.
 
-    `size`: bytes of the samples; `rate` [Hz], a whole number in the file; `bits`: 32 for floats, 16
-    for whole numbers.
+    `size` is the bytes of the samples; `rate` [Hz] is rounded; `bits` is 32 for floats, 16 for
+    integers.
 
     Sources: Microsoft, Multiple Channel Audio Data and WAVE Files (2007); EBU Tech 3306 (RF64).
 

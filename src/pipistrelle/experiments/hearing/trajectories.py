@@ -1,11 +1,10 @@
-r"""Where the vehicle is sent: by controls, by way-points that a driver steers for, or along poses.
+r"""Courses of the vehicle: constant or timed controls, way-points followed by a driver, or poses.
 
-The paper's course is a circle of constant controls, driven blindly. A vehicle on any other shape
-would lose it within a round, so a driver who sees where the vehicle is steers for a point a little
-ahead on the line through the way-points (pure pursuit): by the angle off the heading,
-:math:`\gamma = \varphi`, for a front wheel, along the arc through the point, :math:`\omega = 2 V
-\sin\varphi / a`, for a unicycle, with a how far ahead that is. Noise is added to what he commands;
-what he commands is what the filters know.
+The paper's circle is driven open loop with constant controls. On other shapes the vehicle would
+soon drift off the course, so a driver with access to the true pose steers for a point at a distance
+a ahead on the line through the way-points (pure pursuit): with the angle :math:`\varphi` to that
+point, :math:`\gamma = \varphi` for a front wheel, and :math:`\omega = 2 V \sin\varphi / a` for a
+unicycle. The vehicle executes the commands with noise; the estimators know the commands.
 """
 
 import math
@@ -19,51 +18,50 @@ from pipistrelle.estimation.motion import Motion, controls_between, motion_step
 from pipistrelle.geometry import path_at, wrap_angle
 
 LOOK_AHEAD = 1.0
-"""How far ahead of the vehicle the driver aims [m]."""
+"""Distance of the driver's aim from the vehicle [m]."""
 MAX_STEERING = 0.6
-"""Largest angle to which he turns a front wheel [rad]."""
+"""Largest steering angle that the driver commands [rad]."""
 TIME_TOLERANCE = 1e-6
-"""By how much two times may differ that are one, in steps or seconds."""
+"""Difference below which two times count as equal, in steps or seconds."""
 EIGHT_POINTS = 96
-"""Way-points of a figure of eight."""
+"""Number of way-points of a figure of eight."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Commands:
-    """Commanded controls; the vehicle starts where the settings say."""
+    """Timed control commands; the vehicle starts at the settings' pose."""
 
     time: Float[np.ndarray, " n"]
-    """Since the start, rising: a row holds until the next one's, the last only ends the drive
-    [s]."""
+    """Times since the start [s], rising: a row holds until the next; the last only ends the
+    drive."""
     rows: Float[np.ndarray, "n 2"]
     """Speed [m/s], and steering angle [rad] of a bicycle or angular rate [rad/s] of a unicycle."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Waypoints:
-    """A line through points, and from the last to the first as often as there is time."""
+    """A closed line through points, repeated until the drive ends."""
 
     points: Float[np.ndarray, "n 2"]
-    """At least two; the vehicle starts at the first [m]."""
+    """At least two points [m]; the vehicle starts at the first."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Poses:
-    """Poses of the vehicle, and the controls that its filters assume."""
+    """Timed poses [m, m, rad] of the vehicle, and the controls that its estimators assume."""
 
     time: Float[np.ndarray, " n"]
-    """Since the start, rising; poses in between are interpolated [s]."""
+    """Times since the start [s], rising; poses between them are interpolated."""
     path: Float[np.ndarray, "n 3"]
-    """Path [m, m, rad]."""
     commands: Commands | None = None
-    """None: what would have led along the path, less noise."""
+    """None: the controls that lead along the path, minus noise."""
 
 
 Course = Commands | Waypoints | Poses
 
 
 def motion_of(motion: MotionConfig) -> Motion:
-    """Return the settings' motion model, as the filters take it.
+    """Return the true motion model of the settings.
 
     Bradley & Abaid, Eq. (5).
 
@@ -81,8 +79,7 @@ def motion_of(motion: MotionConfig) -> Motion:
 def course_of(setup: ScenarioConfig, motion: Motion) -> Course:
     """Return the course that the settings name.
 
-    A circle gives its constant controls; a unicycle turns as the bicycle of its wheelbase
-    does.
+    A circle gives constant controls; a unicycle turns at the rate of the bicycle of its wheelbase.
 
     Bradley & Abaid, Sec. IV: the circle.
 
@@ -110,10 +107,9 @@ def course_of(setup: ScenarioConfig, motion: Motion) -> Course:
 
 
 def steps_of(course: Course, setup: ScenarioConfig) -> int:
-    """Return the number of control steps of a course that ends.
+    """Return the number of control steps of a course; way-points count from the first to the last.
 
-    `setup`: its step, and the speed between way-points. Way-points give as many steps as the line
-    takes, from the first to the last.
+    `setup` gives the length of a step and the speed between way-points.
 
     >>> steps_of(Waypoints(points=np.array([[0.0, 0.0], [7.5, 0.0]])), ScenarioConfig())
     80
@@ -132,12 +128,10 @@ def driven(
     rng: np.random.Generator,
     bias: tuple[float, float] = (0.0, 0.0),
 ) -> tuple[Float[np.ndarray, "t 3"], Float[np.ndarray, "t-1 2"]]:
-    """Drive a course, with noise on both controls.
+    """Simulate a drive along a course, with noise on both controls.
 
-    `setup`: its steps, their length, and the speed between way-points; `bias`: what the vehicle
-    does beyond what it is told, noise apart: of speed [m/s], and of steering angle [rad] or angular
-    rate [rad/s]. Returns `path` [m, m, rad]: true poses, the start first; `controls`: as the
-    filters know them.
+    `bias` is a constant error of speed [m/s] and of steering angle [rad] or angular rate [rad/s].
+    Returns the true poses [m, m, rad], the start first, and the controls that the estimators know.
 
     Bradley & Abaid, Eq. (5).
 
@@ -168,7 +162,7 @@ def driven(
 
 
 def _lanes(extent: float, lane: float) -> Float[np.ndarray, "n 2"]:
-    """Return the corners of parallel lanes from one side of a square to the other."""
+    """Return the corners of parallel lanes that cover a square."""
     across = np.arange(-extent, extent + 0.5 * lane, lane)
     ends = np.tile([[-extent, extent], [extent, -extent]], (len(across), 1))[: len(across)]
     return np.column_stack((ends.ravel(), np.repeat(across, 2)))
@@ -177,7 +171,7 @@ def _lanes(extent: float, lane: float) -> Float[np.ndarray, "n 2"]:
 def _noise(
     setup: ScenarioConfig, motion: Motion, rng: np.random.Generator, bias: tuple[float, float]
 ) -> Float[np.ndarray, "k 2"]:
-    """Draw the noise on both controls, about its bias."""
+    """Draw the noise of both controls, with mean `bias`."""
     return rng.standard_normal((setup.steps, 2)) * motion.control_std + bias
 
 
@@ -188,7 +182,7 @@ def _held(time: Float[np.ndarray, " t"], commands: Commands) -> Float[np.ndarray
 
 
 def _poses_at(time: Float[np.ndarray, " t"], course: Poses) -> Float[np.ndarray, "t 3"]:
-    """Return the poses at some times: to the bit, where they are those of the course."""
+    """Interpolate the poses of a course; at its recorded times they are returned bit for bit."""
     if np.array_equal(time, course.time[: len(time)]):
         return course.path[: len(time)].copy()
     return path_at(time, course.time, course.path)
@@ -200,7 +194,7 @@ def _steered(
     setup: ScenarioConfig,
     motion: Motion,
 ) -> tuple[Float[np.ndarray, "t 3"], Float[np.ndarray, "k 2"]]:
-    """Return the controls that follow the closed line through the way-points, by pure pursuit."""
+    """Simulate a pure-pursuit drive along the closed line through way-points."""
     _check_speed(setup)
     line = np.vstack((points, points[:1]))
     along = np.append(0.0, np.hypot(*np.diff(line, axis=0).T).cumsum())
@@ -221,7 +215,7 @@ def _ahead(
     line: Float[np.ndarray, "n 2"],
     along: Float[np.ndarray, " n"],
 ) -> float:
-    """Move the aim along a line until it is far enough ahead, by one round at most [m]."""
+    """Advance the aim along a line until it is `LOOK_AHEAD` from the vehicle; at most a round."""
     for _ in range(math.ceil(10.0 * along[-1] / LOOK_AHEAD)):
         x, y = _at(aim, line, along)
         if math.hypot(x - pose[0], y - pose[1]) >= LOOK_AHEAD:
@@ -233,7 +227,7 @@ def _ahead(
 def _at(
     aim: float, line: Float[np.ndarray, "n 2"], along: Float[np.ndarray, " n"]
 ) -> tuple[float, float]:
-    """Return the point at a length along a closed line."""
+    """Return the point of a closed line at a given arc length."""
     here = aim % along[-1]
     return float(np.interp(here, along, line[:, 0])), float(np.interp(here, along, line[:, 1]))
 
@@ -250,7 +244,7 @@ def _towards(
 
 
 def _check_speed(setup: ScenarioConfig) -> None:
-    """Refuse a speed of zero."""
+    """Raise if the speed is not positive."""
     if setup.speed <= 0.0:
         raise InputError(
             f"scenario.speed: found {setup.speed:g} m/s, expected more than 0 to drive between "
@@ -259,7 +253,7 @@ def _check_speed(setup: ScenarioConfig) -> None:
 
 
 def _check_length(course: Commands | Poses, setup: ScenarioConfig) -> None:
-    """Refuse a course that ends before the drive."""
+    """Raise if a course ends before the drive."""
     if course.time[-1] < setup.steps * setup.step - TIME_TOLERANCE:
         raise InputError(
             f"scenario.steps: found {setup.steps}, but the path of {setup.world} ends after "

@@ -1,8 +1,8 @@
-"""Worlds as folders: text files that say what is known of a world, read and written.
+"""World folders: the known parts of a world as text files, read and written.
 
-``world.toml`` holds settings and callers, ``landmarks.csv`` the landmarks, ``path.csv`` the way of
-the vehicle; each may be left out, and what it would say is drawn. What a file is wrong in is
-refused by line or key.
+``world.toml`` holds settings and callers, ``landmarks.csv`` the landmarks, ``path.csv`` the course
+of the vehicle. Each is optional; the content of a missing file is drawn. Errors name the file and
+its line or key.
 """
 
 import os
@@ -54,7 +54,7 @@ from pipistrelle.settings import (
 _COUNT: Key = ("scenario", "landmarks")
 _STEPS: Key = ("scenario", "steps")
 FILES = ("world.toml", "landmarks.csv", "path.csv")
-"""What a world may consist of, beside the routes of its callers."""
+"""Files of a world, besides the routes of its callers."""
 _CONTROLS = {"bicycle": ("speed", "steering"), "unicycle": ("velocity", "angular_rate")}
 _POSE = ("time", "x", "y", "heading")
 _HEADERS = {
@@ -63,7 +63,7 @@ _HEADERS = {
     **{("time", *names): "controls" for names in _CONTROLS.values()},
     **{(*_POSE, *names): "poses and controls" for names in _CONTROLS.values()},
 }
-"""What a path's columns say of it."""
+"""Kind of a course by the columns of ``path.csv``."""
 _README = """\
 A world of Pipistrelle. Hear it with: pipistrelle run --world FOLDER
 
@@ -87,20 +87,13 @@ class _WorldTable(Section):
 
 
 def named_world(layer: Layer) -> World | None:
-    """Read the world that settings name.
-
-    None where they name none.
-    """
+    """Read the world that the settings name; None if they name none."""
     given = layer.get(WORLD_KEY)
     return None if given is None or given.value is None else read_world(Path(str(given.value)))
 
 
 def settled(world: World, layer: Layer) -> Layer:
-    """Combine a world's settings with others, which override them.
-
-    They have the number of its landmarks, and of the steps that its path takes unless that
-    is given.
-    """
+    """Merge a world's settings below `layer`, and set the numbers of its landmarks and steps."""
     beneath = world.settings | _decided(world, layer) | layer
     if world.course is not None and _STEPS not in beneath:
         steps = steps_of(world.course, resolve(beneath).scenario)
@@ -109,10 +102,10 @@ def settled(world: World, layer: Layer) -> Layer:
 
 
 def laid_over(world: World, layer: Layer, values: Layer) -> Layer:
-    """Combine settings with those of a world, which override them, as one value of a grid.
+    """Merge settings with a world that a grid varies: `values` over the world's, over `layer`.
 
-    `layer`: settings that hold where neither the world nor the values say anything else; `values`:
-    of the rest of the grid. The drive ends with the world's path if that is shorter.
+    `values` are the settings of the rest of the grid. The drive ends with the world's course if
+    that is shorter.
     """
     over = layer | world.settings | _decided(world, values) | values
     if world.callers is not None and CALLERS not in values:
@@ -125,7 +118,7 @@ def laid_over(world: World, layer: Layer, values: Layer) -> Layer:
 
 
 def _decided(world: World, layer: Layer) -> Layer:
-    """Return the settings that a world fixes; refuse a layer that contradicts them."""
+    """Return the settings that a world's files fix; raise if a layer contradicts them."""
     decided: Layer = {}
     if world.landmarks is not None:
         decided[_COUNT] = Given(len(world.landmarks), f"{world.name}: landmarks.csv")
@@ -139,9 +132,7 @@ def _decided(world: World, layer: Layer) -> Layer:
 
 
 def read_world(folder: Path) -> World:
-    r"""Read a world from its folder.
-
-    The world has the folder's name.
+    r"""Read a world, named after its folder.
 
     >>> from tempfile import TemporaryDirectory
     >>> with TemporaryDirectory() as place:
@@ -187,10 +178,7 @@ def read_world(folder: Path) -> World:
 
 
 def kept_world(config: Config, world: World) -> tuple[Config, dict[str, bytes]]:
-    """Return the files of the world that a folder of results keeps.
-
-    Returns the settings that name the copy, and the copy's files, relative to the folder.
-    """
+    """Return the settings that name a result folder's copy of a world, and the copy's files."""
     place = f"worlds/{world.name}"
     scenario = config.scenario.model_copy(update={"world": place})
     files = {f"{place}/{name}": content for name, content in world.files.items()}
@@ -198,10 +186,7 @@ def kept_world(config: Config, world: World) -> tuple[Config, dict[str, bytes]]:
 
 
 def world_files(scenario: Scenario, config: Config) -> dict[str, str]:
-    """Return the files of a drawn world, from which it can be simulated again or changed.
-
-    Settings that are not at their defaults, and no filter's, stand in ``world.toml``.
-    """
+    """Return the files of a drawn world, with non-default settings, to edit or simulate again."""
     import tomli_w
 
     names = _CONTROLS[config.motion.model]
@@ -238,7 +223,7 @@ def world_files(scenario: Scenario, config: Config) -> dict[str, str]:
 
 
 def _refuse_misspelt(folder: Path, there: Sequence[str]) -> None:
-    """Refuse a file whose name is nearly that of a missing one: it would be ignored."""
+    """Raise if a file is nearly named like a missing file, as it would be ignored."""
     missing = [name for name in FILES if name not in there]
     for path in sorted(folder.iterdir()):
         near = get_close_matches(path.name.lower(), missing, n=1, cutoff=0.85)
@@ -247,7 +232,7 @@ def _refuse_misspelt(folder: Path, there: Sequence[str]) -> None:
 
 
 def _own_settings(config: Config) -> dict[str, Any]:
-    """Return the settings of a world that are not at their defaults."""
+    """Return the settings of a world that differ from the defaults."""
     decides = {"world", "landmarks", "steps", "vehicle"}
     others = {"seed", "bag", *SETTINGS, *OWN, *CALLERS, *SECTIONS}
     said = config.model_dump(mode="json", exclude_defaults=True, exclude=others)
@@ -259,7 +244,7 @@ def _own_settings(config: Config) -> dict[str, Any]:
 
 
 def _landmark_text(scenario: Scenario) -> str:
-    """Lay out the landmarks, with their bodies where these are their own."""
+    """Format the landmarks as CSV, with radius and shape if the world gives them."""
     numbers = np.arange(1, len(scenario.landmarks) + 1)
     text = table_text(("landmark", "x", "y"), numbers, *scenario.landmarks.T)
     bodies = scenario.bodies
@@ -273,7 +258,7 @@ def _landmark_text(scenario: Scenario) -> str:
 
 
 def _read_head(path: Path) -> _WorldTable:
-    """Read ``world.toml``, or refuse its first fault."""
+    """Read ``world.toml``; raise on its first fault."""
     raw = parse_toml(read_text(path), path)
     try:
         return _WorldTable.model_validate(raw)
@@ -291,7 +276,7 @@ def _read_head(path: Path) -> _WorldTable:
 def _read_landmarks(
     path: Path, usual: TargetConfig
 ) -> tuple[Float[np.ndarray, "n 2"], Bodies | None]:
-    """Read the positions of landmarks, and their bodies if there are columns for them."""
+    """Read the positions of landmarks, and their bodies if the columns exist."""
     words = {"shape": tuple(SHAPES)}
     more = ("radius", "shape")
     if _is_header_alone(path):
@@ -315,20 +300,20 @@ def _read_landmarks(
 
 
 def _is_header_alone(path: Path) -> bool:
-    """Tell whether a file has the header of landmarks and no row: none is there."""
+    """Return whether a file has the landmarks' header and no rows: a world without landmarks."""
     lines = [line for line in read_text(path).splitlines() if line.strip() and line[0] != "#"]
     names = [name.strip() for name in lines[0].split(",")] if len(lines) == 1 else []
     return names[:3] == ["landmark", "x", "y"] and not set(names[3:]) - {"radius", "shape"}
 
 
 def _refuse_coincident(table: Table, places: Float[np.ndarray, "n 2"]) -> None:
-    """Refuse two landmarks at one place."""
+    """Raise if two landmarks coincide."""
     x, y = places.T
     check_unique(Table(path=table.path, line=table.line, column={"x": x, "y": y}), "x", "y")
 
 
 def _read_course(path: Path, config: Config) -> Course:
-    """Read the vehicle's course; the columns decide its kind."""
+    """Read the course of the vehicle; the columns decide its kind."""
     columns = _columns(path, config.motion.model)
     table = read_table(path, columns)
     column = table.column
@@ -348,7 +333,7 @@ def _read_course(path: Path, config: Config) -> Course:
 
 
 def _columns(path: Path, model: str) -> tuple[str, ...]:
-    """Return the columns of a path by its header, one of those that say what it is."""
+    """Return the columns in the header of a course; raise if they match no kind of course."""
     lines = (line for line in read_text(path).splitlines() if line.strip() and line[0] != "#")
     header = next(lines, "")
     columns = tuple(name.strip().strip('"') for name in header.split(","))
@@ -363,13 +348,13 @@ def _columns(path: Path, model: str) -> tuple[str, ...]:
 
 
 def _fits(columns: tuple[str, ...], model: str) -> bool:
-    """Tell whether controls among the columns are those of a motion model."""
+    """Return whether columns contain no controls of another motion model."""
     others = {name for key, names in _CONTROLS.items() if key != model for name in names}
     return not others.intersection(columns)
 
 
 def _waypoints(table: Table) -> Float[np.ndarray, "n 2"]:
-    """Return way-points, each apart from the one before."""
+    """Return the way-points; raise if there are too few or two successive ones coincide."""
     points = np.column_stack((table.column["x"], table.column["y"]))
     if len(points) < 2:
         raise refusal(table.path, "one way-point", "at least two", "add rows")
@@ -382,7 +367,7 @@ def _waypoints(table: Table) -> Float[np.ndarray, "n 2"]:
 
 
 def _check_rising(table: Table) -> None:
-    """Refuse a path of one row, or two rows of one time."""
+    """Raise if a course has fewer than two rows, or rows of equal time."""
     if len(table.line) < 2:
         raise refusal(table.path, "one row", "at least two: the last ends the drive", "add rows")
     check_unique(table, "time")

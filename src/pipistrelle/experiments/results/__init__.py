@@ -1,5 +1,5 @@
-"""The results of a trial: their `scores`, and the `folder` that keeps them for other tools.
+"""Scores and result folders: `scores` compares an estimate with the truth, `writing` stores it.
 
-`writing` fills it, with the texts and tables of `tables`; `stored` takes these up again, `reading`
-says how the mission may be done once more.
+`tables` formats tracks, maps and scans, `ros` converts them to ROS messages, and `reading` reads
+and checks a result folder.
 """

@@ -1,8 +1,6 @@
-"""The summary of a result folder, read and checked; any other folder is refused.
+"""Result folders read back: the summary, and the scores, settings, tracks and maps of a mission.
 
-A folder of results read back: scores, settings, paths and maps.
-
-What a folder holds is `writing`'s business; a file that is not as it was written is refused.
+Any other folder, or a file that does not match its sum, raises an InputError.
 """
 
 import csv
@@ -31,26 +29,24 @@ SUMMARY = "summary.json"
 
 
 class RunEntry(BaseModel):
-    """An estimate of the summary, under the keys of ``summary.json``."""
+    """An estimate's entry in ``summary.json``."""
 
     strategy: Strategy
     filter: str
-    """The estimator's name."""
 
 
 class LogEntry(BaseModel):
-    """The recorded log that was solved."""
+    """The recorded log of a mission, in ``summary.json``."""
 
     path: str
-    """The folder; bytes that are no text are escaped."""
+    """The folder; bytes that are not valid text are escaped."""
     path_bytes: str | None = Field(None, pattern=r"^([0-9a-f]{2})+$")
-    """The bytes of the folder's name in hexadecimal digits, where they are no text."""
+    """Bytes of the path in hexadecimal digits, if they are not valid text."""
     robot: Robot | None
-    """The robot, where the log is of several."""
     beamwidth_rad: float | None
-    """Ranges outside a beam of this width were hidden [rad]."""
+    """Full beamwidth outside which ranges were hidden [rad]."""
     files: dict[str, str]
-    """The SHA-256 of each file that was read, or might have been."""
+    """SHA-256 of each file that the reader may use."""
 
     @property
     def place(self) -> Path:
@@ -61,19 +57,17 @@ class LogEntry(BaseModel):
 
 
 class Summary(BaseModel):
-    """What ``summary.json`` says that is needed to do a mission again."""
+    """The parts of ``summary.json`` needed to run a mission again; no `log` if it was simulated."""
 
     format: Literal[1]
     version: str
-    """The version of the package that wrote it."""
     config_hash: str
     runs: list[RunEntry]
     log: LogEntry | None = None
-    """None where the mission was simulated."""
 
 
 def read_summary(folder: Path) -> Summary:
-    """Read the summary of a result folder; refuse a folder that is none, and say what it is.
+    """Read the summary of a result folder; raise if it is another kind of folder.
 
     >>> read_summary(Path("nowhere"))
     Traceback (most recent call last):
@@ -103,7 +97,7 @@ def read_summary(folder: Path) -> Summary:
 
 
 def _no_results(folder: Path) -> InputError:
-    """Return the refusal of a folder without results: what it is, and what to do."""
+    """Return the error for a folder without results: its kind, and the fix."""
     expected = "the result folder of `pipistrelle run` or `pipistrelle slam`"
     if not folder.is_dir():
         found = "a file" if folder.exists() else "no such folder"
@@ -134,33 +128,30 @@ Estimate = tuple[str, str]
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class StoredPath:
-    """A path as it was read from a result folder."""
+    """Times [s] and poses [m, m, rad] from a TUM file."""
 
     time: Float[np.ndarray, " k"]
-    """Seconds."""
     pose: Float[np.ndarray, "k 3"]
-    """Position and heading [m, m, rad]."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class StoredMission:
-    """What `run` or `slam` wrote into a folder, as `compare` reads it, without doing it again."""
+    """The results of `run` or `slam`, read from their folder, and the version that wrote them."""
 
     folder: Path
     version: str
-    """The version of Pipistrelle that wrote it."""
     settings: Mapping[str, Any]
-    """All settings, by their dotted names."""
+    """All settings, by dotted name."""
     scores: Mapping[Estimate, Mapping[str, Any]]
-    """Scores under the names of ``summary.json``; None where there is none."""
+    """Scores by their names in ``summary.json``, or None."""
     paths: Mapping[Estimate, StoredPath]
     maps: Mapping[Estimate, Float[np.ndarray, "n 2"]]
-    """Positions of the landmarks that are placed [m]."""
+    """Positions of the fully initialised landmarks [m]."""
     truth: StoredPath | None
 
 
 def read_mission(folder: Path) -> StoredMission:
-    """Read the results in a folder; refuse a file that is not as it was written.
+    """Read the results in a folder; raise if a file was changed since.
 
     >>> read_mission(Path("nowhere"))
     Traceback (most recent call last):
@@ -184,13 +175,13 @@ def read_mission(folder: Path) -> StoredMission:
         )
     except InputError:
         raise
-    except (ValueError, LookupError, TypeError, AttributeError) as error:  # sums of its own
+    except (ValueError, LookupError, TypeError, AttributeError) as error:  # valid sums, not ours
         found = f"files that Pipistrelle would not write ({error})"
         raise refusal(folder, found, "results of it", "run again what wrote them") from error
 
 
 def _log_settings(log: Mapping[str, Any] | None) -> dict[str, Any]:
-    """Return the log that was solved and the options it was solved with, as settings."""
+    """Return the log of a mission and the options of its replay, as settings."""
     if log is None:
         return {}
     asked = {f"log.{name}": log[name] for name in ("path", "robot", "beamwidth_rad")}
@@ -199,7 +190,7 @@ def _log_settings(log: Mapping[str, Any] | None) -> dict[str, Any]:
 
 
 def flattened(table: Mapping[str, Any]) -> dict[str, Any]:
-    """Name each value of nested tables by its dotted name.
+    """Flatten nested tables into a dict by dotted names.
 
     >>> flattened({"seed": 3, "air": {"pressure_kpa": 90.0}})
     {'seed': 3, 'air.pressure_kpa': 90.0}
@@ -208,7 +199,7 @@ def flattened(table: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def results_in(folder: Path) -> OwnFiles:
-    """Return the files of a result folder; refuse a folder without whole results."""
+    """Return the files of a result folder; raise if the results are incomplete."""
     own = OwnFiles(folder, RESULTS)
     if own.there == RESULTS.title and (folder / SUMMARY).exists() and SUMMARY in own:
         own.read(SUMMARY)
@@ -220,14 +211,14 @@ def results_in(folder: Path) -> OwnFiles:
 
 
 def _path(text: bytes) -> StoredPath:
-    """Read a path of the TUM format."""
+    """Parse a path in the TUM format."""
     rows = np.loadtxt(io.BytesIO(text), ndmin=2).reshape(-1, 8)
     heading = 2.0 * np.arctan2(rows[:, 6], rows[:, 7])
     return StoredPath(time=rows[:, 0], pose=np.column_stack([rows[:, 1:3], heading]))
 
 
 def _placed(text: bytes) -> Float[np.ndarray, "n 2"]:
-    """Read the positions of the fully initialised landmarks of a map [m]."""
+    """Parse the positions of the fully initialised landmarks of a map [m]."""
     rows = csv.DictReader(io.StringIO(text.decode()))
     places = [(float(row["x"]), float(row["y"])) for row in rows if row["status"] == "full"]
     return np.array(places).reshape(-1, 2)

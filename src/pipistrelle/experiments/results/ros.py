@@ -1,8 +1,7 @@
-"""Results as messages of ROS: poses, maps and transforms, and a bag of a mission's.
+"""ROS messages of results: poses, maps and transforms, and a bag of a mission.
 
-A message is told as a dictionary of its fields, by the names of ROS's common interfaces. On a robot
-``rosidl_runtime_py.set_message_fields`` makes a message of it, here the package rosbags, of the
-extra ``ros``.
+A message is a dict of its fields, by the names of ROS's common interfaces, which
+``rosidl_runtime_py.set_message_fields`` converts on a robot, and the package rosbags here.
 """
 
 import math
@@ -28,33 +27,31 @@ if TYPE_CHECKING:
 
 Fields = dict[str, Any]
 BAG = "mission.mcap"
-"""The bag's name in a result folder."""
+"""Name of the bag in a result folder."""
 POSE = "geometry_msgs/msg/PoseWithCovarianceStamped"
 MAP = "visualization_msgs/msg/MarkerArray"
 TRANSFORM = "geometry_msgs/msg/TransformStamped"
 _PLANE = (0, 1, 5)
-"""Where x, y and the turn about z stand among the six of a pose."""
+"""Indices of x, y and the rotation about z among the six coordinates of a ROS pose."""
 _SPHERE, _DELETE_ALL = 2, 3
 _HEIGHT = 0.05
-"""Of a landmark's marker [m]."""
+"""Height of a landmark's marker [m]."""
 _NUMBERS = ("weight", "x_m", "y_m", "xx_m2", "xy_m2", "yy_m2")
 _COLORS = {"full": {"r": 0.0, "g": 0.6, "b": 0.5}, "partial": {"r": 0.9, "g": 0.6, "b": 0.0}}
 _END = 2**31
-"""Stamps are below it [s]."""
 
 
 class Told(NamedTuple):
-    """A message of a bag."""
+    """A message of a bag, with its topic, type and time [s]."""
 
     topic: str
     type: str
     time: float
-    """[s]."""
     fields: Fields
 
 
 def header(time: float, frame: str) -> Fields:
-    """Tell the time [s] and the frame of a message.
+    """Return the header of a message: its time [s] as a stamp, and its coordinate frame.
 
     >>> header(1.5, "map")
     {'stamp': {'sec': 1, 'nanosec': 500000000}, 'frame_id': 'map'}
@@ -67,7 +64,7 @@ def header(time: float, frame: str) -> Fields:
 
 
 def _stamp(time: float) -> int:
-    """Return a time [s] in nanoseconds."""
+    """Convert a time [s] to nanoseconds."""
     whole = math.floor(time)
     return whole * 10**9 + round((time - whole) * 1e9)
 
@@ -78,7 +75,7 @@ def pose_fields(
     pose: Float[np.ndarray, "3"],
     covariance: Float[np.ndarray, "3 3"],
 ) -> Fields:
-    """Tell a pose in the plane [m, m, rad] and its covariance, as a `POSE`."""
+    """Convert a pose in the plane [m, m, rad] and its covariance to a `POSE` message."""
     six = np.zeros((6, 6))
     six[np.ix_(_PLANE, _PLANE)] = covariance
     x, y, heading = map(float, pose)
@@ -92,10 +89,10 @@ def correction_fields(
     pose: Sequence[float],
     odometry: Sequence[float],
 ) -> Fields:
-    """Tell what takes the frame of the odometry to that of the map, as a `TRANSFORM`.
+    """Return the transform from the map's to the odometry's coordinate frame, as a `TRANSFORM`.
 
-    `frames`: the map's and the odometry's; `pose`, `odometry` [m, m, rad]: where the vehicle is in
-    either at that time.
+    `frames` are the names of the map's and the odometry's frame; `pose` and `odometry` [m, m, rad]
+    are the vehicle's poses in them at the same time.
 
     >>> told = correction_fields(0.0, ("map", "odom"), (3.0, 1.0, 0.5), (1.0, 1.0, 0.5))
     >>> told["transform"]["translation"]
@@ -111,13 +108,12 @@ def correction_fields(
 
 
 def map_fields(time: float, frame: str, table: "pl.DataFrame") -> Fields:
-    r"""Tell a map, a marker for each hypothesis of each landmark, as a `MAP`.
+    r"""Convert a map to a `MAP` message, with a marker for each hypothesis of each landmark.
 
-    A marker is the ellipse of one standard deviation: its axes' lengths are :math:`2\sigma` along
-    ``scale.x`` and ``scale.y``, turned by its orientation. Its name space is the landmark's label,
-    its opacity the hypothesis' weight. The first marker clears those of an earlier map.
-
-    `table`: with the columns of ``landmarks.parquet``; rows that are not finite are left out.
+    A marker is the 1-sigma ellipse: its axes' lengths are :math:`2\sigma` along ``scale.x`` and
+    ``scale.y``, turned by its orientation. Its name space is the landmark's label, its opacity the
+    hypothesis' weight. The first marker deletes all earlier markers. `table` has the columns of
+    ``landmarks.parquet``; rows that are not finite are omitted.
     """
     head = header(time, frame)
     markers: list[Fields] = [{"header": head, "action": _DELETE_ALL}]
@@ -142,12 +138,12 @@ def map_fields(time: float, frame: str, table: "pl.DataFrame") -> Fields:
 
 
 def _turn(heading: float) -> Fields:
-    """Tell a turn in the plane [rad] as a quaternion."""
+    """Convert a heading [rad] to a quaternion."""
     return {"x": 0.0, "y": 0.0, "z": math.sin(heading / 2.0), "w": math.cos(heading / 2.0)}
 
 
 def _ellipse(xx: float, xy: float, yy: float) -> tuple[float, float, float]:
-    """Return the standard deviations along and across a covariance's main axis, and its angle.
+    """Return the standard deviations along and across a covariance's major axis, and its angle.
 
     >>> _ellipse(4.0, 0.0, 1.0)
     (2.0, 1.0, 0.0)
@@ -158,10 +154,7 @@ def _ellipse(xx: float, xy: float, yy: float) -> tuple[float, float, float]:
 
 
 def told_of(trials: Sequence[TrialResult], frame: str = "map") -> Iterator[Told]:
-    """Tell the track and the map of each estimate, on topics of its own.
-
-    Poses that are not finite are left out.
-    """
+    """Yield the messages of each estimate: its finite poses and its map, on separate topics."""
     for trial in trials:
         track, name = trial.track, re.sub(r"\W", "_", short_name(trial.filter))
         rows = zip(track.time.tolist(), track.pose.mean, track.pose.covariance, strict=True)
@@ -195,7 +188,7 @@ def write_bag(path: Path, messages: Sequence[Told]) -> None:
 
 
 def _latched() -> Any:
-    """Return the quality of service by which who comes late gets the last message."""
+    """Return a quality of service that sends the last message to late subscribers."""
     from rosbags import interfaces as its
 
     never = its.QosTime(0, 0)
@@ -213,7 +206,7 @@ def _latched() -> Any:
 
 
 def _made(store: "Typestore", kind: str, fields: Fields) -> Any:
-    """Make a message of what is told; the rest is zero."""
+    """Create a message from its fields; missing fields are zero. Raise if a field is unknown."""
     types = store.fielddefs[kind][1]
     if unknown := fields.keys() - {name for name, _ in types}:
         raise ValueError(f"{kind}: has no field {', '.join(sorted(unknown))}")
@@ -221,7 +214,7 @@ def _made(store: "Typestore", kind: str, fields: Fields) -> Any:
 
 
 def _field(store: "Typestore", how: Any, value: Any) -> Any:
-    """Make a field of what is told of it, which may be nothing."""
+    """Create a field of a message; a missing value gives zero or empty."""
     from rosbags.interfaces import Nodetype
 
     node, inner = how

@@ -1,4 +1,4 @@
-"""Scores: how good an estimate is, by the truth."""
+"""Scores of an estimate: errors, consistency and data association, compared with the truth."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -37,17 +37,12 @@ OF_ASSOCIATION = (
     "landmarks_missed", "landmarks_false", "landmarks_twice",
     "gospa_m", "gospa_error_m", "gospa_missed", "gospa_false",
 )  # fmt: skip
-"""Scores that known labels do not have."""
+"""Scores of data association, which known labels lack."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PathScores:
-    """How near a path is to the truth, under the names of `Scores`.
-
-    Attributes
-    ----------
-    position_rmse_m, heading_rmse_rad, position_rmse_aligned_m, nees_mean, nees_max : float or None
-    """
+    """Scores of a path, by the names of `Scores`."""
 
     position_rmse_m: float | None
     heading_rmse_rad: float | None
@@ -58,53 +53,53 @@ class PathScores:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Scores:
-    """How one trial did, under the names of ``summary.json``.
+    """Scores of a trial, by their names in ``summary.json``.
 
-    None where there is no truth or nothing to score; infinite or NaN where the trial diverged.
-    Errors and NEES are over the control steps, the start excluded.
+    None without truth or data; infinite or NaN if the trial diverged. Errors and NEES are over the
+    control steps, the start excluded.
 
     Attributes
     ----------
     position_rmse_m, heading_rmse_rad : float or None
-        Of the path.
+        RMSE of the path.
     map_rmse_m : float or None
-        Of the fully initialised landmarks whose true positions are known.
+        RMSE of the fully initialised landmarks with known true positions.
     position_rmse_aligned_m, map_rmse_aligned_m : float or None
-        The same, path and map each after its own rigid motion; at least two points.
+        RMSE of path and map, each after its best rigid motion; at least two points.
     position_floor_m : float or None
-        Of a path that is right after the first scan (`position_floor`).
+        RMSE of a path without errors after the first scan (`position_floor`).
     position_bound_m, heading_bound_rad : float or None
-        Least that any estimator without bias has in the mean over such drives, the start exact and
-        the noise as the signal tells it (`evaluation.bound.path_bound`).
+        Lower bound of the RMSE of any unbiased estimator, averaged over such drives, with an exact
+        start and the measured noise (`evaluation.bound.path_bound`).
     nees_mean, nees_max : float or None
     caller_rmse_m, caller_rmse_aligned_m : float or None
-        Of the callers that move and are followed, at the scans since each was placed; the second
-        after a rigid motion of all that is estimated of them.
+        RMSE of the tracked callers, at the scans since the initialisation of each; the second after
+        a rigid motion of all these positions.
     diverged : bool or None
-        Whether any NEES is not finite or above the limit; without truth, True where the path is
-        not finite, else None.
+        Whether any NEES is not finite or exceeds the limit. Without truth: True if the path is not
+        finite, else None.
     landmarks_full, landmarks_total : int
-        Fully initialised; fully and partially.
+        Number of fully initialised landmarks, and of all.
     measurements_per_frame : float or None
-        Mean over the scans.
+        Mean number of bearings per scan.
     gated : int
-        Measurements that the gate rejected, of `judged`.
+        Number of measurements rejected by the gate, of `judged`.
     associated_right : float or None
-        Share of the rows that an association gave a label which are of the landmark that the label
-        stands for (`evaluation.association`); None if no row of a log has a label. None of known
-        labels, as are those that follow.
+        Share of correct labels among all measurements labelled by the association
+        (`evaluation.association`); None for a log without labels. This and all following scores of
+        the association are None for known labels.
     associated_found : float or None
-        Share of the rows of landmarks that an association gave the right label: low where much of
-        the map is lost, or where many rows are too unsure to be used.
+        Share of landmark measurements with a correct label: low if much of the map is lost, or if
+        many measurements are too uncertain to be used.
     landmarks_missed, landmarks_false, landmarks_twice : int or None
-        Heard in three scans or more and not on the map; on the map and none, or near none
-        (`map_motion`); there twice. If no row of a log has a label, all true landmarks count as
-        heard, and landmarks are matched by their positions.
+        Landmarks measured in three scans or more and not mapped; mapped landmarks without a true
+        landmark, or far from it (`map_motion`); landmarks mapped twice. For a log without labels
+        all true landmarks count as measured, and landmarks are matched by position.
     gospa_m, gospa_error_m, gospa_missed, gospa_false
-        Metric of the map against the landmarks that were heard, and its parts.
+        GOSPA metric of the map against the measured landmarks, and its parts.
     nis_mean : float or None
-        Normalised innovation squared per degree of freedom of what was used of placed landmarks:
-        about 1 where the filter believes rightly. None where it does not say (`Innovations`).
+        Normalised innovation squared per degree of freedom, for fully initialised landmarks: about
+        1 for a consistent filter. None if the filter does not provide it (`Innovations`).
     """
 
     position_rmse_m: float | None
@@ -138,32 +133,31 @@ class Scores:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class TrialResult:
-    """One estimate: the scans of a strategy, the track and map of a filter, and their scores."""
+    """An estimate and its scores: the scans of a strategy, the track and map of an estimator."""
 
     strategy: str
     filter: str
-    """The estimator's name."""
     track: Track
     heard: tuple[Scan, ...]
-    """Scans of the strategy, one per frame, empty ones included; the same for every filter of the
-    same settings."""
+    """Scans of the strategy, one per frame, including empty ones; equal for all estimators with
+    the same settings."""
     scans: tuple[Scan, ...]
-    """The scans as the filter had them, perhaps without callers that move."""
+    """Scans that the estimator used, possibly without moving callers."""
     scores: Scores
     wall_s: float
-    """Time that the estimate took."""
     mapped: Landmarks | None = None
-    """The map under the names of the true landmarks, where an association has labels of its own;
-    numbers below 0 name landmarks that stand for none."""
+    """The map with the labels of the true landmarks, after data association; negative labels
+    have no true landmark."""
     online: PathScores | None = None
-    """Scores of the path as it was believed at its time, where the filter revises it."""
+    """Scores of the path estimated at each time, if the estimator revises its path."""
     left_out: Mapping[str, Float[np.ndarray, " n"]] = field(default_factory=dict)
-    """Deviations of a log's rows that the association left out as too unsure, by its setting."""
+    """Standard deviations of measurements of a log that the association discarded as too
+    uncertain, by setting."""
     causes: Causes | None = None
-    """The landmark that caused each row of `heard`, where an association labels the rows and the
-    truth is known."""
+    """True landmark of each measurement of `heard`, if an association labels them and the truth
+    is known."""
     error: str | None = None
-    """The error with which the filter failed; its path is then NaN."""
+    """Error with which the estimator failed; its path is then NaN."""
 
 
 def is_placed(trial: TrialResult) -> bool:
@@ -172,9 +166,9 @@ def is_placed(trial: TrialResult) -> bool:
 
 
 def judged(scans: Sequence[Scan]) -> int:
-    """Return how many measurements a gate judges: a bearing with its range, or an excess path.
+    """Count the measurements that a gate tests: bearings, with their ranges, and excess paths.
 
-    A row holds one of them, or both, and `Scores.gated` counts each.
+    `Scores.gated` counts bearing and excess path of a row separately.
 
     >>> from pipistrelle.detection.scans import make_scan
     >>> ahead = make_scan(0.0, np.array([3, 8]), np.zeros(2), excess_path=np.array([2.0, np.nan]))
@@ -187,12 +181,10 @@ def judged(scans: Sequence[Scan]) -> int:
 
 @np.errstate(over="ignore", invalid="ignore")
 def score(track: Track, truth: Truth, scans: Sequence[Scan], limit: float) -> Scores:
-    """Score a track and its map against the truth, at the same times.
+    """Score a track and its map against the truth at the same times.
 
-    The scans are those that the filter was given. A NEES above the limit means divergence.
+    The scans are the estimator's input. A NEES above `limit` counts as divergence.
 
-    Notes
-    -----
     Bradley & Abaid, Eqs. (23), (26) and (27) and Sec. V-A.
 
     >>> from pipistrelle.estimation.beliefs import Gaussian, no_landmarks
@@ -236,7 +228,7 @@ def score(track: Track, truth: Truth, scans: Sequence[Scan], limit: float) -> Sc
 def _followed(
     track: Track, truth: Truth
 ) -> tuple[Float[np.ndarray, "n 2"], Float[np.ndarray, "n 2"]]:
-    """Return the estimated and the true positions of all callers that move, row by row [m]."""
+    """Return estimated and true positions of all tracked callers, row by row [m]."""
     both = [
         np.hstack((believed.mean, truth.callers[label]))
         for label, believed in track.callers.items()
@@ -254,9 +246,9 @@ def with_association(
     truth: Truth,
     motion: Float[np.ndarray, "3"] = STAY,
 ) -> Scores:
-    """Return scores with those of an association filled in; ``landmarks``: under its own labels.
+    """Add the scores of a data association; ``landmarks`` has the labels of the association.
 
-    Whether a landmark is near a true one is decided after `motion`.
+    Landmarks are compared with the true ones by position after the rigid motion `motion`.
     """
     away = out_of_place(landmarks, found, *truth.landmarks, motion) if truth.landmarks else ()
     counts = map_counts(landmarks, found, away)
@@ -286,8 +278,9 @@ def with_association(
 def map_motion(track: Track, truth: Truth) -> Float[np.ndarray, "3"]:
     """Return the rigid motion after which a map is compared with the true landmarks by position.
 
-    It is the alignment of the path, or none: that after which the map is nearer. No measurement
-    determines where the whole map lies, so a common shift and turn makes no landmark false.
+    It is the alignment of the path or the identity, whichever brings the map nearer. No measurement
+    determines the position of the map as a whole, so a common shift and turn makes no landmark
+    false.
     """
     if truth.landmarks is None or truth.path is None:
         return STAY
@@ -302,22 +295,18 @@ def map_motion(track: Track, truth: Truth) -> Float[np.ndarray, "3"]:
 
 
 def position_floor(drive: Drive, scans: Sequence[Scan]) -> float | None:
-    r"""Return the RMSE of position [m] if all after the first scan is estimated without error.
+    r"""Return the RMSE of position [m] of an estimate without errors after the first scan.
 
-    What is heard tells where things are relative to the vehicle, and never where the vehicle was
-    before it heard anything. Until then it reckons from its controls; by the first scan that holds
-    anything, at step j, the noise has moved and turned it unseen, and so all that follows:
+    Measurements give positions relative to the vehicle, never the motion before the first scan.
+    Until then the vehicle is dead reckoned; at the first scan with a measurement, at step j, the
+    accumulated error shifts and turns everything that follows:
 
     .. math:: \hat x_k = T x_k, \quad T = \hat x_j \circ x_j^{-1} \quad (k \ge j), \qquad
-              \hat x_k \text{ by the controls alone} \quad (k < j)
+              \hat x_k \text{ by dead reckoning} \quad (k < j)
 
-    The start is excluded; None where the truth is not known at step j.
+    The start is excluded; None if the truth is unknown at step j. Alignment removes this error.
 
-    Notes
-    -----
-    The error that is left is one turn and shift of everything: alignment removes it.
-
-    A metre ahead unseen, then a straight drive.
+    A metre ahead without measurements, then a straight drive:
 
     >>> from pipistrelle.detection.scans import make_scan
     >>> from pipistrelle.estimation.motion import Motion
@@ -353,10 +342,10 @@ def position_floor(drive: Drive, scans: Sequence[Scan]) -> float | None:
 def drive_bound(
     drive: Drive, scans: Sequence[Scan], config: Config
 ) -> Float[np.ndarray, "t 3 3"] | None:
-    """Return the bound of the pose at every step, its covariance in [m, rad], squared.
+    """Return the bound on the covariance of the pose at every step, in [m, rad] squared.
 
-    None where the truth is not known at every step, or no landmark is. The scans bear their
-    standard deviations; the settings say how callers move, and whether they are followed.
+    None if the truth is not known at every step or no landmark is. The scans contain their standard
+    deviations; the settings give the motion of callers and whether they are tracked.
     """
     path, landmarks = drive.truth.path, drive.truth.landmarks
     if path is None or landmarks is None or not np.isfinite(path).all():
@@ -377,7 +366,7 @@ def drive_bound(
 
 
 def with_bound(scores: Scores, bound: Float[np.ndarray, "t 3 3"] | None) -> Scores:
-    """Return scores with the bounds of position and heading filled in."""
+    """Add the bounds of position and heading to scores."""
     if bound is None:
         return scores
     position, heading = path_bound(bound)
@@ -386,12 +375,8 @@ def with_bound(scores: Scores, bound: Float[np.ndarray, "t 3 3"] | None) -> Scor
 
 @np.errstate(over="ignore", invalid="ignore")
 def score_path(pose: Gaussian, true_path: Float[np.ndarray, "k 3"] | None) -> PathScores:
-    """Score a path against the truth, its start excluded.
+    """Score a path against the truth, excluding its start and true poses that are NaN.
 
-    Poses of the truth that are NaN are not scored.
-
-    Notes
-    -----
     Bradley & Abaid, Eqs. (23) and (26).
 
     >>> pose = Gaussian(mean=np.zeros((2, 3)), covariance=np.tile(np.eye(3), (2, 1, 1)))

@@ -1,8 +1,8 @@
-"""What the files of a result folder hold: tracks and maps as text, the rest as tables.
+"""Contents of a result folder: tracks and maps as text, poses, maps and scans as tables.
 
-Columns bear their units. In the tables null means that there is none (no truth, a passive range);
-what a diverged filter left not finite stays so. NaN is an error where the truth is not known, and a
-NEES before an exact start has become uncertain.
+Column names end in their units. Null means that a value does not exist (no truth, a passive range).
+Non-finite values of a diverged filter are kept. Errors are NaN where the truth is unknown, the NEES
+until an exact start has become uncertain.
 """
 
 from collections.abc import Sequence
@@ -24,11 +24,11 @@ if TYPE_CHECKING:
 
 @np.errstate(invalid="ignore")
 def tum_text(time: Float[np.ndarray, " k"], path: Float[np.ndarray, "k 3"]) -> str:
-    r"""Write a path as lines of time, x, y, z and a unit quaternion, the TUM format.
+    r"""Format a path in the TUM format: lines of time, x, y, z and a unit quaternion.
 
     .. math:: q = (0, 0, \sin(\theta / 2), \cos(\theta / 2))
 
-    Times are kept to 1e-6 s, poses to 1e-12.
+    Times are rounded to 1e-6 s, poses to 1e-12.
 
     >>> print(tum_text(np.array([0.125]), np.array([[1.0, 2.0, -np.pi]])), end="")
     0.125000 1.000000000000 2.000000000000 0 0 0 -1.000000000000 0.000000000000
@@ -41,7 +41,7 @@ def tum_text(time: Float[np.ndarray, " k"], path: Float[np.ndarray, "k 3"]) -> s
 
 
 def place_text(time: Float[np.ndarray, " k"], place: Float[np.ndarray, "k 2"]) -> str:
-    """Write positions without a heading as `tum_text` does; rows that are NaN are left out.
+    """Format positions without heading in the TUM format, omitting NaN.
 
     >>> print(place_text(np.arange(2.0), np.array([[np.nan, np.nan], [1.0, 2.0]])), end="")
     1.000000 1.000000000000 2.000000000000 0 0 0 0.000000000000 1.000000000000
@@ -51,7 +51,7 @@ def place_text(time: Float[np.ndarray, " k"], place: Float[np.ndarray, "k 2"]) -
 
 
 def map_text(landmarks: Landmarks) -> str:
-    """Write a map as one line per landmark: mean, covariance and status.
+    """Format a map as CSV, a line per landmark: mean, covariance and status.
 
     A partially initialised landmark is represented by its heaviest hypothesis.
 
@@ -78,12 +78,10 @@ def map_text(landmarks: Landmarks) -> str:
 
 @np.errstate(over="ignore", invalid="ignore")
 def step_table(track: Track, true_path: Float[np.ndarray, "k 3"] | None) -> "pl.DataFrame":
-    """Lay out a track, its standard deviations, errors and NEES, one row per pose.
+    """Return a table of a track with standard deviations, errors and NEES, a row per pose.
 
     Columns that need the truth are null without it.
 
-    Notes
-    -----
     Bradley & Abaid, the terms of Eqs. (23) and (26).
 
     >>> from pipistrelle.estimation.beliefs import Gaussian, no_landmarks
@@ -110,7 +108,7 @@ def step_table(track: Track, true_path: Float[np.ndarray, "k 3"] | None) -> "pl.
 
 
 def path_table(time: Float[np.ndarray, " k"], path: Gaussian) -> "pl.DataFrame":
-    """Lay out poses and their standard deviations, a row per time."""
+    """Return a table of poses and their standard deviations, a row per time."""
     import polars as pl
 
     std = np.sqrt(np.diagonal(path.covariance, axis1=1, axis2=2))
@@ -129,14 +127,12 @@ def landmark_table(
     true_landmarks: LabelledPoints | None,
     mapped: Landmarks | None = None,
 ) -> "pl.DataFrame":
-    """Lay out a map, one row per hypothesis, with the true positions beside it.
+    """Return a table of a map, a row per hypothesis, with the true positions.
 
-    ``landmark`` is the map's label and ``true_landmark`` that of the true landmark for which it
-    stands: the same number, or by `mapped`, the same rows under the names of the true landmarks.
-    ``status`` is full, partial or, for a true landmark that is not in the map, unseen.
+    ``landmark`` is the label in the map. ``true_landmark`` is the true landmark that it represents:
+    the same label, or by `mapped`, the same rows with true labels. ``status`` is full, partial or,
+    for a true landmark missing from the map, unseen.
 
-    Notes
-    -----
     Bradley & Abaid, the terms of Eq. (27).
 
     >>> landmarks = Landmarks(
@@ -193,12 +189,11 @@ def measurement_table(
     labels: Sequence[Int[np.ndarray, " m"]] = (),
     causes: Causes | None = None,
 ) -> "pl.DataFrame":
-    """Lay out scans, one row per measurement; null is what was not measured.
+    """Return a table of scans, a row per measurement; null for a quantity that was not measured.
 
-    ``caller`` is the name of the caller whose echo it is, number 1 being the first name; it is null
-    for an echo of the vehicle's own call. ``assigned`` is the label that an association gave the
-    row, one array of `labels` for each scan. ``true_landmark`` is the landmark that caused the row:
-    by `causes`, or else its recorded label.
+    ``caller`` is the name of the emitter of an echo, number 1 being the first name; null for the
+    vehicle. ``assigned`` is the label from an association, with an array of `labels` for each scan.
+    ``true_landmark`` is the landmark that caused the row: by `causes`, else its recorded label.
 
     >>> from pipistrelle.detection.scans import make_scan
     >>> scan = make_scan(1.0, np.array([7]), np.array([0.5]))
@@ -231,7 +226,7 @@ def measurement_table(
     ).with_columns(
         pl.col("bearing_rad", "range_m", "excess_path_m").fill_nan(None),
         pl.col("assigned", "true_landmark").replace(UNLABELLED, None),
-        # Noise is stated of every row, whether it has a bearing, a range or an excess path or not.
+        # Every row has all standard deviations, whether it has these measurements or not.
         *(
             pl.when(pl.col(f"{name}_{unit}").is_not_nan())
             .then(f"{name}_std_{unit}")
@@ -243,7 +238,7 @@ def measurement_table(
 
 
 def _name(number: int, callers: Sequence[str]) -> str | None:
-    """Return the name of a caller other than the vehicle, or its number if it has none."""
+    """Return the name of a caller, or its number without a name; None for the vehicle."""
     if number == OWN:
         return None
     return callers[number - 1] if number <= len(callers) else f"caller{number}"

@@ -1,8 +1,7 @@
-"""Writing a result folder: scores, tracks, maps and tables, for Pipistrelle and other tools.
+"""Result folders: claimed or newly named, and written with scores, tracks, maps and tables.
 
-``summary.json`` is written last: its presence means that the folder is complete.
-
-The folder for results: the one that the user named, or a new one under ``runs``.
+``summary.json`` is written last, so it marks a complete folder. Without a given path, results go to
+a new folder under ``runs``.
 """
 
 import contextlib
@@ -58,11 +57,11 @@ _OURS = re.compile(r"\d{8}-\d{6}-(run|slam)(-\d+)?")
 def result_folder(
     path: Path | None, name: str, *, overwrite: bool, flags: tuple[str, str] = COMMAND_LINE
 ) -> Iterator[OwnFiles]:
-    """Lend the folder for the results; if there are none in the end, nothing is left of it.
+    """Provide the folder for results; remove it if it stays empty.
 
-    Without a path it is ``runs/<time>-<name>``, and once it is whole ``runs/latest`` points at it,
-    where the file system has symbolic links and no other file has that name. Earlier results stay
-    until the new ones are whole.
+    Without a path it is ``runs/<time>-<name>``; once complete, ``runs/latest`` links to it, if the
+    file system has symbolic links and no other file has that name. Earlier results stay until the
+    new ones are complete.
 
     >>> from tempfile import TemporaryDirectory
     >>> with TemporaryDirectory() as parent:
@@ -83,7 +82,7 @@ def result_folder(
 
 
 def _new_folder(name: str) -> list[Path]:
-    """Make ``runs/<time>-<name>``; return it, and ``runs`` if that was missing."""
+    """Create ``runs/<time>-<name>``; return it and, if it was created, ``runs``."""
     runs = Path("runs")
     try:
         made = make_folder(runs)[:1]
@@ -102,7 +101,7 @@ def _new_folder(name: str) -> list[Path]:
 
 
 def _point_latest_at(folder: Path) -> None:
-    """Let ``runs/latest`` point at a folder, unless a file that is not ours has that name."""
+    """Link ``runs/latest`` to a folder, unless another program's file has that name."""
     latest = folder.parent / "latest"
     if os.path.lexists(latest) and not (
         latest.is_symlink() and _OURS.fullmatch(str(latest.readlink()))
@@ -185,10 +184,9 @@ def write_results(
     log: Mapping[str, object] | None = None,
     draw: Callable[[Path], None] = lambda _: None,
 ) -> None:
-    """Write everything into a result folder, in place of earlier results: all of it, or nothing.
+    """Write all results into a folder, replacing earlier results, or change nothing.
 
-    `beside` holds other files, by their
-    names in the folder, and `draw` is given a folder to draw the pictures into.
+    `beside` contains additional files by name; `draw` receives a folder for the figures.
 
     >>> import tempfile
     >>> from pipistrelle.config import Config
@@ -229,7 +227,7 @@ def write_results(
 def _texts(
     trials: Sequence[TrialResult], truth: Truth, moving: Mapping[int, str]
 ) -> dict[str, str]:
-    """Write tracks and maps, and the true paths, each as the file of its name."""
+    """Return tracks, maps and true paths as text, by file name."""
     texts: dict[str, str] = {}
     for trial in trials:
         name, track = f"{trial.strategy}_{short_name(trial.filter)}", trial.track
@@ -251,10 +249,10 @@ def _texts(
 def tables_of(
     trials: Sequence[TrialResult], truth: Truth, callers: Sequence[str] = ()
 ) -> "dict[str, pl.DataFrame]":
-    """Lay out ``steps``, ``landmarks`` and ``measurements`` of a mission, as their files hold them.
+    """Return the tables ``steps``, ``landmarks`` and ``measurements`` of a mission.
 
-    Trials of one strategy share their measurements, with a null for the filter, unless settings or
-    associations of the filters make them differ: then each filter has its rows.
+    Trials of a strategy share their measurements, with a null for the filter, unless settings or
+    associations make them differ; then each filter has its rows.
     """
     import polars as pl
 
@@ -287,7 +285,7 @@ def tables_of(
 def config_hash(config: BaseModel) -> str:
     """Return 16 hexadecimal digits that identify a configuration.
 
-    They are the head of the SHA-256 of its JSON with sorted keys and no spaces.
+    They are the start of the SHA-256 of its JSON with sorted keys and no spaces.
 
     >>> from pipistrelle.config import Config
     >>> config_hash(Config(seed=7)) == config_hash(Config()), len(config_hash(Config()))
@@ -297,7 +295,7 @@ def config_hash(config: BaseModel) -> str:
 
 
 def settings_hash(settings: Mapping[str, object]) -> str:
-    """Return 16 hexadecimal digits that identify settings, as ``config.toml`` has them.
+    """Return 16 hexadecimal digits that identify settings, as nested in ``config.toml``.
 
     >>> settings_hash({"seed": 7, "rays": {}}) == settings_hash({"rays": {}, "seed": 7})
     True
@@ -307,7 +305,7 @@ def settings_hash(settings: Mapping[str, object]) -> str:
 
 
 def run_entry(trial: TrialResult, ignored_rows: Mapping[str, int]) -> dict[str, object]:
-    """Return a trial's entry of the summary; numbers that are not finite become None."""
+    """Return the entry of a trial in the summary; non-finite numbers become None."""
     run: dict[str, object] = {
         "strategy": trial.strategy,
         "filter": trial.filter,
@@ -324,7 +322,7 @@ def run_entry(trial: TrialResult, ignored_rows: Mapping[str, int]) -> dict[str, 
 
 
 def calibration_of(track: Track) -> dict[str, float]:
-    """Return what a filter estimated of the vehicle, and ``NAME_std`` of each number.
+    """Return the estimated calibration parameters, and ``NAME_std`` of each.
 
     >>> from pipistrelle.estimation.beliefs import Gaussian, no_landmarks
     >>> pose = Gaussian(mean=np.zeros((1, 3)), covariance=np.zeros((1, 3, 3)))
@@ -341,14 +339,14 @@ def calibration_of(track: Track) -> dict[str, float]:
 
 
 def _told(scores: Scores) -> dict[str, object]:
-    """Return scores by name, without those of an association where there is none."""
+    """Return scores by name, without the scores of data association if all are None."""
     told = asdict(scores)
     known = all(told[name] is None for name in OF_ASSOCIATION)
     return {name: v for name, v in told.items() if not (known and name in OF_ASSOCIATION)}
 
 
 def _finite(scores: Mapping[str, object]) -> dict[str, object]:
-    """Return None for a number that is not finite."""
+    """Replace non-finite scores by None, as JSON has no NaN."""
     return {
         key: None if isinstance(value, float) and not math.isfinite(value) else value
         for key, value in scores.items()

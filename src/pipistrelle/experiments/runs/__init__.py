@@ -1,4 +1,5 @@
-"""Missions: simulated (`trial`), solved from a log (`replay`), or done again (`rerun`).
+"""Missions: simulated (`trial`), replayed from a log (`replay`) or run again (`rerun`).
 
-`truth_files` reads what is known of the truth of a recorded one; `compiling` has the kernels ready.
+`heard_world` holds the scans of a simulated world, `truth_files` reads the truth of a recorded log,
+`validate` checks settings before a mission, and `compiling` compiles the kernels.
 """

@@ -1,4 +1,4 @@
-"""Kernels are compiled before workers start that would each compile them, and in two processes."""
+"""Compilation of the kernels before a mission or a study, optionally in a second process."""
 
 import subprocess
 import sys
@@ -36,8 +36,8 @@ from pipistrelle.experiments.runs.compiling import compile_filters
 compile_filters(Config.model_validate_json(sys.stdin.read()), sys.argv[1:])
 """
 _FRAMES, _HEARD = 200, 10
-"""Frames of the made-up drive, and how many of them hear its first landmark: later it leaves the
-smoother's border, whose kernels are then compiled, too."""
+"""Frames of the synthetic drive, and frames with its first landmark; later this landmark leaves the
+smoother's window, which compiles the kernels for that case."""
 
 
 def compile_kernels(
@@ -47,9 +47,8 @@ def compile_kernels(
 ) -> None:
     """Compile kernels, or load them from the cache, by missions of two frames.
 
-    The timings are the values of ``listening.timing``, the associations of ``association.method``.
-    Filters that are not of the catalogue are left out: their kernels are compiled when they are
-    needed.
+    `timings` are values of ``listening.timing``, `associations` of ``association.method``.
+    Estimators outside the catalogue are skipped.
     """
     there = [name for name in filters if name in CATALOGUE]
     tiny = ScenarioConfig(steps=8, landmarks=4, radius=10.0)
@@ -60,7 +59,7 @@ def compile_kernels(
 
 
 def compile_all() -> None:
-    """Compile the kernels of all estimators, with and without labels, or load them."""
+    """Compile or load the kernels of all estimators, with and without known labels."""
     compile_kernels(associations=(KNOWN, *METHODS))
     for timing in (False, True):
         compile_filters(Config(listening=ListeningConfig(timing=timing)), CATALOGUE)
@@ -70,10 +69,10 @@ def compile_all() -> None:
 def in_two_processes(
     tell: Callable[[str], object] | None, config: Config, filters: Sequence[str]
 ) -> Iterator[None]:
-    """Let a second process compile the kernels of filters, if any kernel must be compiled.
+    """Let a second process compile kernels in parallel, if any must be compiled.
 
-    It begins with the first that this process compiles, which `tell` announces, where given. What
-    both need is compiled by one of them (`pipistrelle.kernel_folder`).
+    It starts with the first compilation in this process, announced through `tell` if given. The
+    processes do not repeat each other's work (`pipistrelle.kernel_folder`).
     """
     second = None
 
@@ -94,7 +93,7 @@ def in_two_processes(
 
 
 def _second_process(config: Config, filters: Sequence[str]) -> subprocess.Popen[str] | None:
-    """Start a process that compiles the kernels of filters, if one can be had."""
+    """Start a process that compiles the kernels of estimators; None without a second core."""
     if cores() < 2:
         return None
     nowhere = subprocess.DEVNULL
@@ -112,7 +111,7 @@ def _second_process(config: Config, filters: Sequence[str]) -> subprocess.Popen[
 
 
 def compile_filters(config: Config, filters: Iterable[str]) -> None:
-    """Compile the kernels of filters alone, by a drive past landmarks that nobody listens to."""
+    """Compile the kernels of estimators by a synthetic drive, without simulating sound."""
     each = config.scenario.steps_per_frame
     tiny = {"steps": each * _FRAMES, "landmarks": 4, "radius": 10.0, "steps_per_frame": each}
     config = config.model_copy(update={"scenario": ScenarioConfig(**tiny)})
@@ -126,9 +125,9 @@ def compile_filters(config: Config, filters: Iterable[str]) -> None:
 
 
 def _true_scan(drive: Drive, step: int, first: int, *, timing: bool) -> Scan:
-    """Return true rows of the landmarks from a first one on; the last of them is a caller.
+    """Return noise-free measurements of the landmarks from index `first` on; the last is a caller.
 
-    Every other one has a range, the rest bearings and, with timing, excess paths.
+    All have a bearing, odd labels a range, even labels with `timing` an excess path.
     """
     path, landmarks = drive.truth.path, drive.truth.landmarks
     assert path is not None

@@ -1,8 +1,7 @@
-"""A world as it was heard: what each strategy takes of it, and the bound on any estimate of it.
+"""A simulated world with its scans: the measurements of each strategy, and the bound on estimates.
 
-A mission and the cases of a study ask the same `HeardWorld`, so both have the same scans and bound.
-
-The record of a mission, simulated or solved from a recorded log.
+Missions and the cases of a study use the same `HeardWorld`, so their scans and bounds are equal.
+`Mission` is the record of a simulated or replayed mission.
 """
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -45,36 +44,32 @@ from pipistrelle.geometry import wrap_angle
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Mission:
-    """A mission, simulated or from a log: what was driven and heard, and each estimate of it."""
+    """A mission, simulated or from a log: its drive, measurements and estimates."""
 
     config: Config
-    """Of a log, the sections that estimators read count."""
+    """For a log only the sections of the estimators apply."""
     drive: Drive
     trials: tuple[TrialResult, ...]
     beamwidth: float | None
-    """Full half-power width of the vehicle's beam; of a log, that outside which ranges were hidden
-    [rad]."""
+    """Full half-power beamwidth of the vehicle's call; for a log, the beamwidth outside which
+    ranges were hidden [rad]."""
     callers: tuple[Caller, ...] = ()
-    """Callers besides the vehicle, where the world is known."""
+    """Callers besides the vehicle; empty for a log."""
     scenario: Scenario | None = None
-    """The world that was drawn; None for a log."""
     world: World | None = None
-    """The user's own world, if one was given."""
     heard: tuple[FrameMeasurements, ...] = ()
-    """The frames of a simulated mission."""
     log: Log | None = None
-    """The recorded log; None for a simulated mission."""
     source: Mapping[str, object] | None = None
-    """Which log it was, for ``summary.json`` (`log_entry`)."""
+    """Entry of the log in ``summary.json`` (`log_entry`)."""
     notes: Callable[[], Iterable[str]] = tuple
-    """Returns the warnings for the user; it is called after the results are written."""
+    """Returns the warnings for the user; called after the results are written."""
     difference: str = ""
-    """Of a mission that was rerun: how its tracks differ from those of its folder, in a line."""
+    """Difference of a rerun mission's tracks from its folder's, in a line."""
 
 
 _NOISE = ("noise", "range_std", "bearing_std", "excess_path_std", "calibrate")
 _CALLERS = ("caller_speed_std", "caller_walk_std")
-"""Settings of a filter that say what it is told: of what is heard, and of how callers move."""
+"""Settings of a filter that change its measurement noise, and its model of moving callers."""
 _Key = tuple[float, Strategy, FilterConfig, ListeningConfig, AssociationConfig]
 """Piston radius [m], strategy, and settings of noise, listening and association."""
 _LABELS = {"association": AssociationConfig(method=KNOWN)}
@@ -83,20 +78,11 @@ _LABELS = {"association": AssociationConfig(method=KNOWN)}
 def scans_of(
     heard: Sequence[FrameMeasurements], strategy: Strategy, config: Config
 ) -> tuple[Scan, ...]:
-    """Return what a strategy takes of each frame, with the noise that the settings state.
+    """Return the measurements of a strategy in each frame, with the noise of the settings.
 
-    Parameters
-    ----------
-    heard : sequence of FrameMeasurements
-    strategy : "active", "fused" or "passive"
-    config : Config
-
-    Returns
-    -------
-    tuple of Scan
-        A scan between frames that holds nothing for the strategy is left out. With an association
-        (``association.method``) scans bear no labels, and rows state their own noise alone: that of
-        the settings is stated after rows of one landmark were merged.
+    Frames between the vehicle's calls are omitted if they have no measurement for the strategy.
+    With a data association (``association.method``) scans have no labels and only their measured
+    noise; constant noise is set after measurements of a landmark were merged.
     """
     known = config.association.method == KNOWN
     noise = noise_of(config.filter) if known else (lambda scan: scan)
@@ -114,7 +100,7 @@ def scans_of(
 
 
 def frame_causes(heard: Sequence[FrameMeasurements], scans: Sequence[Scan]) -> Causes:
-    """Return what caused the rows of scans without labels that `scans_of` took of frames."""
+    """Return the true label of each measurement in scans without labels, from `scans_of`."""
     frames = {frame.rows.time: frame for frame in heard}
     return tuple(
         causes_of(scan, _unlabelled(frames[scan.time]), frames[scan.time].causes) for scan in scans
@@ -122,7 +108,7 @@ def frame_causes(heard: Sequence[FrameMeasurements], scans: Sequence[Scan]) -> C
 
 
 def _unlabelled(frame: FrameMeasurements) -> Scan:
-    """Return a frame's rows without labels; refuse a frame that was heard without them."""
+    """Return a frame's measurements without labels; raise if it was simulated with labels only."""
     if frame.unlabelled is None:
         raise InputError(
             "association.method: found frames that were heard with labels alone; expected some of "
@@ -132,19 +118,10 @@ def _unlabelled(frame: FrameMeasurements) -> Scan:
 
 
 def drive_of(scenario: Scenario, config: Config, iteration: int = 0) -> Drive:
-    """Return what a filter may know of a world, and the truth to score it by.
+    """Return the input of an estimator for a simulated world, and the truth for scoring.
 
-    Parameters
-    ----------
-    scenario : Scenario
-    config : Config
-    iteration : int
-        Number of the world, part of the key of a start that is drawn.
-
-    Returns
-    -------
-    Drive
-        Its true landmarks are the landmarks and then the callers that stand: the beacon is last.
+    `iteration`, the number of the world, is part of the key of a drawn start. The true landmarks
+    are the world's, then the callers that do not move, so the beacon is last.
     """
     start, covariance = scenario.path[0], _start_covariance(config)
     if config.filter.first_pose == "drawn":
@@ -169,9 +146,10 @@ def drive_of(scenario: Scenario, config: Config, iteration: int = 0) -> Drive:
 
 
 class HeardWorld:
-    """A world, the frames heard with each beam, and what follows from both, worked out once.
+    """A world, its frames for each beam, and a cache of the scans and bounds derived from them.
 
-    Configurations that are given to its methods may differ in what is neither drawn nor recorded.
+    Configurations passed to its methods may differ only in settings that change neither the world
+    nor its recording.
     """
 
     def __init__(
@@ -182,7 +160,7 @@ class HeardWorld:
         """Frames by the radius of the vehicle's piston [m]."""
         self._config = config
         self._drive = replace(drive_of(scenario, config), motion=motion_of(config.motion))
-        # No `cache` of a method: it would hold what holds it, and a world's sound for long.
+        # A `cache` of a method would keep this object, and so the world's sound, alive for long.
         self._scans: dict[_Key, tuple[Scan, ...]] = {}
         self._bounds: dict[_Key, Float[np.ndarray, "t 3 3"]] = {}
 
@@ -195,13 +173,13 @@ class HeardWorld:
         return self._scans[key]
 
     def causes(self, config: Config, strategy: Strategy) -> Causes | None:
-        """Return what caused the rows of a strategy's scans; None where labels are known."""
+        """Return the true label of each measurement of a strategy; None for known labels."""
         if config.association.method == KNOWN:
             return None
         return frame_causes(self.beams[config.emitter.radius], self.scans(config, strategy))
 
     def bound(self, config: Config, strategy: Strategy) -> Float[np.ndarray, "t 3 3"]:
-        """Return the bound of the pose at every step, for the noise that the signal tells."""
+        """Return the bound on the covariance of the pose at every step, for the measured noise."""
         noise = config.filter.model_copy(update={"noise": "measured"})
         bound = self.stated_bound(config.model_copy(update={"filter": noise}), strategy)
         if config.filter.first_pose == "drawn":
@@ -209,9 +187,9 @@ class HeardWorld:
         return bound
 
     def stated_bound(self, config: Config, strategy: Strategy) -> Float[np.ndarray, "t 3 3"]:
-        """Return the bound of the pose at every step from an exact start, for the stated noise.
+        """Return the bound of the pose at every step for an exact start and the settings' noise.
 
-        It is that of known labels, with an association, too.
+        Labels count as known, also with a data association.
         """
         noise = _only(config.filter, _NOISE + _CALLERS)
         key = (config.emitter.radius, strategy, noise, config.listening, _LABELS["association"])
@@ -223,17 +201,17 @@ class HeardWorld:
         return self._bounds[key]
 
     def _with(self, key: _Key) -> Config:
-        """Return the world's settings with those of a key."""
+        """Return the world's settings with the sections of a key replaced."""
         _, _, *sections = key
         names = ("filter", "listening", "association")
         return self._config.model_copy(update=dict(zip(names, sections, strict=True)))
 
 
 def _start_covariance(config: Config) -> Float[np.ndarray, "3 3"]:
-    """Return the covariance of the first pose, as a filter is given it."""
+    """Return the covariance of the first pose that a filter assumes."""
     return np.diag(np.square(np.array(config.filter.initial_pose_std)))
 
 
 def _only(settings: FilterConfig, names: Sequence[str]) -> FilterConfig:
-    """Return some of a filter's settings, and of the others the defaults."""
+    """Return a filter's settings with all except the named ones at their defaults."""
     return FilterConfig(**{name: getattr(settings, name) for name in names})

@@ -1,4 +1,4 @@
-"""Recorded logs: read with their truth, reduced to what a strategy hears, and solved."""
+"""Recorded logs: read with their truth, reduced to the measurements of a strategy, and solved."""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -46,9 +46,9 @@ from pipistrelle.refusals import refusal
 
 NO_BAG = BagConfig()
 KNOWN_STD = (1e-3, 1e-3)
-"""Std of a caller's given position if the log states none [m]."""
+"""Default standard deviation of a caller's given position [m]."""
 LEAST_STD = 1e-6
-"""Least std of a given position [m]; a smaller one makes the covariance singular."""
+"""Least standard deviation of a given position [m]; a smaller one gives a singular covariance."""
 
 
 def load(
@@ -59,32 +59,13 @@ def load(
     readers: Sequence[Reader] = (),
     truths: Mapping[str, WithTruth] = {},
 ) -> tuple[Log, Truth]:
-    """Read a recorded log, and what is known of its truth.
+    """Read a recorded log, and its truth if known.
 
-    Parameters
-    ----------
-    folder : Path
-        Or a file, where the format is one.
-    robot : int or str
-        Where the format holds the logs of several, as a MRCLAM set does, and only there: its
-        number or its name.
-    bag : BagConfig
-        How a ROS bag is read.
-    readers : sequence of Reader
-        Of formats that the package does not know; they are asked before its own.
-    truths : mapping of a reader's name to the function that reads its log with the truth
-        In place of the package's own of that name. Without either, the truth is ``truth.csv`` and
-        ``landmarks.csv`` beside the log.
-
-    Returns
-    -------
-    Log
-    Truth
-
-    Raises
-    ------
-    InputError
-        With the file and the line or key, what was found, what was expected and the fix.
+    `folder` may be a file for formats of a single file. `robot`, a number or a name, is needed only
+    for formats with several, such as MRCLAM sets. `readers` of other formats are tried before the
+    package's. `truths` are functions, by a reader's name, that read its log with the truth; the
+    default reads ``truth.csv`` and ``landmarks.csv`` in the log's folder. An InputError names the
+    file and the line or key, the value found, the value expected and the fix.
 
     Examples
     --------
@@ -115,7 +96,7 @@ def load(
 
 
 def _refuse_unknown(folder: Path, titles: str) -> None:
-    """Refuse what no reader recognises, by what it is; a folder of nothing known passes."""
+    """Raise if a path is missing or holds something known that is no log; other folders pass."""
     if folder.exists():
         what, _, fix = (recording_of(folder) or "").partition("; ")
         if what:
@@ -129,7 +110,7 @@ def _refuse_unknown(folder: Path, titles: str) -> None:
 
 
 def _of_ours(folder: Path) -> str | None:
-    """Name the kind of a folder that Pipistrelle wrote; None for any other."""
+    """Name the kind of a folder written by Pipistrelle; None for other folders."""
     if (folder / "plan.toml").is_file() and (folder / "trials").is_dir():
         return "a study"
     return OwnFiles(folder, LOG).there
@@ -138,12 +119,12 @@ def _of_ours(folder: Path) -> str | None:
 def as_heard_by(
     scans: Sequence[Scan], strategy: Strategy, beamwidth: float | None = None
 ) -> tuple[Scan, ...]:
-    """Return what a strategy would have heard of recorded scans, one scan for each.
+    """Reduce recorded scans to the measurements of a strategy, scan by scan.
 
-    The beam has a full width about the heading [rad]. Inside it, where the absolute bearing is at
-    most half the width, range and bearing are heard actively. Outside it only the bearing is heard,
-    passively; excess paths are heard everywhere. Fused takes both, active only rows with a range
-    and no excess paths, passive all bearings and no range. Without a beam all ranges are kept.
+    Inside the beam, of full width `beamwidth` [rad] about the heading, range and bearing are
+    measured actively. Outside it only the bearing is measured, passively; excess paths are measured
+    everywhere. Fused keeps both, active only rows with a range and no excess paths, passive all
+    bearings and no range. Without a beamwidth all ranges are kept.
 
     >>> from pipistrelle.detection.scans import make_scan
     >>> scan = make_scan(0.0, np.array([3, 8]), np.array([0.1, 0.4]), range=np.array([2.0, 5.0]))
@@ -164,7 +145,7 @@ def as_heard_by(
 
 
 def motion_of(log: Log) -> Motion:
-    """Return the motion model of a log, as the filters take it.
+    """Return the motion model of a log.
 
     >>> log = Log(
     ...     name="walk", time=np.array([0.0, 1.0]), controls=np.array([[1.0, 0.0]]),
@@ -185,7 +166,7 @@ def motion_of(log: Log) -> Motion:
 
 
 def start_of(log: Log) -> Gaussian:
-    """Return the pose at which a log starts; its errors in x, y and heading are independent.
+    """Return the initial pose of a log, with independent errors in x, y and heading.
 
     >>> log = Log(
     ...     name="walk", time=np.array([0.0, 1.0]), controls=np.array([[1.0, 0.0]]),
@@ -211,34 +192,14 @@ def replay(
     progress: Progress | None = None,
     watch: Watch | None = None,
 ) -> Mission:
-    """Let each filter map a recorded log by each strategy.
+    """Estimate path and map of a recorded log with each strategy and filter.
 
-    Parameters
-    ----------
-    log : Log
-    truth : Truth
-    strategies : sequence of "active", "fused", "passive"
-    filters : sequence of str
-        The names of estimators.
-    beamwidth : [rad], optional
-        See `as_heard_by`.
-    config : Config
-        Its sections that estimators read; what the log decides must agree with it. With "constant"
-        noise, what the rows themselves say of it is ignored; with an association, their labels are.
-    progress, watch : callable, optional
+    Ranges outside `beamwidth` [rad] are hidden (`as_heard_by`). Only the estimators' sections of
+    the settings apply, and they must agree with the log. "constant" noise ignores the standard
+    deviations in the log; an association ignores its labels. Raises InputError for an estimator
+    that cannot be found or built.
 
-    Returns
-    -------
-    Mission
-
-    Raises
-    ------
-    InputError
-        For an estimator that cannot be had or built.
-
-    Examples
-    --------
-    A post 2 m ahead, after 1 m of walk, stands at 3 m.
+    A post 2 m ahead, after a drive of 1 m, is at 3 m:
 
     >>> from pipistrelle.detection.scans import make_scan
     >>> ahead = make_scan(1.0, np.array([7]), np.array([0.0]), range=np.array([2.0]))
@@ -273,7 +234,7 @@ def replay(
 def _heard(
     log: Log, strategies: Sequence[Strategy], beamwidth: float | None, config: Config
 ) -> dict[Strategy, tuple[Scan, ...]]:
-    """Return the scans of each strategy, as settings have them."""
+    """Return the scans of each strategy under the given settings."""
     if config.association.method == KNOWN and _is_bare(log):
         raise refusal(log.name, "rows without labels", LABELS, UNKNOWN)
     scans = [without_unused(rows, config) for rows in log.scans]
@@ -299,7 +260,7 @@ def drive_of(log: Log, truth: Truth) -> Drive:
 
 
 def without_unused(scan: Scan, config: Config) -> Scan:
-    """Return a recorded scan without what the settings hide: labels, noise, excess paths."""
+    """Remove the parts of a recorded scan that the settings hide: labels, noise, excess paths."""
     known = config.association.method == KNOWN
     rows = scan if known or scan.direct.size else without_labels(scan, scan.callers)
     timing = config.listening.timing
@@ -307,14 +268,14 @@ def without_unused(scan: Scan, config: Config) -> Scan:
 
 
 def with_noise(scan: Scan, config: Config) -> Scan:
-    """Merge the rows of each landmark and state their noise, where labels are known."""
+    """Merge the measurements of each landmark and set their noise, if labels are known."""
     if config.association.method != KNOWN:
         return scan
     return noise_of(config.filter)(labelled(scan, scan.landmark))
 
 
 def check_calibrated(log: Log, config: Config) -> None:
-    """Refuse to calibrate the odometry of a vehicle whose sensor is elsewhere."""
+    """Raise if the odometry is to be calibrated with a sensor offset from the vehicle's origin."""
     asked = [name for name in config.filter.calibrate if name in OF_ODOMETRY]
     if asked and any(log.sensor_pose):
         expected = f"none of {', '.join(OF_ODOMETRY)} beside a sensor_pose"
@@ -323,18 +284,18 @@ def check_calibrated(log: Log, config: Config) -> None:
 
 LABELS = "labels of landmarks, or an association"
 UNKNOWN = "add --association.method marginal"
-"""What is expected of rows, and what to do where they have no labels."""
+"""Expected labels of a log, and the fix if it has none."""
 
 
 def _is_bare(log: Log) -> bool:
-    """Tell whether no row of a log has a label."""
+    """Return whether a log has no labels at all."""
     return all((scan.landmark == UNLABELLED).all() for scan in log.scans)
 
 
 def _log_causes(
     log: Log, heard: Mapping[Strategy, Sequence[Scan]]
 ) -> dict[Strategy, Causes | None]:
-    """Return the labels that a log's rows bear, as what caused them; None where none bears one."""
+    """Return a log's labels as the true landmark of each measurement; None if the log has none."""
     if _is_bare(log):
         return dict.fromkeys(heard)
     return {
@@ -344,7 +305,7 @@ def _log_causes(
 
 
 def _known_callers(log: Log) -> Landmarks:
-    """Return the callers whose positions the log gives, as landmarks known beforehand."""
+    """Return the callers with given positions, as landmarks known beforehand."""
     placed = [caller for caller in log.callers if caller.place is not None]
     stds = [np.maximum(caller.place_std or KNOWN_STD, LEAST_STD) for caller in placed]
     return Landmarks(
@@ -358,7 +319,7 @@ def _known_callers(log: Log) -> Landmarks:
 def _whose(
     reader: Reader, folder: Path, robot: Robot | None, formats: Sequence[Reader]
 ) -> tuple[Robot, ...]:
-    """Return the robot as arguments for the reader: one if the format holds several, else none."""
+    """Return the robot as arguments for the reader: empty if the format holds a single robot."""
     if reader.robots is None:
         if robot is None:
             return ()

@@ -1,8 +1,7 @@
-"""A mission done again from its result folder.
+"""Missions repeated from their result folders, for views that need the belief of every frame.
 
-The same settings give the same bits, so a result folder keeps no belief of every frame: to look at
-one, the mission is done again. The folder holds what that takes, its settings and, of a recorded
-log, which it was and how it was heard (`log_entry`).
+Equal settings give equal bits, so a folder stores the settings and, for a recorded log, its path,
+sums and options (`log_entry`), but no belief of every frame.
 """
 
 import math
@@ -44,10 +43,10 @@ def rerun(
     progress: Progress | None = None,
     watch: Watch | None = None,
 ) -> Mission:
-    """Do a mission again from its result folder, and compare its tracks with those there.
+    """Repeat a mission from its result folder, and compare its tracks with the stored ones.
 
-    `log` says where the log is, if it was moved. The folder may come from elsewhere, so estimators
-    and associations from outside, ``module:Class``, are run only if they are trusted.
+    `log` is the new path of a log that was moved. Estimators and associations from outside
+    (``module:Class``) run only if `trusted` lists them, as the folder may be another person's.
 
     >>> from tempfile import TemporaryDirectory
     >>> from pipistrelle.config import Config, ScenarioConfig
@@ -89,15 +88,13 @@ def rerun(
 
 
 def _not_ours(where: str, name: str, fix: str) -> InputError:
-    """Return the refusal of code from outside that a folder names and nobody else."""
+    """Return the error for code from outside that is named only by a folder."""
     found = f"{name!r}, whose code is not Pipistrelle's"
     return refusal(where, found, "one that you trust", fix)
 
 
 def log_entry(log: Path, robot: Robot | None, beamwidth: float | None) -> dict[str, object]:
-    """Return the entry of ``summary.json`` of a log: its folder and the SHA-256 of its files.
-
-    The beamwidth outside which ranges were hidden is in radians.
+    """Return the entry of a log in ``summary.json``: folder, SHA-256 of its files, beamwidth [rad].
 
     >>> from tempfile import TemporaryDirectory
     >>> with TemporaryDirectory() as name:
@@ -113,7 +110,7 @@ def log_entry(log: Path, robot: Robot | None, beamwidth: float | None) -> dict[s
 
 
 def _sums(log: Path) -> dict[str, str]:
-    """Return the SHA-256 of each file of a log and of its truth, by name."""
+    """Return the SHA-256 of each file of a log and its truth, by name."""
     patterns = (*reader_of(log).files, *truth_files.FILES)
     found = {text_of(path.name): path for pattern in patterns for path in log.glob(pattern)}
     found |= {text_of(log.name): log} if log.is_file() else {}
@@ -126,7 +123,7 @@ def _sums(log: Path) -> dict[str, str]:
 
 
 def _check_simulated(folder: Path, log: Path | None) -> None:
-    """Refuse a result folder that names no log but lacks a world, and a log for a simulated one."""
+    """Raise if a folder has neither log nor world, or if `log` is given for a simulated mission."""
     if "scenario" not in read_toml(folder / "config.toml"):
         raise refusal(
             f"{folder / SUMMARY}: log",
@@ -144,7 +141,7 @@ def _check_simulated(folder: Path, log: Path | None) -> None:
 
 
 def _log_of(folder: Path, summary: Summary, log: Path | None) -> Path:
-    """Return where the log is that was solved; refuse one that is gone or was changed."""
+    """Return the path of a mission's log; raise if it is missing or was changed."""
     assert summary.log
     path = summary.log.place if log is None else log
     where = f"{folder / SUMMARY}: log.path" if log is None else f"{folder}, option --log"
@@ -171,7 +168,7 @@ def _log_of(folder: Path, summary: Summary, log: Path | None) -> Path:
 
 
 def _difference(folder: Path, summary: Summary, trials: Sequence[TrialResult]) -> str:
-    """Describe in a line how tracks differ from those of the folder; empty if they do not."""
+    """Describe in a line how tracks differ from the tracks of a folder; empty if equal."""
     differences = {}
     for trial in trials:
         track = trial.track
@@ -192,7 +189,7 @@ def _difference(folder: Path, summary: Summary, trials: Sequence[TrialResult]) -
 
 
 def _reason(folder: Path, summary: Summary) -> str:
-    """Give the reason for a difference, where it is known: other settings or another version."""
+    """Name the reason for a difference, if known: other settings or another version."""
     if settings_hash(read_toml(folder / "config.toml")) != summary.config_hash:
         return "; config.toml was changed since"
     if summary.version != find_version():
@@ -201,13 +198,13 @@ def _reason(folder: Path, summary: Summary) -> str:
 
 
 def _apart(here: str, there: str) -> str:
-    """Word the largest distance between two tracks, where they can be compared."""
+    """Format the largest distance between two tracks; empty if they cannot be compared."""
     try:
         paths = [
             np.array([line.split()[1:3] for line in text.splitlines()], dtype=float)
             for text in (here, there)
         ]
         distance = float(np.hypot(*(paths[0] - paths[1]).T).max())
-    except ValueError:  # rows of unlike lengths, or of unlike number, or no numbers
+    except ValueError:  # unequal columns or rows, or not numbers
         return ""
     return f", by up to {distance:.2g} m" if math.isfinite(distance) else ""

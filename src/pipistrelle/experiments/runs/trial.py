@@ -1,10 +1,8 @@
-"""A mission on one screen: draw a world, listen along the path, estimate, score.
+"""Simulated missions: draw a world, simulate scans, run each estimator, score the estimates.
 
-Read this file first: each call is a box of the paper's workflow.
-
-One filter runs over one drive: it predicts, associates, updates, and every pose is kept.
-
-What cannot be used is refused here, before or after a filter has it.
+Read this file first: each call is a box of the paper's workflow. `run_filter` runs an estimator
+over a drive, scan by scan, and keeps every pose. Invalid inputs and outputs of estimators raise an
+InputError.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -71,36 +69,30 @@ def run_filter(
     progress: Callable[[int, int], None] | None = None,
     watch: Callable[[Scan, B], None] | None = None,
 ) -> Track:
-    """Conduct a `Session` over a drive: predict to each scan, correct with it, keep every pose.
+    """Run an estimator over a drive: predict to each scan, update with it, keep every pose.
 
-    Where the belief revises its path (it has ``path``), the track is the path as it is believed at
-    the end, and the poses that were kept are beside it. Where it revises those of callers, too
-    (``tracks``), they are likewise.
+    If the belief revises its path (it has ``path``), the track is the final revised path, and the
+    poses estimated at each time are kept as ``online``. Revised tracks of callers (``tracks``)
+    replace the online ones.
 
     Parameters
     ----------
     estimator : Estimator
     drive : Drive
     scans : sequence of Scan
-        In order; the time of each is one of the drive's.
+        In order, at times of the drive.
     rng : Generator
     association, noise : optional
         See `Session`.
-    progress : callable, optional
-        Given the scans done and their number.
-    watch : callable, optional
-        Given each scan, as the filter had it, and the belief after it.
-
-    Returns
-    -------
-    Track
+    progress, watch : callable, optional
+        Called with the number of scans done and the total, and with each scan, as the estimator
+        used it, and the belief after it.
 
     Raises
     ------
     InputError
-        For a row that is neither bearing nor excess path, or no number, or has no standard
-        deviation, scans out of order or at a time that is not one of the drive's, labels that are
-        none, landmarks known beforehand that move, or poses that are not one for each step.
+        For an unusable measurement or label, scans out of order or at other times than the drive's,
+        moving landmarks known beforehand, or a wrong number of poses.
     """
     time = drive.time
     steps = _steps_of(scans, time)
@@ -133,7 +125,7 @@ def run_filter(
 def _track_of(
     belief: Belief, time: Float[np.ndarray, " k"], path: Gaussian, callers: dict[int, Gaussian]
 ) -> Track:
-    """Return a drive as its last belief has it; `path`, `callers`: as believed at their time."""
+    """Return the track of a drive from its final belief and its online estimates."""
     online = replace(path, invariant=belief.pose().invariant)
     revised, cloud = answer(belief, "path"), answer(belief, "cloud")
     if revised is not None:
@@ -153,7 +145,7 @@ def _track_of(
 
 
 def _move(session: Session[B], drive: Drive, first: int, last: int, path: Gaussian) -> None:
-    """Move a session through some steps of a drive, and write the pose after each into the path."""
+    """Predict a session over some steps of a drive, and store the pose after each."""
     if last == first:
         return
     dt = np.diff(drive.time[first : last + 1])
@@ -162,7 +154,7 @@ def _move(session: Session[B], drive: Drive, first: int, last: int, path: Gaussi
 
 
 def _check_known(drive: Drive, scans: Sequence[Scan]) -> None:
-    """Refuse landmarks that are known beforehand and move."""
+    """Raise if landmarks known beforehand move."""
     labelled = (scan for scan in scans if not scan.direct.size)
     moving = {*drive.moving, *(label for scan in labelled for label in scan.moving.tolist())}
     if roving := sorted(moving.intersection(drive.known.landmark.tolist())):
@@ -172,13 +164,13 @@ def _check_known(drive: Drive, scans: Sequence[Scan]) -> None:
 
 
 def _innovations(belief: Belief) -> Innovations:
-    """Return the sum of innovations of a belief, or none if it does not keep one."""
+    """Return the accumulated innovations of a belief, or none if it has no such sum."""
     innovations = getattr(belief, "innovations", None)
     return innovations if isinstance(innovations, Innovations) else NO_INNOVATIONS
 
 
 def _follow(callers: dict[int, Gaussian], scan: Scan, belief: Belief, at: tuple[int, int]) -> None:
-    """Write where moving callers in sight are at step k of so many into their tracks."""
+    """Store the positions of moving callers in sight at step k."""
     found, (k, steps) = answer(belief, "moving") if scan.moving.size else None, at
     if found is None:
         return
@@ -190,7 +182,7 @@ def _follow(callers: dict[int, Gaussian], scan: Scan, belief: Belief, at: tuple[
 
 
 def _retraced(callers: dict[int, Gaussian], belief: Belief, steps: int) -> Mapping[int, Gaussian]:
-    """Return the tracks of callers, as the last belief revises them where it does."""
+    """Replace online tracks of callers by the revised tracks of the final belief, if any."""
     revised = answer(belief, "tracks") if callers else None
     if revised is None:
         return callers
@@ -208,7 +200,7 @@ def _retraced(callers: dict[int, Gaussian], belief: Belief, steps: int) -> Mappi
 
 
 def _filled_up(track: Gaussian, online: Gaussian) -> Gaussian:
-    """Fill the gaps of a caller's revised track with its position as believed at that time."""
+    """Fill the gaps of a caller's revised track with its online positions."""
     none = np.isnan(track.mean[:, :1])
     return Gaussian(
         mean=np.where(none, online.mean, track.mean),
@@ -217,7 +209,7 @@ def _filled_up(track: Gaussian, online: Gaussian) -> Gaussian:
 
 
 def _steps_of(scans: Sequence[Scan], time: Float[np.ndarray, " t"]) -> list[int]:
-    """Find the step that ends at each scan; refuse scans that a filter could not use."""
+    """Return the time index of each scan; raise if scans are out of order or off the time steps."""
     heard = np.array([scan.time for scan in scans], dtype=float)
     steps = np.searchsorted(time, heard)
     on_time = time[np.minimum(steps, time.size - 1)] == heard
@@ -234,7 +226,7 @@ def _steps_of(scans: Sequence[Scan], time: Float[np.ndarray, " t"]) -> list[int]
 
 
 NOT_KNOWN: Mapping[Strategy, None] = {}
-"""What caused rows, where nobody tells."""
+"""No true labels of measurements."""
 Watch = Callable[[str, str, Scan, Belief], None]
 """Called with strategy, filter, scan and the belief after it."""
 
@@ -249,11 +241,10 @@ def run_mission(
     progress: Progress | None = None,
     watch: Watch | None = None,
 ) -> Mission:
-    """Draw a world, listen along its path once, and let each filter map it by each strategy.
+    """Draw a world, simulate its scans once, and run each estimator with each strategy.
 
-    `keep` is given the sound of each frame (`listen`), `watch` each scan and the belief after it.
-    Settings, filters and worlds that cannot be used, or need more memory than there is, raise
-    `InputError` before anything is heard.
+    `keep` receives the sound of each frame (`listen`), `watch` each scan and the belief after it.
+    Invalid settings, estimators and worlds, or a lack of memory, raise an `InputError` first.
 
     >>> from pipistrelle.config import ScenarioConfig
     >>> mission = run_mission(Config(scenario=ScenarioConfig(steps=40)), ["fused"])
@@ -297,7 +288,7 @@ def run_mission(
 def in_order(
     trials: Sequence[TrialResult], strategies: Sequence[Strategy], filters: Sequence[str]
 ) -> tuple[TrialResult, ...]:
-    """Return trials by strategy, and of each by filter."""
+    """Sort trials by strategy, then by filter."""
     done = {(trial.strategy, trial.filter): trial for trial in trials}
     return tuple(done[pair] for pair in product(strategies, filters))
 
@@ -312,11 +303,10 @@ def run_trials(
     progress: Progress | None = None,
     watch: Watch | None = None,
 ) -> tuple[TrialResult, ...]:
-    """Let each filter map the scans of each strategy; one result for each pair, by strategy.
+    """Run each estimator on the scans of each strategy; return a result for each pair.
 
-    `causes`: see `run_trial`.
-
-    A filter of the user's may fail: its path is then NaN, and the result says why.
+    `causes` are the true labels, as in `run_trial`. If an estimator from outside fails, its path is
+    NaN and its result contains the error.
     """
 
     def tried(case: Case, scans: Sequence[Scan]) -> TrialResult:
@@ -348,27 +338,23 @@ def run_trial(
     progress: Progress | None = None,
     watch: Watch | None = None,
 ) -> TrialResult:
-    """Estimate path and map from one strategy's scans, and score them.
+    """Estimate path and map from the scans of a strategy, and score them.
 
     Parameters
     ----------
     case : Case
     drive : Drive
     scans : sequence of Scan
-        As `scans_of` gives them. What is labelled as a caller that moves is left out, unless the
-        settings have timing and the estimator follows.
+        From `scans_of`. Measurements labelled as moving callers are removed, unless the settings
+        use excess paths and the estimator tracks callers.
     config : Config
     association : Association, optional
-        Labels the rows of scans; that of the settings by default, where they have one. The noise of
-        rows that it merges is the settings'. Its labels are not the truth's.
+        Labels the measurements; by default from the settings, if these name a method. Its labels
+        differ from the true ones. Merged measurements have the settings' noise.
     causes : sequence of (m), optional
-        What caused the rows of each scan, to score an association by; without them the map is
-        matched with the true landmarks by position.
+        True label of each measurement, to score the association; without them the map is matched
+        with the true landmarks by position.
     progress, watch : callable, optional
-
-    Returns
-    -------
-    TrialResult
     """
     strategy, name, heard, estimator = case.strategy, case.filter, tuple(scans), entry(case.filter)
     association = association or association_of(config)
@@ -413,7 +399,7 @@ def run_trial(
 
 
 def _named(track: Track, used: Sequence[Scan], drive: Drive) -> Track:
-    """Return a track whose callers have their own labels, not those of an association."""
+    """Rename a track's callers from the association's labels to the labels of the drive."""
     if not track.callers:
         return track
     pairs = (zip(scan.callers.tolist(), drive.callers.tolist(), strict=False) for scan in used)
@@ -429,7 +415,7 @@ def _scored(
     causes: Causes | None,
     association: Association | None,
 ) -> tuple[Scores, Landmarks | None]:
-    """Return the scores of a track, and its map by the names of the truth where it has others."""
+    """Score a track; after data association, also return its map with true labels."""
     truth = drive.truth
     if association is None:
         return score(track, truth, used, limit), None
@@ -448,10 +434,9 @@ def _scored(
 def with_moving(
     scans: Sequence[Scan], drive: Drive, *, follows: bool, known: bool = True
 ) -> Sequence[Scan]:
-    """Mark the callers that move in scans, or leave out their rows.
+    """Mark moving callers in scans, or remove their measurements.
 
-    `known`: whether labels are; if not, callers are marked by their numbers, and nothing is left
-    out.
+    Without known labels callers are marked by their numbers, and nothing is removed.
     """
     if not drive.moving:
         return scans

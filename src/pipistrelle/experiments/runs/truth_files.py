@@ -1,9 +1,8 @@
-"""The truth of a recorded log, read from files beside it or from its own format.
+"""The truth of a recorded log, from files in its folder or from the log itself.
 
-A format's reader (`pipistrelle.detection.logs.readers`) never sees the truth. Its other half is a
-function here, found by the same name: it is given the reader, and what tells it which log to read,
-and returns the log with its truth. So it may tell the reader what files that hold a log alone do
-not say, when a drive began and where.
+A format's reader (`pipistrelle.detection.logs.readers`) never receives the truth. A function of the
+same name here calls it with the arguments that select a log, and returns the log with its truth. It
+can pass the start time and set the initial pose, if the log's files do not contain them.
 """
 
 import math
@@ -29,7 +28,7 @@ FILES = ("truth.csv", "landmarks.csv")
 _PATH = ("time", "x", "y", "heading")
 
 Read = Callable[..., Log]
-"""Reads a log of a folder, and of the robot where there are several."""
+"""Reads the log of a folder, and of a robot if there are several."""
 
 
 def with_files_beside(read: Read, folder: Path, *robot: Robot) -> tuple[Log, Truth]:
@@ -39,7 +38,7 @@ def with_files_beside(read: Read, folder: Path, *robot: Robot) -> tuple[Log, Tru
 
 
 def with_mrclam_truth(read: Read, folder: Path, robot: int) -> tuple[Log, Truth]:
-    """Read one robot's log where the truth is known, starting at the true pose, and the truth."""
+    """Read a robot's MRCLAM log, cut to the times of known truth, starting at the true pose."""
     time, path = read_path(folder / f"Robot{robot}_Groundtruth.dat", None)
     columns = ("subject", "x", "y", "x_std", "y_std")
     landmarks = read_landmarks(folder / "Landmark_Groundtruth.dat", columns, None)
@@ -51,10 +50,7 @@ def with_mrclam_truth(read: Read, folder: Path, robot: int) -> tuple[Log, Truth]
 
 
 def with_bag_truth(read: Read, path: Path, settings: BagConfig) -> tuple[Log, Truth]:
-    """Read a ROS bag, and the topic that tells the truth, where one is named; it starts there.
-
-    What was driven before the truth is known is left out.
-    """
+    """Read a ROS bag with the truth from a topic, if named; the log starts with the truth."""
     from pipistrelle.detection.logs.bag_log import Remarks, read_poses
 
     remarks = Remarks()
@@ -76,18 +72,18 @@ def with_bag_truth(read: Read, path: Path, settings: BagConfig) -> tuple[Log, Tr
 
 WithTruth = Callable[..., tuple[Log, Truth]]
 TRUTHS: Mapping[str, WithTruth] = {"mrclam": with_mrclam_truth, "bag": with_bag_truth}
-"""Functions that read the truth, by the reader's name; others use files beside the log."""
+"""Functions that read the truth, by the reader's name; others use the files in the log's folder."""
 
 
 def read_truth(folder: Path, time: Float[np.ndarray, " k"]) -> Truth:
-    """Read ``truth.csv`` and ``landmarks.csv`` of a log folder, where they exist.
+    """Read ``truth.csv`` and ``landmarks.csv`` of a log folder, if they exist.
 
-    The path is linear between the recorded poses, the heading unwrapped, and NaN before the first
-    and after the last of them. `time` holds the times of the track [s].
+    The path is interpolated at the times `time` [s], the heading unwrapped; NaN outside the
+    recorded poses.
     """
     path_file, landmark_file = folder / "truth.csv", folder / "landmarks.csv"
     path = landmarks = None
-    if lexists(path_file):  # also a link that leads nowhere, which is refused
+    if lexists(path_file):  # also a broken link, which raises
         path = poses_at(time, *read_path(path_file, ","))
         if np.isnan(path).all():
             expected = f"poses between the log's times {time[0].item()!r} and {time[-1].item()!r}"
@@ -98,19 +94,10 @@ def read_truth(folder: Path, time: Float[np.ndarray, " k"]) -> Truth:
 
 
 def write_truth(folder: Path, truth: Truth) -> None:
-    """Write ``truth.csv`` and ``landmarks.csv`` beside a log, exactly.
+    """Write the truth as ``truth.csv`` and ``landmarks.csv`` into a log's folder, unrounded.
 
-    Parameters
-    ----------
-    folder : Path
-        The log's folder.
-    truth : Truth
-        Rows of the path that are NaN are left out.
-
-    Raises
-    ------
-    InputError
-        Where a file cannot be written, or one in its place is not as we wrote it.
+    NaN rows of the path are omitted. Raises InputError if a file cannot be written, or was changed
+    since Pipistrelle wrote it.
 
     Examples
     --------
@@ -129,7 +116,7 @@ def write_truth(folder: Path, truth: Truth) -> None:
 
 
 def truth_files(truth: Truth) -> dict[str, str]:
-    """Return the files of the truth that belong beside a log, as far as the truth is known."""
+    """Return ``truth.csv`` and ``landmarks.csv`` as text, as far as the truth is known."""
     files = {}
     if truth.path is not None:
         rows = np.column_stack((truth.time, truth.path))[np.isfinite(truth.path).all(axis=1)]
@@ -143,9 +130,9 @@ def truth_files(truth: Truth) -> dict[str, str]:
 def read_path(
     path: Path, separator: str | None
 ) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, "n 3"]]:
-    r"""Read times [s] and poses [m, m, rad], the heading unwrapped, from a table.
+    r"""Read times [s] and poses [m, m, rad], with unwrapped heading, from a table.
 
-    Of two rows with one time the later wins. Without a separator, columns are split at spaces and
+    The later of two rows with equal time wins. Without a separator, columns are split at spaces and
     there is no header.
 
     >>> from tempfile import TemporaryDirectory
@@ -165,24 +152,10 @@ def read_path(
 
 
 def read_landmarks(path: Path, columns: tuple[str, ...], separator: str | None) -> LabelledPoints:
-    r"""Read labels and positions; each label once.
+    r"""Read labels and positions [m] of landmarks; raise if a label occurs twice.
 
-    Parameters
-    ----------
-    path : Path
-    columns : tuple of str
-        Of the table: ``landmark`` or ``subject`` first, and ``x`` and ``y`` among the others.
-    separator : str or None
-        Between columns; None: spaces, and no header.
-
-    Returns
-    -------
-    labels (n) and positions (n, 2) [m]
-
-    Raises
-    ------
-    InputError
-        With the file and the line.
+    The first of the `columns` has the labels (``landmark`` or ``subject``); the others include
+    ``x`` and ``y``. Without a separator, columns are split at spaces and there is no header.
 
     Examples
     --------

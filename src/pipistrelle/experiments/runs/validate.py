@@ -1,10 +1,7 @@
-"""Checks of estimators before anything is heard, and records of those that fail later.
+"""Checks of estimators and settings before a mission, warnings, and records of failed estimators.
 
-A trial that fails costs its own estimate; what the others found is kept.
-
-Checks of the settings of a simulated mission before anything is heard, and warnings on them.
-
-`run` asks for one mission, a study for every combination of its plan: through the same door.
+A failed trial does not stop the trials of other estimators. Missions and every combination of a
+study pass the same checks.
 """
 
 import math
@@ -36,9 +33,9 @@ from pipistrelle.kernel_clock import judging
 def check_filters(
     filters: Sequence[str], motion: Motion, config: Config, moving: Iterable[str] = ()
 ) -> None:
-    """Refuse estimators and associations that cannot be built or begun, before anything is heard.
+    """Raise if an estimator or association cannot be built or initialised.
 
-    `moving`: names of the callers that move.
+    `moving`: names of the moving callers.
     """
     check_distinct(filters)
     followed = () if association_of(config) is None or not config.listening.timing else moving
@@ -68,7 +65,7 @@ def check_filters(
 
 
 def check_calibrates(name: str, config: Config) -> None:
-    """Refuse ``filter.calibrate`` with a listed estimator that calibrates nothing."""
+    """Raise if ``filter.calibrate`` is set for an estimator that cannot calibrate."""
     asked = config.filter.calibrate
     if asked and not CATALOGUE[name].calibrates:
         able = ", ".join(known.name for known in CATALOGUE.values() if known.calibrates)
@@ -79,7 +76,7 @@ def check_calibrates(name: str, config: Config) -> None:
 
 
 def check_follows(name: str, moving: Iterable[str]) -> None:
-    """Refuse callers that move, and that an association is to find, of a filter that follows none.
+    """Raise if moving callers are to be associated with a filter that tracks none.
 
     >>> check_follows("iekf", ["boat"])
     """
@@ -92,12 +89,12 @@ def check_follows(name: str, moving: Iterable[str]) -> None:
 
 
 def _nothing() -> None:
-    """Stand for a method that a belief need not have."""
+    """Callable default for an optional method of a belief."""
 
 
 @judging()
 def first_belief(name: str, motion: Motion, config: Config) -> Belief:
-    """Return the belief of an estimator before the vehicle has moved or heard anything.
+    """Return the initial belief of an estimator, before any motion or measurement.
 
     >>> still = Motion(model="unicycle", control_std=(0.1, 0.1))
     >>> first_belief("fastslam", still, Config()).landmarks().landmark.size
@@ -107,10 +104,7 @@ def first_belief(name: str, motion: Motion, config: Config) -> Belief:
 
 
 def failed_trial(case: Case, drive: Drive, scans: Sequence[Scan], error: Exception) -> TrialResult:
-    """Return the result of a filter that failed: its poses are NaN, and it has no map.
-
-    An interruption that a library hid behind the error is raised (`let_interruptions_pass`).
-    """
+    """Return the result of an estimator that failed: NaN poses, no map, and the error."""
     let_interruptions_pass(error)
     k = drive.time.size
     nowhere = Gaussian(mean=np.full((k, 3), np.nan), covariance=np.full((k, 3, 3), np.nan))
@@ -128,16 +122,13 @@ def failed_trial(case: Case, drive: Drive, scans: Sequence[Scan], error: Excepti
 
 
 def failure_text(error: Exception) -> str:
-    """Return the traceback of the current error, with its message as the last line.
-
-    An interruption that a library hid behind the error is raised (`let_interruptions_pass`).
-    """
+    """Return the traceback of the current error, with its message as the last line."""
     let_interruptions_pass(error)
     return f"{format_exc()}{worded(error)}\n"
 
 
 def let_interruptions_pass(error: Exception) -> None:
-    """Raise an interruption that a library hid behind an error of its own."""
+    """Raise a KeyboardInterrupt that is the cause or context of another error."""
     behind: BaseException | None = error
     while behind is not None:
         if isinstance(behind, KeyboardInterrupt):
@@ -146,17 +137,17 @@ def let_interruptions_pass(error: Exception) -> None:
 
 
 def _placed(error: Exception) -> str:
-    """Return the message of an error that a filter raised, with file and line."""
+    """Return the message of an estimator's error, with file and line."""
     place = extract_tb(error.__traceback__)[-1]
     return f"{worded(error)} ({Path(place.filename).name}, line {place.lineno})"
 
 
 MANY_DOUBLES = 0.1
-"""Share of the bearings with a double from which on a warning is given."""
+"""Share of ambiguous bearings that gives a warning."""
 CLOSEST = 0.25
-"""Spacing of hydrophones below which they warn, in waves."""
+"""Spacing of hydrophones, in wavelengths, below which a warning is given."""
 KILOHERTZ = 1e3
-"""Sonars call at 1 kHz to 1 MHz, so a smaller number of hertz is probably of kilohertz [Hz]."""
+"""Sonars call at 1 kHz to 1 MHz; smaller frequencies [Hz] were probably given in kilohertz."""
 
 
 @judging()
@@ -168,10 +159,10 @@ def checked_scenario(
     filters: int = 1,
     workers: int = 1,
 ) -> Scenario:
-    """Draw the first world of a mission, and refuse settings with which it cannot be heard.
+    """Draw the first world of a mission; raise if its sound cannot be simulated with the settings.
 
-    Memory is estimated for so many strategies and filters, and for so many workers on this machine
-    (0 if they are elsewhere).
+    Memory is checked for the numbers of strategies and filters, and of workers on this machine (0
+    for a cluster).
 
     >>> from pipistrelle.config import EmitterConfig, ReceiverConfig
     >>> len(checked_scenario(Config()).landmarks)
@@ -193,17 +184,13 @@ def checked_scenario(
 
 
 def warnings_of(config: Config, callers: Sequence[Caller] = ()) -> tuple[str, ...]:
-    r"""Warn of a receiver whose spacing makes bearings ambiguous, or whose sampling aliases tones.
+    r"""Return warnings about ambiguous bearings, aliased tones and settings for the wrong medium.
 
-    In water also of what fits air: a call that is deaf too far, and hydrophones too close.
-
-    Elements a distance d apart cannot tell the angle :math:`\theta` off their normal from another,
-    the grating lobe,
+    Elements with spacing d cannot distinguish the angle :math:`\theta` from their normal from the
+    grating lobe
 
     .. math:: \sin\theta_g = \sin\theta - \lambda / d .
 
-    Notes
-    -----
     Van Trees, Optimum Array Processing (2002), Sec. 2.4.
 
     >>> from pipistrelle.config import ReceiverConfig
@@ -222,10 +209,10 @@ def warnings_of(config: Config, callers: Sequence[Caller] = ()) -> tuple[str, ..
     for caller in callers:
         frequency, key = caller.frequency, caller.key or caller.name
         tone, wave = f"{key}.frequency ({frequency:g} Hz)", config.medium.sound_speed / frequency
-        nearest = wave / spacing - math.sin(math.radians(limit))  # its lobe lies at the limit
+        nearest = wave / spacing - math.sin(math.radians(limit))  # its lobe is at the limit
         if isinstance(layout, Scattered):
             warnings += _doubles(layout, frequency, tone, config.medium.sound_speed)
-        elif nearest < 1.0 and caller.sound is None:  # a band's delays tell the lobe
+        elif nearest < 1.0 and caller.sound is None:  # the delays of a band resolve the ambiguity
             warnings.append(
                 f"receiver.spacing: {spacing:g} m is {spacing / wave:.2f} of a wave at {tone}: "
                 f"echoes {math.degrees(math.asin(max(nearest, 0.0))):.0f} degrees off a face's "
@@ -241,7 +228,7 @@ def warnings_of(config: Config, callers: Sequence[Caller] = ()) -> tuple[str, ..
 
 
 def _kilohertz(section: Section, place: str = "") -> list[str]:
-    """Ask whether frequencies below 1 kHz are in kilohertz, of all settings in hertz.
+    """Warn of frequencies below 1 kHz, in all settings with the unit hertz.
 
     >>> from pipistrelle.config import EmitterConfig
     >>> _kilohertz(Config(emitter=EmitterConfig(frequency=40.0)))
@@ -264,7 +251,7 @@ def _kilohertz(section: Section, place: str = "") -> list[str]:
 
 
 def _of_the_other_medium(config: Config) -> list[str]:
-    """Warn of settings that count in the other medium alone, and in water of those that suit air.
+    """Warn of settings for an unused medium and, in water, of settings that fit only air.
 
     >>> from pipistrelle.config import WaterConfig
     >>> config = Config(water=WaterConfig(salinity=0.0))
@@ -282,7 +269,7 @@ def _of_the_other_medium(config: Config) -> list[str]:
 
 
 def _left_from_air(config: Config) -> list[str]:
-    """Warn of settings that suit sound in air, and not the longer waves and ways of water."""
+    """Warn of call duration and spacing that fit the shorter waves and paths in air."""
     pulse, spacing, c = config.emitter.pulse, config.receiver.spacing, config.medium.sound_speed
     nearest, deaf = config.rays.range_bounds[0], 0.5 * c * pulse
     wave, warnings = c / config.emitter.centre, []
@@ -302,7 +289,7 @@ def _left_from_air(config: Config) -> list[str]:
 
 
 def _cost(config: Config, callers: Sequence[Caller]) -> list[str]:
-    """Say what it costs to record every sample, where nobody has asked for that."""
+    """Warn of the run time of recording every sample, if the settings do not request it."""
     why = off_raster(config, callers)
     swept = [caller.key or caller.name for caller in callers if caller.sound is not None]
     if config.receiver.engine != "auto" or not (why or swept):
@@ -314,7 +301,7 @@ def _cost(config: Config, callers: Sequence[Caller]) -> list[str]:
 
 
 def _doubles(layout: Scattered, frequency: float, tone: str, c: float) -> list[str]:
-    """Warn of groups of microphones to which much of the circle sounds as another part of it."""
+    """Warn of groups of microphones with many ambiguous bearings."""
     warnings = []
     for g, name in enumerate(layout.name):
         found = pattern_of(layout, g, frequency=frequency, speed_of_sound=c)
@@ -330,7 +317,7 @@ def _doubles(layout: Scattered, frequency: float, tone: str, c: float) -> list[s
 
 
 def _refuse_supersonic(scenario: Scenario, config: Config) -> None:
-    """Refuse a vehicle or a caller that is faster than sound."""
+    """Raise if the vehicle or a caller is faster than sound."""
 
     def fastest(path: np.ndarray) -> float:
         return np.hypot(*np.diff(path, axis=0).T).max(initial=0.0) / config.scenario.step

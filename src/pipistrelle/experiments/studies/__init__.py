@@ -1,4 +1,4 @@
-"""Many worlds: a `plan` (as a file: `plan_file`), the `world` that it tries, the `store` it fills.
+"""Studies of many worlds: a `plan`, the trials of each `world`, and the `store` of their results.
 
-`study` runs what is not done yet, on one of the `executors`.
+`study` runs the unfinished worlds in this process or on an executor of `executors`.
 """

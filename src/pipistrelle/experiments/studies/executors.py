@@ -1,4 +1,4 @@
-"""Executors: worlds in this machine's processes, or on a Dask cluster."""
+"""Executors of a study: worlds computed in this machine's processes, or on a Dask cluster."""
 
 import os
 import signal
@@ -20,25 +20,25 @@ from pipistrelle.config import InputError
 from pipistrelle.experiments.studies.world import EndedTrial
 
 AHEAD = 1000
-"""Worlds handed to a cluster before the first of them is done."""
+"""Worlds submitted to a cluster before the first of them is done."""
 
 _NO_PAGES = {f"distributed.{who}.http.routes": [] for who in ("scheduler", "worker")}
-"""Settings of a local cluster: Dask's web pages are off."""
+"""Settings of a local cluster that disable Dask's web pages."""
 
 
 Task = Callable[[int], list[EndedTrial]]
-"""Computes a world, writes its results, and tells how its trials ended."""
+"""Computes a world, writes its results, and returns the outcome of its trials."""
 Ended = tuple[int, "Future[list[EndedTrial]]"]
-"""A world that has ended, and the future of its trials."""
+"""Number of a finished world, and the future of its trials."""
 Results = Generator[list[EndedTrial], None, None]
-"""The trials of one world after another, in the order in which they end."""
+"""The trials of each world, in the order in which the worlds end."""
 
 
 def ended(executor: Executor, task: Task, waiting: deque[int], ahead: int) -> Iterator[Ended]:
-    """Keep an executor busy, and yield each world that has ended, with the future of its trials.
+    """Keep an executor busy; yield each finished world with the future of its trials.
 
-    At most `ahead` worlds are handed over before the first of them has ended. Once the executor is
-    broken, no more is handed to it, and what is left stays in ``waiting``.
+    At most `ahead` worlds are pending. Once the executor is broken, no more are submitted, and the
+    rest stays in ``waiting``.
 
     >>> from concurrent.futures import ThreadPoolExecutor
     >>> def task(world):
@@ -55,7 +55,7 @@ def ended(executor: Executor, task: Task, waiting: deque[int], ahead: int) -> It
                     running[executor.submit(task, waiting[0])] = waiting[0]
                     waiting.popleft()
             except BrokenExecutor:
-                ahead = 0  # nothing more can be started; what runs is reported
+                ahead = 0  # start no more; report the running worlds
             for future in wait(running, return_when=FIRST_COMPLETED).done:
                 yield running.pop(future), future
     finally:
@@ -64,10 +64,10 @@ def ended(executor: Executor, task: Task, waiting: deque[int], ahead: int) -> It
 
 
 def in_processes(task: Task, give_up: Task, waiting: deque[int], workers: int) -> Results:
-    """Run worlds in spawned processes, and yield the ended trials of one world after another.
+    """Run worlds in spawned processes, and yield the trials of each finished world.
 
-    Worlds in processes that die are tried again, one at a time; `give_up` is called for a world
-    whose process has died twice.
+    The worlds of processes that died are tried again, in a single process; `give_up` is called for
+    a world that has lost its process twice.
     """
     alive = False
     while waiting:
@@ -87,7 +87,10 @@ def in_processes(task: Task, give_up: Task, waiting: deque[int], workers: int) -
 def _in_pool(
     task: Task, waiting: deque[int], workers: int, broken: deque[int]
 ) -> Generator[list[EndedTrial], None, bool]:
-    """Run worlds until a process dies; yield those that were running then, return if any ended."""
+    """Run worlds until a process dies; put the unfinished running worlds into `broken`.
+
+    Returns whether any world has finished.
+    """
     alive = False
     with _pool(min(workers, len(waiting))) as pool:
         for iteration, future in ended(pool, task, waiting, workers):
@@ -101,12 +104,12 @@ def _in_pool(
 
 @contextmanager
 def _pool(workers: int) -> Iterator[Executor]:
-    """Spawn worker processes; kill them when they are no longer wanted."""
+    """Spawn worker processes; kill them if the caller fails."""
     from concurrent.futures import ProcessPoolExecutor
     from multiprocessing import active_children, get_context
 
     class Pool(ProcessPoolExecutor):
-        """A pool whose processes ignore Ctrl-C from their start, and start as tasks come."""
+        """Process pool that spawns processes on demand, with Ctrl-C ignored from their start."""
 
         def submit(self, fn: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future[Any]:
             with _held_interrupt():
@@ -126,7 +129,7 @@ def _pool(workers: int) -> Iterator[Executor]:
 
 @contextmanager
 def _held_interrupt() -> Iterator[None]:
-    """Defer Ctrl-C; a process that is started meanwhile ignores it."""
+    """Block Ctrl-C in this context; processes started in it ignore Ctrl-C."""
     if not hasattr(signal, "pthread_sigmask"):
         yield
         return
@@ -138,7 +141,7 @@ def _held_interrupt() -> Iterator[None]:
 
 
 def _become_worker() -> None:
-    """Ignore Ctrl-C in a worker, and end it when its parent process is gone."""
+    """Ignore Ctrl-C in a worker, and exit when its parent process has ended."""
     from multiprocessing import parent_process
 
     signal.signal(signal.SIGINT, signal.SIG_IGN)
@@ -156,11 +159,10 @@ def _become_worker() -> None:
 def on_cluster(
     task: Task, give_up: Task, waiting: deque[int], workers: int, address: str
 ) -> Results:
-    """Run worlds on Dask's workers, and yield the ended trials of one world after another.
+    """Run worlds on Dask's workers, and yield the trials of each finished world.
 
-    The address is that of a scheduler, or "local" for a cluster of so many workers on this machine.
-    Dask itself tries again what a dead worker leaves; `give_up` is called for a world that it no
-    longer tries.
+    `address` is a scheduler's, or "local" for a cluster of `workers` on this machine. Dask retries
+    the worlds of a dead worker; `give_up` is called for a world that it abandons.
     """
     with _client(address, workers) as client:
         from distributed import KilledWorker
@@ -183,9 +185,9 @@ def on_cluster(
 
 
 def check_cluster(address: str) -> None:
-    """Refuse a cluster where Dask is not installed."""
+    """Raise if Dask is not installed."""
     try:
-        import cryptography  # noqa: F401  (Dask asks for it when it makes certificates)
+        import cryptography  # noqa: F401  (Dask needs it for certificates)
         import dask  # noqa: F401
         import distributed  # noqa: F401
     except ImportError as error:
@@ -197,7 +199,7 @@ def check_cluster(address: str) -> None:
 
 @contextmanager
 def _client(address: str, workers: int) -> Iterator[Any]:
-    """Connect to a cluster, one on this machine if none is named."""
+    """Connect to a cluster, started on this machine for the address "local"."""
     from dask import config as dask_config
     from distributed import Client, LocalCluster
 
@@ -216,7 +218,7 @@ def _client(address: str, workers: int) -> Iterator[Any]:
         cluster = LocalCluster(
             n_workers=workers,
             threads_per_worker=1,
-            security=True,  # certificates of its own: who does not hold them is not listened to
+            security=True,  # certificates of this cluster; other clients are rejected
             dashboard_address="127.0.0.1:0",  # 8787 may be taken
             worker_dashboard_address="127.0.0.1:0",
             scheduler_kwargs={"dashboard": False},
@@ -227,7 +229,7 @@ def _client(address: str, workers: int) -> Iterator[Any]:
 
 @contextmanager
 def _started_deaf() -> Iterator[None]:
-    """Start processes that ignore Ctrl-C."""
+    """Make processes that are started in this context ignore Ctrl-C."""
     if threading.current_thread() is not threading.main_thread():
         yield
         return

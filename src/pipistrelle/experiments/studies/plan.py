@@ -1,14 +1,10 @@
-"""A study's plan: the settings that it varies, and the cases that result.
+"""Study plans: the varied settings and the resulting cases, read from and written to TOML.
 
 The cases are the product of the grid, the strategies and the filters. A passive case does not
-depend on the vehicle's beam: there is one for all radii, heard beside the narrowest beam.
+depend on the vehicle's beam, so all radii share a single passive case.
 
-A plan as a file: read, checked, written, compared.
-
-Beamwidths in a plan's grid: each stands for the piston that makes it.
-
-A plan may vary `beamwidth` [deg] in place of `emitter.radius` [m]. What is kept and compared is the
-radius alone, so that both ways of writing a plan are one study.
+A grid may vary `beamwidth` [deg] instead of `emitter.radius` [m]. It is converted to the radius of
+the piston with that beamwidth, so both forms describe the same study.
 """
 
 import json
@@ -69,53 +65,51 @@ from pipistrelle.settings import (
 
 RADIUS, WORLD = ".".join(RADIUS_KEY), ".".join(WORLD_KEY)
 MOST_CASES = 2**15 - 1
-"""Largest number of cases, so that their numbers fit the column of the tables."""
+"""Largest number of cases; case numbers are 16-bit in the tables."""
 MOST_WORLDS = 1_000_000
-"""Largest number of worlds; each is one file for every table."""
+"""Largest number of worlds; each is a file per table."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Plan:
-    """What a study varies, and in how many worlds."""
+    """A study's settings, their varied values, and its number of worlds."""
 
     name: str
     iterations: int
-    """Number of worlds."""
     strategies: tuple[Strategy, ...]
     filters: tuple[str, ...]
-    """The names of estimators."""
     config: Config
-    """Settings of every case, unless the grid says otherwise."""
+    """Settings of every case, unless the grid overrides them."""
     grid: Mapping[str, tuple[Any, ...]]
-    """Settings by their dotted name, with the values that each takes."""
+    """Values of each varied setting, by dotted name."""
     own: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
-    """Settings of one filter alone by its name, each by its dotted name; they change nothing that
-    is heard."""
+    """Settings for single filters, by filter and dotted name; they do not change the simulated
+    measurements."""
     worlds: Mapping[str, World] = field(default_factory=dict)
-    """Worlds that ``scenario.world`` names, by their names."""
+    """World folders, by their names in ``scenario.world``."""
     planned: int = 0
-    """Number of worlds of a whole study, as the plan's file names it, though fewer were asked for;
-    at least ``iterations`` in what is read."""
+    """Number of worlds in the plan's file, if fewer are requested; at least ``iterations`` once
+    read."""
 
     def world(self, config: Config) -> World:
-        """Return the user's own world that settings name, or the one of which all is drawn."""
+        """Return the user's world that the settings name, or a world without known parts."""
         return ALL_DRAWN if config.scenario.world is None else self.worlds[config.scenario.world]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PlannedCase(Case):
-    """One combination of a plan: a case, in any world, with its settings."""
+    """A combination of a plan's grid, strategy and filter, with its settings, for any world."""
 
     number: int
     """Number of the case, from 0, in the order of the plan."""
     values: Mapping[str, Any]
-    """Values of the grid's settings; None for the radius of a passive case."""
+    """Values of the grid; the radius of a passive case is None."""
     config: Config
-    """Settings with these values, and with those of the filter alone."""
+    """Settings with these values and the filter's overrides."""
 
 
 def cases_of(plan: Plan) -> tuple[PlannedCase, ...]:
-    """Lay out the cases of a plan, in the order of their numbers.
+    """Return the cases of a plan, in order of their numbers.
 
     >>> grid = {"emitter.radius": (0.0025, 0.025)}
     >>> ways = {"strategies": ("active", "passive"), "filters": ("ekf",)}
@@ -143,7 +137,7 @@ def cases_of(plan: Plan) -> tuple[PlannedCase, ...]:
 
 
 def own_config(plan: Plan, name: str, config: Config) -> Config:
-    """Return settings with those of one filter's own laid over them.
+    """Return settings with a filter's overrides from the plan applied.
 
     >>> own = {"iekf": {"filter.noise": "measured"}}
     >>> ways = {"strategies": ("fused",), "filters": ("ekf", "iekf")}
@@ -161,7 +155,7 @@ def own_config(plan: Plan, name: str, config: Config) -> Config:
 
 
 def common(plan: Plan, values: Mapping[str, Any]) -> Config:
-    """Return a plan's settings with some values of its grid, without those of one filter alone.
+    """Return a plan's settings with some values of its grid, without overrides for single filters.
 
     >>> ways = {"strategies": ("fused",), "filters": ("ekf",), "config": Config()}
     >>> plan = Plan(name="one", iterations=1, grid={"filter.gate": (0.9,)}, **ways)
@@ -180,9 +174,9 @@ def combinations(
     prefix: str,
     worlds: Mapping[str, World] = MappingProxyType({}),
 ) -> Iterator[tuple[dict[str, Any], Config]]:
-    """Yield each combination of a grid, its values by name, and the settings with these values.
+    """Yield each combination of a grid: its values by name, and the settings with these values.
 
-    The values of the last name change fastest. The prefix stands before a name in a refusal.
+    The values of the last name change fastest. `prefix` precedes a name in error messages.
 
     >>> grid = {"seed": (1, 2), "filter.gate": (0.9,)}
     >>> [(named["seed"], config.filter.gate) for named, config in combinations({}, grid, "grid.")]
@@ -204,9 +198,10 @@ MAKERS = (
     *("emitter.call", "emitter.band", "emitter.frequency"),
     *("air.speed_of_sound", "air.temperature_c"),
 )
-"""Settings that change the beamwidth; the last one unless the speed of sound is set."""
+"""Settings that change the beamwidth; the last only if no speed of sound is given."""
 DIGITS = Context(prec=12, rounding=ROUND_FLOOR)
-"""Digits of a radius on which machines agree; rounded down, so that no beam exceeds the widest."""
+"""Significant digits of a radius, so that all machines agree; rounded down, so that no beam exceeds
+the widest."""
 
 
 def with_radii(
@@ -214,7 +209,7 @@ def with_radii(
 ) -> dict[str, Any]:
     """Replace the beamwidths of a grid by piston radii, in the same order.
 
-    The layer holds the plan's settings, which give the tone and the speed of sound.
+    `layer` contains the plan's settings, which give the tone and the speed of sound.
 
     >>> with_radii("grid", {"beamwidth": [180, 11.4], "seed": []}, ["active"], {})
     {'emitter.radius': [0.0025210352264, 0.0253830203249], 'seed': []}
@@ -241,7 +236,7 @@ def with_radii(
 def _check_alone(
     where: str, grid: Mapping[str, Any], strategies: Sequence[str], layer: Layer
 ) -> None:
-    """Refuse beamwidths beside radii or settings that decide them, or if all is passive."""
+    """Raise if a grid's beamwidths conflict with radii, other settings or passive sensing only."""
     emitter = grid.get("emitter")
     if RADIUS in grid or (isinstance(emitter, dict) and "radius" in emitter):
         raise InputError(f"{where}.{BEAMWIDTH}: is {RADIUS} in other words; vary one of them")
@@ -258,7 +253,7 @@ def _check_alone(
 
 
 def _radius(where: str, width: Any, config: Config) -> float:
-    """Find the piston that makes a beamwidth [deg]."""
+    """Return the radius [m] of the piston with a beamwidth [deg]."""
     from pipistrelle.acoustics.emitter import piston_radius
 
     number = isinstance(width, (int, float)) and not isinstance(width, bool)
@@ -273,7 +268,7 @@ FORMAT = 1
 
 
 def _named(found: Any) -> str:
-    """Accept the name of an estimator; one from outside need not be installed to read a plan."""
+    """Validate the name of an estimator; an external estimator need not be installed."""
     try:
         return check_name(str(found))
     except InputError:
@@ -284,7 +279,7 @@ def _named(found: Any) -> str:
 
 
 class _Head(Section):
-    """A plan without settings and grid, as its file holds it."""
+    """Keys of a plan file, except settings and grid."""
 
     format: Literal[1]
     name: Annotated[str, Field(pattern=r"^\w[\w.-]*$")]
@@ -297,7 +292,7 @@ class _Head(Section):
 
 
 def find_plan(word: str) -> Path:
-    """Return the path of a plan that is named by a word of `PLANS` or by its path.
+    """Return the path of a plan given by a name of `PLANS` or a path.
 
     >>> find_plan("paper").name
     'paper.toml'
@@ -314,9 +309,7 @@ def find_plan(word: str) -> Path:
 
 
 def read_plan(path: Path, over: Layer | None = None, iterations: int | None = None) -> Plan:
-    """Read a plan, lay settings over its own, and check every combination.
-
-    Iterations replace the plan's number of worlds.
+    """Read a plan, with `over` and `iterations` replacing its values, and check every combination.
 
     >>> from pipistrelle.experiments.studies.plan import cases_of
     >>> plan = read_plan(find_plan("paper"))
@@ -332,9 +325,9 @@ def plan_of(
     over: Layer | None = None,
     iterations: int | None = None,
 ) -> Plan:
-    """Make a plan of what its file would hold, and check every combination.
+    """Create a plan from the content of its file, and check every combination.
 
-    The path is the file's name in refusals, and its relative paths lead from there.
+    `path` is the file's name in error messages and the base of relative paths.
 
     >>> levels = {"beacon.level_db": [36.8, 42.8]}
     >>> plan_of({"format": 1, "iterations": 6, "grid": levels}).grid
@@ -385,9 +378,9 @@ def plan_of(
 def _check_unvaried(
     path: Path, layer: Layer, grid: Mapping[str, Any], over: Layer, in_degrees: bool
 ) -> None:
-    """Refuse a setting of which the grid has several values; `in_degrees`: those of the beam."""
+    """Raise if a setting has a value although the grid varies it, perhaps as a beamwidth."""
     for key in (key for key in layer if ".".join(key) in grid):
-        # The plan in a study's folder names every setting; a default there says nothing.
+        # The plan in a study's folder lists every setting, so a default value is no conflict.
         if key in over or resolve({key: layer[key]}) != Config():
             name = f" as {BEAMWIDTH}" * (in_degrees and ".".join(key) == RADIUS)
             why = f"the plan varies this setting{name}; take it out of [grid] in {path}"
@@ -395,7 +388,7 @@ def _check_unvaried(
 
 
 def _beneath(path: Path, table: Mapping[str, Any], over: Layer) -> tuple[Layer, tuple[str, ...]]:
-    """Return the settings that lie beneath a plan by name, and the estimators that they name."""
+    """Return the preset's settings below a plan, and the estimators that the preset names."""
     config = table.get("config")
     places = (config if isinstance(config, dict) else {}, table)
     words = [Given(one["settings"], f"{path}: settings") for one in places if "settings" in one]
@@ -404,9 +397,9 @@ def _beneath(path: Path, table: Mapping[str, Any], over: Layer) -> tuple[Layer, 
 
 
 def _with_named(own: Any, named: Mapping[str, Layer], filters: Sequence[str]) -> Any:
-    """Lay the settings of a plan that are one filter's own over those that are by name."""
+    """Merge a plan's settings for single filters over the preset's."""
     if not isinstance(own, dict) or not all(isinstance(one, dict) for one in own.values()):
-        return own  # refused with all else
+        return own  # rejected later with all values
     beneath = {
         name: {".".join(key): given.value for key, given in named[name].items()}
         for name in filters
@@ -416,7 +409,7 @@ def _with_named(own: Any, named: Mapping[str, Layer], filters: Sequence[str]) ->
 
 
 def _laid(path: Path, table: Mapping[str, Any], over: Layer, worlds: dict[str, World]) -> Layer:
-    """Return a plan's settings over those of the world that they name, below the given ones."""
+    """Merge the settings of a world, a plan and `over`, in rising priority; read named files."""
     layer: Layer = {
         key: Given(value, f"{path}: config.{name}")
         for key, name, value in _settings(path, "config", table)
@@ -430,12 +423,12 @@ def _laid(path: Path, table: Mapping[str, Any], over: Layer, worlds: dict[str, W
 
 
 def _beside(path: Path, folder: str) -> str:
-    """Return the path of a folder that a file names, from where the file lies."""
+    """Return the path of a folder relative to a plan's file."""
     return str(path.parent / folder)
 
 
 def _read(path: Path, key: Key, values: Any, worlds: dict[str, World]) -> Any:
-    """Read the files that a grid names: of worlds, and of the routes of callers."""
+    """Read the files that a grid names: worlds, arrays, and callers' routes."""
     if key == WORLD_KEY:
         return _worlds(path, values, worlds)
     if key == CALLERS and isinstance(values, list):
@@ -451,7 +444,7 @@ def _read(path: Path, key: Key, values: Any, worlds: dict[str, World]) -> Any:
 def _worlds(path: Path, folders: Any, worlds: dict[str, World]) -> Any:
     """Read the worlds of a grid, and return their names."""
     if not isinstance(folders, list) or not all(isinstance(one, str) for one in folders):
-        return folders  # refused with all other values
+        return folders  # rejected later with all values
     names = []
     for folder in folders:
         world = read_world(Path(_beside(path, folder)))
@@ -471,7 +464,7 @@ def _own(
     layer: Layer,
     worlds: Mapping[str, World],
 ) -> dict[str, dict[str, Any]]:
-    """Check the settings that are one filter's own: none of them changes what is heard."""
+    """Validate settings for single filters, which must not change the simulated measurements."""
     if not isinstance(table, dict) or not all(
         isinstance(settings, dict) for settings in table.values()
     ):
@@ -500,7 +493,7 @@ def _own(
 
 
 def plan_text(plan: Plan) -> str:
-    """Write a plan as TOML that names every setting and reads back as the same plan.
+    """Format a plan as TOML that lists every setting and can be read back as the same plan.
 
     >>> print(plan_text(read_plan(find_plan("paper"), iterations=3)).splitlines()[2])
     iterations = 3
@@ -511,7 +504,7 @@ def plan_text(plan: Plan) -> str:
 
 
 def changed_settings(there: Plan, asked: Plan) -> list[str]:
-    """Name what differs between two plans, except the number of worlds.
+    """List the differences between two plans, except the number of worlds.
 
     >>> plans = [
     ...     read_plan(find_plan("paper"), from_flags({"seed": seed}), seed) for seed in (1, 2)
@@ -536,9 +529,7 @@ def _digest(world: World) -> str:
 
 
 def plan_settings(plan: Plan) -> dict[str, Any]:
-    """Return all that a plan says, by dotted names.
-
-    The speed of sound is among it, given or not, and of each world a sum of its files.
+    """Return all settings of a plan by dotted names, with derived values and its worlds' digests.
 
     >>> plan_settings(read_plan(find_plan("paper")))["iterations"]
     115
@@ -550,12 +541,12 @@ def plan_settings(plan: Plan) -> dict[str, Any]:
 
 
 def _worded(table: Mapping[str, Any], name: str) -> str:
-    """Return a plan's value as text."""
+    """Format a plan's value as JSON, or "nothing" if it is missing."""
     return json.dumps(table[name]) if name in table else "nothing"
 
 
 def _as_table(plan: Plan) -> dict[str, Any]:
-    """Return a plan as nested tables and lists; what the grid varies has its default beside it."""
+    """Return a plan as nested tables and lists; settings varied by the grid keep their defaults."""
     layer = from_flags(plan.config.model_dump(mode="json"))
     kept = {key: layer[key] for key in layer if ".".join(key) not in plan.grid}
     own = {name: dict(settings) for name, settings in plan.own.items()}
@@ -581,7 +572,7 @@ def _as_table(plan: Plan) -> dict[str, Any]:
 
 
 def _head(path: Path, table: Mapping[str, Any], iterations: int | None) -> _Head:
-    """Check the keys of a plan other than its settings and grid."""
+    """Validate the keys of a plan, except settings and grid."""
     keys = (*_Head.model_fields, "settings", "config", "grid", "own")
     for name in table:
         if name not in keys:
@@ -596,7 +587,7 @@ def _head(path: Path, table: Mapping[str, Any], iterations: int | None) -> _Head
     try:
         head = _Head.model_validate_json(json.dumps(given, default=str), strict=True)
     except ValidationError as refused:
-        wrong = refused.errors(include_url=False)  # a list of refused items counts as too short
+        wrong = refused.errors(include_url=False)  # also lists of only invalid items are too short
         wrong = [error for error in wrong if error["type"] != "too_short" or error["input"] == []]
         problems = [_problem(path, error) for error in wrong]
         raise InputError("\n".join(problems)) from None
@@ -607,7 +598,7 @@ def _head(path: Path, table: Mapping[str, Any], iterations: int | None) -> _Head
 
 
 def _problem(path: Path, error: Any) -> str:
-    """Say which key of a plan was refused, what was found and what was expected."""
+    """Format a validation error of a plan: the key, the value found and the value expected."""
     name = ".".join(map(str, error["loc"]))
     if error["type"] == "missing":
         example = {"format": FORMAT, "iterations": 20}.get(name)
@@ -621,7 +612,7 @@ def _problem(path: Path, error: Any) -> str:
 def _settings(
     path: Path, table: str, settings: Mapping[str, Any]
 ) -> Iterator[tuple[Key, str, Any]]:
-    """Walk through a table's settings: key, dotted name and value of each."""
+    """Yield key, dotted name and value of each setting in a table."""
     keys_by_name = {".".join(key): key for key in known_settings()}
     for key, value in leaves(settings, (CALLERS,)):
         name = ".".join(key)
@@ -633,7 +624,7 @@ def _settings(
 
 
 def _values(path: Path, name: str, key: Key, values: Any, layer: Layer) -> tuple[Any, ...]:
-    """Check the values that a grid gives a setting."""
+    """Validate and return the values of a setting in the grid."""
     where = f"{path}: grid.{name}"
     if key == ("seed",):
         raise InputError(f"{where}: every iteration is another world already; raise iterations")
@@ -652,12 +643,12 @@ def _values(path: Path, name: str, key: Key, values: Any, layer: Layer) -> tuple
 
 
 def _stated(callers: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
-    """Return the tables of callers without the keys that are None."""
+    """Return the tables of callers without keys that are None."""
     return [{k: v for k, v in caller.items() if v is not None} for caller in callers]
 
 
 def _check_distinct(where: str, values: Sequence[Any]) -> None:
-    """Refuse values that occur twice."""
+    """Raise if a value occurs twice."""
     seen = set()
     for value in values:
         before = len(seen)
@@ -674,5 +665,5 @@ def _meant(name: str, names: Iterable[str]) -> str:
 
 
 def _some(names: Sequence[str]) -> str:
-    """List names, or say where they are listed when they are many."""
+    """Format up to nine names, or refer to the command that lists them."""
     return ", ".join(names) if len(names) < 10 else "those of `pipistrelle config show`"

@@ -1,6 +1,6 @@
-"""A study's folder: its plan, and one file per world and table, whole or not there.
+"""A study's folder: its plan, and per world and table a file that is complete or missing.
 
-So a study can be killed anywhere, continued, and written to by many processes at once
+A study can therefore be killed at any time, continued, and written by many processes at once
 (`pipistrelle.experiments.studies.world`).
 """
 
@@ -59,7 +59,7 @@ Two runs of one plan differ in wall_s and cpu_s alone.
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class StoredStudy:
-    """A study as far as it is done: its plan, and its tables, not yet read."""
+    """The plan of a study, and lazy tables of its finished worlds."""
 
     plan: Plan
     trials: "pl.LazyFrame"
@@ -68,7 +68,7 @@ class StoredStudy:
 
 
 def open_store(folder: Path, plan: Plan) -> None:
-    """Make a study's folder, or accept one of the same plan, perhaps with fewer iterations.
+    """Create a study's folder, or accept the folder of the same plan, also with fewer iterations.
 
     >>> import tempfile
     >>> from pipistrelle.experiments.studies.plan import find_plan
@@ -80,11 +80,11 @@ def open_store(folder: Path, plan: Plan) -> None:
     kept = folder / "plan.toml"
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        # Looked at before the plan is sought: others who start now write their plan first.
+        # Listed before the plan is read, as other processes that start now write their plan first.
         seen = list(folder.iterdir())
         there = read_plan(kept) if kept.exists() else None
         left = [path for path in seen if whole_name(path.name) in _FILES]
-        kept_first = [folder / "worlds"]  # a plan names what must be there
+        kept_first = [folder / "worlds"]  # a plan needs its worlds first
         strange = [path.name for path in seen if path not in [*left, *kept_first]]
         _refuse_strange(folder, there, strange)
         if there is not None and (changes := changed_settings(there, plan)):
@@ -111,7 +111,7 @@ def open_store(folder: Path, plan: Plan) -> None:
 
 
 def _keep_plan(folder: Path, there: Plan | None, plan: Plan) -> None:
-    """Write a plan into its folder, with the larger numbers of worlds where one is there."""
+    """Write a plan into its folder, with the larger of the old and new numbers of worlds."""
     kept = folder / "plan.toml"
     if there is not None:
         if not _is_ours(kept, there):
@@ -142,7 +142,7 @@ def _keep_worlds(folder: Path, plan: Plan) -> None:
 
 
 def _refuse_strange(folder: Path, there: Plan | None, strange: Sequence[str]) -> None:
-    """Refuse a folder that holds something, but no plan of ours."""
+    """Raise if a folder has content but no plan written by Pipistrelle."""
     if there is None and strange:
         raise InputError(
             f"{folder}: holds {min(strange)} and no plan.toml, so it is no study's folder; "
@@ -156,26 +156,26 @@ def _refuse_strange(folder: Path, there: Plan | None, strange: Sequence[str]) ->
 
 
 def _is_ours(kept: Path, plan: Plan) -> bool:
-    """Return whether a plan file is as Pipistrelle writes it."""
+    """Return whether a plan file is exactly as Pipistrelle writes it."""
     return read_file(kept) == plan_text(plan).encode()
 
 
 def load_study(folder: Path) -> StoredStudy:
-    """Open what a study has done so far; worlds that are not done are left out."""
+    """Open the plan and the tables of a study's finished worlds."""
     import polars as pl
 
     if not (folder / "plan.toml").is_file():
         raise InputError(f"{folder}: holds no plan.toml; expected the folder of a study")
     plan = read_plan(folder / "plan.toml")
     worlds = sorted(done_worlds(folder))
-    # The files know their columns, even where an estimator from outside is not at hand.
+    # The files contain their columns, also if an external estimator is not installed.
     frames = {
         name: scan_tables(folder, name, worlds)
         if worlds
         else pl.LazyFrame(schema=world_schemas(plan)[name])
         for name in TABLES
     }
-    # Without an association in the plan, its scores have no columns.
+    # Without an association in the plan, the columns of its scores are missing.
     try:
         there = frames["trials"].collect_schema().names()
     except (OSError, pl.exceptions.PolarsError):

@@ -1,9 +1,8 @@
-"""A study: it runs a plan's worlds in this process, in others, or on a cluster.
+"""Running a study: the worlds of a plan, computed in this process, in others, or on a cluster.
 
-The unit of work is a world. The process that computes it writes its results (`studies.store`) and
-reports back how its trials ended, so that a study needs little memory and loses nothing that is
-done. It may run in this process, in several, or on a Dask cluster (`studies.executors`): on
-whatever has a ``submit`` as the executors of ``concurrent.futures`` have. The results are the same.
+The unit of work is a world. Its process writes the results (`studies.store`) and returns only the
+outcome of its trials, so a study needs little memory and keeps all finished worlds. Any executor
+with the ``submit`` of ``concurrent.futures`` can be used (`studies.executors`), with equal results.
 """
 
 from collections import Counter, deque
@@ -43,25 +42,21 @@ from pipistrelle.experiments.studies.world import (
 )
 
 KILLED = "its process ended without a word, twice: killed, or out of memory\n"
-"""Error of every trial of a world whose process died."""
+"""Error of the trials of a world whose process died."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class StudyProgress:
-    """The state of a study: the worlds and trials that are done."""
+    """Numbers of requested and finished worlds and trials of a study; trials by strategy."""
 
     worlds: int
-    """Number of worlds that were asked for."""
     done: int
-    """Number of worlds that are done, those of earlier runs included."""
+    """Number of finished worlds, including earlier runs."""
     trials: dict[str, int]
-    """Number of trials that were asked for, by strategy."""
     ended: dict[str, int]
-    """Number of trials that ended, by strategy."""
     failed: dict[str, int]
-    """Number of trials that failed, by strategy."""
     first_error: str | None
-    """The message of the first trial that failed."""
+    """Message of the first failed trial."""
 
 
 def run_study(
@@ -75,12 +70,13 @@ def run_study(
     retry_failed: bool = False,
     progress: Callable[[StudyProgress], None] | None = None,
 ) -> StudyProgress:
-    """Run the worlds of a plan that are not done yet.
+    """Run the unfinished worlds of a plan.
 
-    All workers must see the same folder. More than one worker are spawned, so a script that calls
-    this must be guarded by ``if __name__ == "__main__"``. A shard (i, n) is each n-th world, from
-    world i on; the scheduler is "local" or the address of one of Dask's; an executor is anything
-    else that has ``submit``. `progress` is called with the state at the start and after each world.
+    All workers must have access to the same folder. With several workers processes are spawned, so
+    a calling script needs the guard ``if __name__ == "__main__"``. A shard (i, n) is every n-th
+    world from world i on. The scheduler is "local" or the address of a Dask scheduler; an executor
+    is any other object with ``submit``. `progress` is called with the state at the start and after
+    each world.
 
     >>> import tempfile
     >>> from pipistrelle.config import Config, ScenarioConfig
@@ -133,15 +129,15 @@ def run_study(
 
 
 def warnings_of_plan(plan: Plan) -> tuple[str, ...]:
-    """Return the warnings on the receivers of a plan (`warnings_of`), each once."""
+    """Return the warnings about the receivers of a plan (`warnings_of`), without repetition."""
     warnings = (line for cases in heard_together(plan) for line in warnings_of(cases[0].config))
     return tuple(dict.fromkeys(warnings))
 
 
 def check_cases(plan: Plan, workers: int) -> None:
-    """Refuse a plan with a case that would be refused, or with more workers than memory allows.
+    """Raise if a case of a plan is invalid, or if the workers need too much memory.
 
-    The workers are those on this machine; 0 if they are elsewhere.
+    `workers` counts the processes on this machine; 0 for a cluster.
     """
     for cases in heard_together(plan):
         with _named(cases[0]):
@@ -159,7 +155,7 @@ def check_cases(plan: Plan, workers: int) -> None:
 
 @contextmanager
 def _named(case: PlannedCase) -> Iterator[None]:
-    """Add the values of the grid to a refusal."""
+    """Add the grid's values to the message of an InputError."""
     try:
         yield
     except InputError as error:
@@ -183,7 +179,7 @@ def _nothing_done(plan: Plan, worlds: int) -> StudyProgress:
 
 
 def _advanced(so_far: StudyProgress, trials: Sequence[EndedTrial]) -> StudyProgress:
-    """Return the state of a study with one more world done."""
+    """Return the state of a study after another finished world."""
     errors = [trial.error for trial in trials if trial.error is not None]
     ended = Counter(trial.strategy for trial in trials)
     failed = Counter(trial.strategy for trial in trials if trial.error is not None)
@@ -198,7 +194,7 @@ def _advanced(so_far: StudyProgress, trials: Sequence[EndedTrial]) -> StudyProgr
 
 
 def _work(folder: Path, plan: Plan, here: Path, iteration: int) -> list[EndedTrial]:
-    """Run a world and write its results; done by a worker, whatever and wherever it is."""
+    """Compute a world and write its results, in any worker."""
     keep_freed_memory()
     if not CATALOGUE.keys() >= set(plan.filters):
         look_in(here)
@@ -208,7 +204,7 @@ def _work(folder: Path, plan: Plan, here: Path, iteration: int) -> list[EndedTri
 
 
 def _give_up(folder: Path, plan: Plan, iteration: int) -> list[EndedTrial]:
-    """Record a world that could not be computed as failed."""
+    """Record all trials of a world as failed, as its process died."""
     records = failed_records(plan, KILLED)
     write_world(folder, plan, iteration, records)
     return [EndedTrial(record.case.strategy, record.error) for record in records]

@@ -1,14 +1,11 @@
-"""One world of a study: drawn once, heard once for all beamwidths, tried in every case.
+"""A world of a study: drawn, its sound simulated once, every case tried, and its tables stored.
 
-What a case is: `studies.plan`. Cases whose settings differ in nothing that is seen or heard
-(filters, rays and the vehicle's piston aside) share the drawing and the recording.
+Cases share the drawing and the simulated sound if they differ only in settings of estimators and in
+the vehicle's piston.
 
-One world's tables in a study's folder: written whole, checked by their sums, read.
-
-Results are written where they were computed, under a name of their own, and renamed when all of
-a world's tables are whole; the table of trials goes last and means that the world is done. It
-bears the sums of all three, so a file that a disk changed, that was cut, or that is of another
-world is noticed.
+Each table is written under a temporary name, and renamed once all tables of the world are complete.
+The table of trials is last and marks the world as finished. It contains the SHA-256 of all three,
+which reveals files that are damaged, truncated or of another world.
 """
 
 import contextlib
@@ -71,49 +68,48 @@ if TYPE_CHECKING:
     import polars as pl
 
 ONLINE = ("position_rmse_m", "heading_rmse_rad", "nees_mean", "nees_max")
-"""Scores that a table also has for the path as it was believed at its time, if it was revised."""
+"""Scores that are also stored for the online path, if the filter revises its path."""
 
 NEES_OF_DRAWN_START = (3.0, 6.0)
-"""Mean and variance of a consistent filter's NEES: chi-square of three numbers."""
+"""Mean and variance of a consistent filter's NEES: chi-square with three degrees of freedom."""
 STEPS = ("position_error_m", "heading_error_rad", "nees", "nees_expected", "nees_variance")
 """Columns for each frame: errors, NEES, and mean and variance of a consistent filter's NEES."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class TrialRecord:
-    """What a study keeps of one trial."""
+    """Results of a trial that a study stores."""
 
     case: PlannedCase
     beamwidth_deg: float | None
-    """Half-power width of the vehicle's call; None for passive."""
     error: str | None = None
-    """The traceback and, last, what it says in a line, if it failed; then there are neither scores
-    nor rows of the other tables."""
+    """Traceback of a failed trial, with the message as its last line. A failed trial has no
+    scores and no rows in the other tables."""
     scores: Scores | None = None
     online: PathScores | None = None
+    """Scores of the online path, if the filter revises its path."""
     calibration: Mapping[str, float] = field(default_factory=dict)
-    """Scores of the path as it was believed at its time, where the filter revises it."""
+    """Estimated calibration parameters, and ``NAME_std`` of each."""
     landmarks_full_mean: float | None = None
-    """Mean over the particles, where the filter has some."""
+    """Number of fully initialised landmarks; for a particle filter the mean over its particles."""
     clutter_per_frame: float | None = None
     """Mean number of detections without a label."""
     wall_s: float = 0.0
     cpu_s: float = 0.0
     steps: Float[np.ndarray, "k 5"]
-    """Position error, heading error and NEES at each frame; of a consistent filter's NEES the mean
-    and the variance [m, rad, 1, 1, 1]."""
+    """Position error [m], heading error [rad] and NEES at each frame, and mean and variance of a
+    consistent filter's NEES."""
     landmark: Int[np.ndarray, " n"]
-    """Labels of the landmarks on the map."""
     full: Bool[np.ndarray, " n"]
-    """Whether each is fully initialised."""
+    """Whether each landmark of the map is fully initialised."""
     landmark_error: Float[np.ndarray, " n"]
-    """Distance from the true position [m]."""
+    """Distance of each from the true position [m]."""
 
 
 def run_world(plan: Plan, iteration: int) -> tuple[TrialRecord, ...]:
-    """Draw a world, listen once for all beamwidths, and try every case of a plan in it.
+    """Draw a world, simulate its sound once for all beamwidths, and try every case of a plan.
 
-    A trial that raises an exception, and every trial of a world that does, is a failed record.
+    A trial that raises an exception becomes a failed record, as do all trials of a world that does.
 
     >>> from pipistrelle.config import ScenarioConfig
     >>> ways = {"strategies": ("fused",), "filters": ("ekf",)}
@@ -131,7 +127,7 @@ def run_world(plan: Plan, iteration: int) -> tuple[TrialRecord, ...]:
 
 
 def heard_together(plan: Plan) -> tuple[tuple[PlannedCase, ...], ...]:
-    """Group the cases of a plan that share the drawing and the recording of a world.
+    """Group the cases of a plan that share the drawing and the simulated sound of a world.
 
     >>> grid = {"filter.gate": (0.9, 1.0), "emitter.radius": (0.0025, 0.025)}
     >>> ways = {"strategies": ("fused",), "filters": ("ekf",)}
@@ -146,14 +142,14 @@ def heard_together(plan: Plan) -> tuple[tuple[PlannedCase, ...], ...]:
 
 
 def failed_records(plan: Plan, error: str) -> tuple[TrialRecord, ...]:
-    """Return a failed record for every case of a world that could not be tried."""
+    """Return a failed record for every case of a world that could not be computed."""
     return tuple(_failed(case, error) for case in cases_of(plan))
 
 
 def world_tables(
     plan: Plan, iteration: int, records: Sequence[TrialRecord]
 ) -> "dict[str, pl.DataFrame]":
-    """Lay out a world's tables, by the names of `world_schemas`."""
+    """Return a world's tables, by the names of `world_schemas`."""
     import polars as pl
 
     schemas = world_schemas(plan)
@@ -183,7 +179,7 @@ def world_tables(
 
 
 def world_schemas(plan: Plan) -> "dict[str, dict[str, Any]]":
-    """Return the columns of each table and their polars types."""
+    """Return the columns of each table and their Polars types."""
     import polars as pl
 
     world = {"iteration": pl.Int32, "case": pl.Int16}
@@ -191,7 +187,7 @@ def world_schemas(plan: Plan) -> "dict[str, dict[str, Any]]":
         name: pl.Float64 if isinstance(_cell(values[0]), (int, float)) else pl.String
         for name, values in plan.grid.items()
     }
-    # Worlds of a study that was begun before have no such columns, and go on being read.
+    # Older studies lack these columns and can still be read.
     known = all(case.config.association.method == KNOWN for case in cases_of(plan))
     left = {"nis_mean", *(OF_ASSOCIATION if known else ())}
     kept = (field.name for field in fields(Scores) if field.name not in left)
@@ -223,7 +219,7 @@ def world_schemas(plan: Plan) -> "dict[str, dict[str, Any]]":
 
 
 def _online_columns(plan: Plan) -> tuple[str, ...]:
-    """Name the columns that a plan has only if one of its filters revises its path."""
+    """Name the columns of online scores; empty if no filter of the plan revises its path."""
     motion = motion_of(plan.config.motion)
     for name in plan.filters:
         if hasattr(first_belief(name, motion, plan.config), "path"):
@@ -232,22 +228,22 @@ def _online_columns(plan: Plan) -> tuple[str, ...]:
 
 
 def _calibration_columns(plan: Plan) -> tuple[str, ...]:
-    """Name the columns of what the filters of a plan estimate of the vehicle itself."""
+    """Name the columns of the calibration parameters that the filters of a plan estimate."""
     asked = {name for case in cases_of(plan) for name in case.config.filter.calibrate}
     return tuple(column for name in numbers_of(asked) for column in (name, f"{name}_std"))
 
 
 def heard_settings(config: Config) -> str:
-    """Return as text all settings on which a world and its recording depend."""
+    """Return as JSON all settings that affect a world and its simulated sound."""
     settings = config.model_dump(mode="json", exclude={*SECTIONS, "bag"})
     section, radius = RADIUS_KEY
     del settings[section][radius]
-    settings["assumed"] = config.assumed_sound_speed  # the rest is the filters' alone
+    settings["assumed"] = config.assumed_sound_speed  # the others affect estimators only
     return json.dumps(settings)
 
 
 def _run_cases(cases: Sequence[PlannedCase], iteration: int, world: World) -> list[TrialRecord]:
-    """Draw and hear a world for cases that share it, and try each."""
+    """Draw and simulate a world for the cases that share it, and try each case."""
     config = cases[0].config
     radii = sorted({case.config.emitter.radius for case in cases})
     try:
@@ -323,7 +319,7 @@ def _frame_errors(track: Track, scenario: Scenario, config: Config) -> Float[np.
 
 
 def _failed(case: PlannedCase, error: str) -> TrialRecord:
-    """Record that a trial failed."""
+    """Create the record of a failed trial."""
     return TrialRecord(
         case=case,
         beamwidth_deg=_beamwidth_deg(case),
@@ -343,7 +339,7 @@ def _beamwidth_deg(case: PlannedCase) -> float | None:
 
 
 def _row(iteration: int, record: TrialRecord, columns: Sequence[str]) -> dict[str, Any]:
-    """Lay out a trial's row."""
+    """Return a trial's row of the table of trials."""
     case, scores, online = record.case, record.scores, record.online
     nothing = dict.fromkeys(field.name for field in fields(Scores))
     row = {
@@ -368,7 +364,7 @@ def _row(iteration: int, record: TrialRecord, columns: Sequence[str]) -> dict[st
 
 
 def _cell(value: Any) -> Any:
-    """Return a grid's value as a table holds it: a number, or text."""
+    """Convert a grid's value to a table cell: a number, or text."""
     return value if value is None or isinstance(value, (int, float, str)) else json.dumps(value)
 
 
@@ -376,25 +372,24 @@ if TYPE_CHECKING:
     import polars as pl
 
 TABLES = ("steps", "landmarks", "trials")
-"""Tables, in the order in which a world's are put in place."""
+"""Names of the tables, in the order of writing."""
 _SUM = "pipistrelle.sha256.{}"
-"""Key of a table's sum in the metadata of the trials' file."""
+"""Key of a table's SHA-256 in the metadata of the trials' file."""
 _NO_SUM = "-" * 64
-"""Placeholder for the sum of the trials' file while that sum is computed."""
+"""Placeholder for the SHA-256 of the trials' file while it is computed."""
 _WORLD, _PLAN = "pipistrelle.iteration", "pipistrelle.plan"
-"""Keys of the world's number and of the plan's sum in the metadata."""
+"""Metadata keys of the world's number and the plan's SHA-256."""
 
 
 class EndedTrial(NamedTuple):
-    """How a trial ended, as a worker reports it."""
+    """Outcome of a trial, as returned by a worker."""
 
     strategy: str
     error: str | None
-    """What is recorded of a trial that failed."""
 
 
 def world_file(folder: Path, table: str, iteration: int) -> Path:
-    """Return the path of one world's table.
+    """Return the path of a table of a world.
 
     >>> world_file(Path("study"), "trials", 7).as_posix()
     'study/trials/iteration_00007.parquet'
@@ -403,7 +398,7 @@ def world_file(folder: Path, table: str, iteration: int) -> Path:
 
 
 def done_worlds(folder: Path) -> set[int]:
-    """Return the numbers of the worlds that are done."""
+    """Return the numbers of the finished worlds."""
     names = (
         path.stem.partition("_")[2] for path in (folder / "trials").glob("iteration_*.parquet")
     )
@@ -411,9 +406,9 @@ def done_worlds(folder: Path) -> set[int]:
 
 
 def write_world(folder: Path, plan: Plan, iteration: int, records: Sequence[TrialRecord]) -> None:
-    """Write a world's tables, in place of earlier ones, and delete what killed writers left.
+    """Write a world's tables over earlier ones, and delete the leftovers of killed processes.
 
-    Where they cannot be written, the earlier ones are as they were.
+    If writing fails, the earlier tables are unchanged.
     """
     files = with_sums(world_tables(plan, iteration, records), plan, iteration)
     paths = [world_file(folder, name, iteration) for name in TABLES]
@@ -434,10 +429,7 @@ def write_world(folder: Path, plan: Plan, iteration: int, records: Sequence[Tria
 
 
 def refuse_strange(folder: Path, plan: Plan, iterations: Iterable[int]) -> None:
-    """Refuse to compute worlds where files that are not ours stand in their tables' place.
-
-    Tables that a killed writer left without its trials are ours; their columns show it.
-    """
+    """Raise if tables of unfinished worlds would replace files that no study wrote."""
     schemas = world_schemas(plan)
     for iteration, name in product(iterations, TABLES[:-1]):
         path = world_file(folder, name, iteration)
@@ -449,7 +441,7 @@ def refuse_strange(folder: Path, plan: Plan, iterations: Iterable[int]) -> None:
 
 
 def _is_table(path: Path, schema: "Mapping[str, pl.DataType]") -> bool:
-    """Return whether a file is a whole table of these columns, and no link."""
+    """Return whether a file is a complete table with these columns, and not a link."""
     import polars as pl
 
     with contextlib.suppress(OSError, pl.exceptions.PolarsError):
@@ -460,7 +452,7 @@ def _is_table(path: Path, schema: "Mapping[str, pl.DataType]") -> bool:
 
 
 def with_sums(tables: "Mapping[str, pl.DataFrame]", plan: Plan, iteration: int) -> dict[str, bytes]:
-    """Return the files of a world's tables; that of the trials bears the sums of all."""
+    """Return a world's tables as Parquet files; the trials' metadata has the SHA-256 of all."""
     files = {name: _parquet(tables[name]) for name in TABLES[:-1]}
     metadata = {_SUM.format(name): sha256(file).hexdigest() for name, file in files.items()}
     metadata |= {_SUM.format("trials"): _NO_SUM, _WORLD: str(iteration), _PLAN: _plan_sum(plan)}
@@ -477,7 +469,7 @@ def _parquet(table: "pl.DataFrame", metadata: dict[str, str] | None = None) -> b
 
 
 def _make_way(folder: Path, iteration: int, files: dict[str, bytes]) -> None:
-    """Delete a world's trials if its other tables are about to change: it is then not done."""
+    """Delete a world's trials if its other tables will change; the world is then unfinished."""
     trials = world_file(folder, "trials", iteration)
     for name in TABLES[:-1]:
         with contextlib.suppress(FileNotFoundError):
@@ -486,7 +478,7 @@ def _make_way(folder: Path, iteration: int, files: dict[str, bytes]) -> None:
 
 
 def sweep(folder: Path, iterations: Iterable[int]) -> None:
-    """Remove what killed writers left of worlds that are done."""
+    """Delete the temporary files that killed processes left of finished worlds."""
     names = {world_file(folder, "", iteration).name for iteration in iterations}
     for path in chain.from_iterable((folder / name).glob("*.partial") for name in TABLES):
         if whole_name(path.name) in names:
@@ -495,10 +487,10 @@ def sweep(folder: Path, iterations: Iterable[int]) -> None:
 
 
 def _plan_sum(plan: Plan) -> str:
-    """Return the SHA-256 of all on which a plan's worlds depend; defaults are left out."""
+    """Return the SHA-256 of all settings that affect a plan's worlds; defaults are omitted."""
     config = plan.config.model_dump(mode="json", exclude_defaults=True)
     medium = config.pop(plan.config.scenario.medium, {})
-    medium["speed_of_sound"] = plan.config.medium.sound_speed  # given or not
+    medium["speed_of_sound"] = plan.config.medium.sound_speed  # also if it is derived
     grid = {name: list(values) for name, values in plan.grid.items()}
     own = {name: dict(settings) for name, settings in plan.own.items()}
     parts = [plan.strategies, plan.filters, config, medium, grid, *([own] if own else [])]
@@ -507,7 +499,7 @@ def _plan_sum(plan: Plan) -> str:
 
 
 def read_ended_trials(folder: Path, plan: Plan, iteration: int) -> list[EndedTrial]:
-    """Return how the trials of a finished world ended; refuse files that were changed."""
+    """Return the outcomes of a finished world's trials; raise if its files were changed."""
     import polars as pl
 
     file = check_world(folder, plan, iteration)
@@ -520,9 +512,9 @@ def read_ended_trials(folder: Path, plan: Plan, iteration: int) -> list[EndedTri
 
 
 def check_world(folder: Path, plan: Plan, iteration: int) -> bytes:
-    """Refuse a finished world whose files are not as the plan's study wrote them.
+    """Check the files of a finished world, and return the file of trials.
 
-    Returns the file of trials.
+    Raises InputError for a file that is missing, damaged or from another plan.
     """
     files: dict[str, bytes] = {}
     for name in reversed(TABLES):
@@ -540,7 +532,7 @@ def check_world(folder: Path, plan: Plan, iteration: int) -> bytes:
 
 
 def damaged(folder: Path, table: str, iteration: int, flaw: str) -> InputError:
-    """Return the refusal of a world's damaged file, with the way to compute the world again."""
+    """Return the error for a damaged file, with the commands that compute its world again."""
     return InputError(
         f"{world_file(folder, table, iteration)}: {flaw}; remove "
         f"{world_file(Path(), 'trials', iteration)} from {folder} and run the study again: its "
@@ -549,7 +541,7 @@ def damaged(folder: Path, table: str, iteration: int, flaw: str) -> InputError:
 
 
 def _flaw(name: str, found: dict[str, bytes], plan: Plan, iteration: int) -> str | None:
-    """Return what is wrong with a file by the metadata of the trials' file, which comes first."""
+    """Compare a file with the metadata of the trials' file; return its fault, or None."""
     import polars as pl
 
     try:
@@ -569,7 +561,7 @@ def _flaw(name: str, found: dict[str, bytes], plan: Plan, iteration: int) -> str
 
 
 def scan_tables(folder: Path, table: str, worlds: Sequence[int]) -> "pl.LazyFrame":
-    """Open one table of some worlds, at least one, as one lazy frame."""
+    """Open a table of several worlds as a lazy frame."""
     import polars as pl
 
     paths = [world_file(folder, table, world).absolute() for world in worlds]
@@ -577,13 +569,13 @@ def scan_tables(folder: Path, table: str, worlds: Sequence[int]) -> "pl.LazyFram
         check_ordinary(path)
     try:
         os.fspath(folder.absolute()).encode()
-    except UnicodeEncodeError:  # a name that Polars could not have
+    except UnicodeEncodeError:  # Polars needs paths that are valid text
         return pl.scan_parquet([read_file(path) for path in paths])
     return pl.scan_parquet(paths, glob=False)
 
 
 def unusable(folder: Path, error: OSError) -> InputError:
-    """Return the refusal of a study's folder that cannot be written; nothing is lost."""
+    """Return the error for a study's folder that cannot be written, with the fix."""
     return InputError(
         f"{error.filename or folder}: could not be written ({error.strerror}); worlds that are "
         "done are kept: mend this, or copy the folder elsewhere, and run the same command again"
