@@ -1,19 +1,15 @@
-"""One file: only an ordinary one is read, and what is written is whole or not there.
+"""Safe files: read ordinary files only, write atomically, and replace only Pipistrelle's output.
 
-A pipe or a device may never end, so neither is read. A file is written beside its place, under a
-new name that no link can have, and renamed when it is whole.
+Pipes and devices may never end, so they are not read. A file is written beside its final place
+under a new random name, and renamed when it is complete.
 
-Folders that we write into: which files in them are ours, and how these are replaced.
+``SHA256SUMS``, in the format of ``sha256sum -c``, lists the files that we wrote into a folder. As
+many downloads have such a list, it is ours only if its first line states so and all its names are
+of files that we write. A listed file is ours while it is an ordinary file with the listed sum,
+reached through no link. Only our files are ever replaced or removed.
 
-``SHA256SUMS``, as ``sha256sum -c`` reads it, lists what we wrote into a folder. Such lists lie
-beside many downloads, so one is ours only if its first line says so and each name on it is one that
-from collections.abc import Iterator
-from contextlib import contextmanager
-we write. What it names is ours as long as it is an ordinary file of that sum, reached through no
-link. Only that is ever replaced or removed; everything else is somebody's, the list itself too.
-
-Whatever is written into a folder that a user names passes `claim` before the work, and
-`OwnFiles.replace` after it.
+A folder named by a user is checked by `claim` before the work, and written by `OwnFiles.replace`
+after it.
 """
 
 import contextlib
@@ -33,13 +29,13 @@ from pipistrelle.config import InputError, Strategy
 from pipistrelle.refusals import refusal, shown
 
 _TURNS = {"LRE", "RLE", "LRO", "RLO", "PDF", "LRI", "RLI", "FSI", "PDI"}
-"""Classes of characters that embed, override or isolate a direction of writing."""
+"""Unicode classes of characters that embed, override or isolate a direction of writing."""
 _DESCRIPTORS = Path("/proc/self/fd")
 _PARTIAL = re.compile(r"(.+)\.[0-9a-f]{8}\.partial")
 
 
 def check_ordinary(path: Path) -> None:
-    """Refuse a path that exists but is no ordinary file.
+    """Raise if a path exists but is not an ordinary file.
 
     >>> check_ordinary(Path("/dev/null"))
     Traceback (most recent call last):
@@ -59,7 +55,7 @@ def read_file(path: Path) -> bytes:
 
 
 def read_named(path: Path, expected: str) -> bytes:
-    """Read a file that a user named; refuse one that cannot be read, and say what was expected."""
+    """Read a file that a user named; raise if it cannot be read, with `expected` in the message."""
     try:
         return read_file(path)
     except InputError:
@@ -68,7 +64,7 @@ def read_named(path: Path, expected: str) -> bytes:
         found = "a link to no file" if path.is_symlink() else "no such file"
         fix = "add it, or name the folder that holds it"
         raise refusal(path, found, expected, fix) from None
-    except (OSError, ValueError) as error:  # a ValueError is of a name that no file can have
+    except (OSError, ValueError) as error:  # ValueError: an impossible file name
         found, fix = getattr(error, "strerror", error), "check the path and its permissions"
         raise refusal(printable(path), str(found), expected, fix) from None
 
@@ -90,7 +86,7 @@ def printable(path: Path) -> str:
 
 
 def text_of(name: str | Path) -> str:
-    r"""Return a path, or text with paths in it, as UTF-8 can hold it: other bytes are escaped.
+    r"""Return a path or a text of paths as valid UTF-8, with other bytes escaped.
 
     >>> text_of("log" + chr(0xDCFF))
     'log\\xff'
@@ -99,7 +95,7 @@ def text_of(name: str | Path) -> str:
 
 
 def spelt(name: str | Path) -> str:
-    r"""Return a path, or text with paths in it, in one line; unprintable characters are escaped.
+    r"""Return a path or a text of paths on one line, with unprintable characters escaped.
 
     >>> spelt("one [2]"), spelt("a" + chr(10)), spelt("b" + chr(0x202E))
     ('one [2]', 'a\\n', 'b\\u202e')
@@ -108,9 +104,9 @@ def spelt(name: str | Path) -> str:
 
 
 def upright(text: str) -> str:
-    r"""Return text in which characters that change the direction of writing are escaped.
+    r"""Escape the characters of a text that change the direction of writing.
 
-    A name that holds one would show the rest of its line in another order.
+    In a file name they would reorder the rest of the line.
 
     >>> upright("log" + chr(0x202E) + "gol")
     'log\\u202egol'
@@ -119,19 +115,19 @@ def upright(text: str) -> str:
 
 
 def without_links(path: Path) -> Path:
-    """Return a path without links; that of a link to itself stands as it is.
+    """Resolve the links of a path; a link to itself is returned unchanged.
 
     >>> without_links(Path("/dev/../dev"))
     PosixPath('/dev')
     """
-    return Path(os.path.realpath(path))  # Path.resolve raises RuntimeError for such a link
+    return Path(os.path.realpath(path))  # Path.resolve raises RuntimeError for a link to itself
 
 
 @contextlib.contextmanager
 def held(folder: Path) -> Iterator[Path]:
-    """Lend a path that leads to a folder even if another is put in its place meanwhile.
+    """Yield a path that keeps leading to a folder if another folder takes its name.
 
-    On Linux it leads by a descriptor; elsewhere it is the folder's own path.
+    On Linux the path goes through a descriptor; on other systems it is `folder` itself.
     """
     if not hasattr(os, "O_PATH") or not _DESCRIPTORS.is_dir():
         yield folder
@@ -144,7 +140,7 @@ def held(folder: Path) -> Iterator[Path]:
 
 
 def partial_of(path: Path) -> Path:
-    """Return a new name beside a file, under which it is written before it is whole."""
+    """Return a new temporary name for a file, in the same folder."""
     return path.with_name(f"{path.name}.{uuid4().hex[:8]}.partial")
 
 
@@ -155,7 +151,7 @@ def sum_of(path: Path) -> str:
 
 
 class PiecesFile:
-    """A new file that is written in pieces, beside the place that it is to have, and summed.
+    """A new file that is written in pieces under a temporary name, with its SHA-256 sum.
 
     >>> from tempfile import TemporaryDirectory
     >>> with TemporaryDirectory() as place:
@@ -174,7 +170,7 @@ class PiecesFile:
 
     @property
     def sum(self) -> str:
-        """The sum of what was written so far."""
+        """The sum of the data written so far."""
         return self._sum.hexdigest()
 
     def write(self, data: bytes) -> None:
@@ -184,7 +180,7 @@ class PiecesFile:
         self._sum.update(data)
 
     def close(self) -> None:
-        """Write all down to the disk."""
+        """Flush the file to the disk and close it."""
         if not self._file.closed:
             with self._faults_named():
                 self._file.flush()
@@ -192,15 +188,15 @@ class PiecesFile:
                 self._file.close()
 
     def discard(self) -> None:
-        """Remove the file where it was not put in its place."""
-        with contextlib.suppress(OSError):  # on a full disk, it writes what is left
+        """Remove the file if it was not put in place."""
+        with contextlib.suppress(OSError):  # on a full disk, closing writes the rest
             self._file.close()
         with contextlib.suppress(OSError):
             self.path.unlink(missing_ok=True)
 
     @contextlib.contextmanager
     def _faults_named(self) -> Iterator[None]:
-        """Refuse with the file's name what the system cannot write."""
+        """Convert an error of the system to an `InputError` that names the file."""
         try:
             yield
         except OSError as error:
@@ -215,7 +211,7 @@ def not_written(path: Path, error: OSError) -> InputError:
 
 
 def whole_name(partial: str) -> str | None:
-    """Return the name of the file that a partial one was to become; None of any other name.
+    """Return the final name of a partial file; None for any other name.
 
     >>> whole_name("mission.png.0f3a9c2e.partial"), whole_name("debian.iso.partial")
     ('mission.png', None)
@@ -225,7 +221,7 @@ def whole_name(partial: str) -> str | None:
 
 
 def write_down(path: Path, data: bytes) -> None:
-    """Write a new file down to the disk, so that a rename cannot outlive its content.
+    """Write a new file and flush it to the disk, so that a rename cannot outlive its content.
 
     >>> from tempfile import TemporaryDirectory
     >>> with TemporaryDirectory() as place:
@@ -242,7 +238,7 @@ def write_down(path: Path, data: bytes) -> None:
 def write_whole(path: Path, data: bytes, *, replace: bool = True) -> None:
     """Write a file completely or not at all, even if writing is interrupted.
 
-    `replace`: whether what stands there is replaced; a link itself is, never what it points at.
+    `replace`: whether an existing file, or a link itself but not its target, is replaced.
 
     >>> import tempfile
     >>> with tempfile.TemporaryDirectory() as parent:
@@ -260,10 +256,9 @@ def write_whole(path: Path, data: bytes, *, replace: bool = True) -> None:
 
 
 def put_in_place(partial: Path, path: Path, *, replace: bool = True) -> None:
-    """Rename a complete file, unless another process has already put it in place.
+    """Rename a complete file to its final name, unless another process has already done so.
 
-    `partial`, `path`: its name so far, and the one that it is to have; `replace`: whether what
-    stands there is replaced.
+    `replace`: whether an existing file is replaced.
 
     >>> from tempfile import TemporaryDirectory
     >>> with TemporaryDirectory() as place:
@@ -284,7 +279,7 @@ def put_in_place(partial: Path, path: Path, *, replace: bool = True) -> None:
 
 
 def _put_where_nothing_is(partial: Path, path: Path) -> None:
-    """Rename a file without replacing anything, even if it appeared a moment ago."""
+    """Rename a file without replacing an existing one, without a race."""
     try:
         os.link(partial, path, follow_symlinks=False)
     except FileExistsError:
@@ -308,19 +303,19 @@ class Kind:
 
     title: str
     names: tuple[str, ...]
-    """Patterns of names: a user's file of such a name is in the way."""
+    """Patterns of names: a user's file with such a name is an obstacle."""
     more: tuple[str, ...] = ()
-    """Patterns of names that are checked one by one, when they are written."""
+    """Patterns of names that are checked individually, when they are written."""
 
     def writes(self, name: str) -> bool:
-        """Tell whether we write a file of this name, relative to the folder."""
+        """Return whether this kind includes a file name, relative to the folder."""
         path = PurePosixPath(name)
         inside = not path.is_absolute() and ".." not in path.parts and path.as_posix() == name
         return inside and _matches(name, (*self.names, *self.more))
 
 
 def _matches(name: str, patterns: Iterable[str]) -> bool:
-    """Tell whether a name is like one of some patterns, in letters of any case."""
+    """Return whether a name matches any pattern, ignoring case."""
     return any(fnmatchcase(name.lower(), pattern.lower()) for pattern in patterns)
 
 
@@ -360,18 +355,17 @@ WORLD = Kind("a world", ("world.toml", "landmarks.csv", "path.csv", "README.md")
 COMPARISON = Kind("a comparison", ("comparison.*", "settings.csv", "README.md"))
 KINDS = (RESULTS, REPORT, LOG, SOUND, WORLD, COMPARISON)
 COMMAND_LINE = ("-o DIR", "--overwrite")
-"""How a user of the command line names another folder, and allows that results are replaced."""
+"""Options of the command line for another folder, and for replacing results."""
 
 
 def claim(
     folder: Path, kind: Kind, *, overwrite: bool, flags: tuple[str, str] = COMMAND_LINE
 ) -> "OwnFiles":
-    """Accept a folder to write into: a new or empty one, or one with our results.
+    """Accept a folder for output: a new or empty one, or one with our results.
 
-    Whether it can be written is tried; nothing is left there by that.
-
-    `kind`: kind of result; `overwrite`: whether what we wrote there may be replaced;
-    `flags`: how the user names another folder, and allows to replace.
+    Raises if it cannot be written, which is tested without leaving anything there. `overwrite`:
+    whether our earlier output may be replaced; `flags`: options for another folder and for
+    replacing, for the message.
 
     >>> with TemporaryDirectory() as name:
     ...     own = claim(Path(name) / "new", LOG, overwrite=False)
@@ -414,7 +408,7 @@ def claim(
 
 
 def make_folder(folder: Path) -> list[Path]:
-    """Make a folder; return what of it and of those around it was missing, the innermost first."""
+    """Make a folder; return it and its parents that were missing, the innermost first."""
     missing = [path for path in (folder, *folder.parents) if not path.exists()]
     try:
         folder.mkdir(parents=True, exist_ok=True)
@@ -425,17 +419,14 @@ def make_folder(folder: Path) -> list[Path]:
 
 
 def remove_empty(folders: Iterable[Path]) -> None:
-    """Remove folders that we made, the innermost first, as far as they are empty."""
+    """Remove folders if they are empty, the innermost first."""
     with contextlib.suppress(OSError):
         for folder in folders:
             folder.rmdir()
 
 
 def drawn_files(draw: Callable[[Path], None], under: str = "") -> dict[str, bytes]:
-    """Return the files that a function draws, by name.
-
-    `under` is put before each name, as in "figures/".
-    """
+    """Run a drawing function in a temporary folder; return its files as {under + name: bytes}."""
     try:
         with TemporaryDirectory(prefix="pipistrelle-") as place:
             draw(Path(place))
@@ -449,16 +440,10 @@ def drawn_files(draw: Callable[[Path], None], under: str = "") -> dict[str, byte
 
 
 class OwnFiles:
-    """The files that we wrote into a folder, known by its list of sums; it writes more of them.
+    """The files that we wrote into a folder, identified by its list of sums.
 
-    Parameters
-    ----------
-    folder : Path
-    kind : Kind
-        What is read or written. Where the folder holds another kind, nothing is written.
+    `kind`: the kind to read or write; a folder with another kind is not written.
 
-    Examples
-    --------
     >>> with TemporaryDirectory() as name:
     ...     own, notes = OwnFiles(Path(name), LOG), Path(name) / "notes.txt"
     ...     own.replace({"README.md": b"one", "log.toml": b"two"})
@@ -471,21 +456,21 @@ class OwnFiles:
     def __init__(self, folder: Path, kind: Kind) -> None:
         self.folder, self.kind = folder, kind
         self._place = folder
-        """Leads to the folder while it is written to (`held`)."""
+        """The path of the folder while it is written to (`held`)."""
         self._list = _list_in(folder)
         self._there, self._sums = _sums_of(self._list)
 
     @property
     def there(self) -> str | None:
-        """The title of the kind that is there; None where nothing is of ours."""
+        """The title of the kind in the folder; None if it has no files of ours."""
         return self._there
 
     def __contains__(self, name: str) -> bool:
-        """Tell whether a file is on the list: we wrote it, or began to."""
+        """Return whether a file is listed: we wrote it, or began to."""
         return name in self._sums
 
     def read(self, name: str) -> bytes:
-        """Read a file if it is unchanged since we wrote it."""
+        """Read a file if it is unchanged since we wrote it; else raise."""
         path = self.folder / name
         try:
             data = read_file(path)
@@ -502,7 +487,7 @@ class OwnFiles:
         return data
 
     def check_kind(self) -> None:
-        """Refuse a folder that holds results of another kind."""
+        """Raise if the folder contains results of another kind."""
         if self._there not in (None, self.kind.title):
             raise InputError(
                 f"{self.folder}: holds {self._there} of Pipistrelle, which {self.kind.title} does "
@@ -510,14 +495,14 @@ class OwnFiles:
             )
 
     def check(self) -> None:
-        """Refuse a folder that holds changed files under the names to be replaced."""
+        """Raise if the folder contains changed or foreign files under the names to be replaced."""
         self.check_kind()
         named = (name for name in _names_in(self._place) if _matches(name, self.kind.names))
         for name in sorted({*named, *self._sums}):
             self.refuse(name)
 
     def refuse(self, name: str) -> None:
-        """Refuse to replace a file that we did not write or that was changed since."""
+        """Raise if a file to be replaced was not written by us, or was changed since."""
         if "\n" in name:
             raise InputError(f"{name!r}: holds a line break; choose another name")
         if self._there is None and os.path.lexists(self._place / SUMS):
@@ -532,7 +517,7 @@ class OwnFiles:
             raise _in_the_way(self.folder / name, changed if name in self._sums else strange)
 
     def _is_ours(self, name: str) -> bool:
-        """Tell whether a file is as we wrote it."""
+        """Return whether a file is unchanged since we wrote it."""
         path = self._place / name
         if name not in self._sums or path.is_symlink() or not path.is_file():
             return False
@@ -541,29 +526,21 @@ class OwnFiles:
         return False
 
     def replace(self, files: Mapping[str, str | bytes | PiecesFile]) -> None:
-        """Write files in place of all that we wrote here before: all of them, or none.
+        """Replace all our earlier files in the folder by new ones: all of them, or none.
 
-        Parameters
-        ----------
-        files : mapping of name to content
-            Names are relative to the folder, with slashes. The last is taken away first and put in
-            place last: where it stands, all stand. A file that was written in pieces is beside its
-            place already, and closed.
-
-        Raises
-        ------
-        InputError
-            As `check`; also where somebody else has written here since this object was made, or
-            where there is no room, and all is as it was.
+        Names are relative to the folder, with slashes. The last file is removed first and put in
+        place last: if it is there, all are. A `PiecesFile` must be closed. Raises InputError as
+        `check`, if another process has written here since this object was made, or if there is no
+        room; the folder is then unchanged.
         """
         self._write(files, keep=False)
 
     def add(self, name: str, content: bytes) -> None:
-        """Write one file beside the others, in place of what we wrote there before."""
+        """Write one file next to the others, replacing our earlier one."""
         self._write({name: content}, keep=True)
 
     def _write(self, files: Mapping[str, str | bytes | PiecesFile], *, keep: bool) -> None:
-        """Write files into the folder that is there now, and into no other."""
+        """Hold the folder and write files into it."""
         made: list[Path] = []
         try:
             made = make_folder(self.folder)
@@ -581,7 +558,7 @@ class OwnFiles:
             remove_empty(made)
 
     def _check_list(self) -> None:
-        """Refuse a folder whose list is another than it was."""
+        """Raise if the list of sums changed since this object was made."""
         if _list_in(self._place) != self._list:
             raise InputError(
                 f"{self.folder}: somebody else wrote into it meanwhile, so nothing there is "
@@ -589,7 +566,7 @@ class OwnFiles:
             )
 
     def _write_held(self, files: Mapping[str, str | bytes | PiecesFile], *, keep: bool) -> None:
-        """Write files under other names, list them, and then give them their own."""
+        """Write files under temporary names, list their sums, and rename them."""
         contents = {n: c.encode() if isinstance(c, str) else c for n, c in files.items()}
         for name in contents:
             if not self.kind.writes(name):
@@ -627,7 +604,7 @@ class OwnFiles:
     def _list_again(
         self, sums: Mapping[str, set[str]], partials: Iterable[Path], made: Iterable[Path]
     ) -> None:
-        """Restore a folder's list after files could not be written."""
+        """Restore the list of sums after a failure to write."""
         with contextlib.suppress(OSError):
             _remove(partials)
             if sums:
@@ -637,7 +614,7 @@ class OwnFiles:
         remove_empty(made)
 
     def _put_in_place(self, partials: Mapping[str, Path], old: Iterable[str]) -> None:
-        """Give files their names; take away what is old, and what a killed process left."""
+        """Rename the new files; remove old ones, and leftovers of killed processes."""
         *_, last = partials
         _remove(self._place / name for name in (*([last] if last in self._sums else ()), *old))
         left = (self._place / name for name in _names_in(self._place) if self._is_left(name))
@@ -646,12 +623,12 @@ class OwnFiles:
             put_in_place(partial, self._place / name, replace=self._is_ours(name))
 
     def _is_left(self, name: str) -> bool:
-        """Tell whether a file is what a killed process left of one of ours."""
+        """Return whether a file is a leftover of a killed process for one of our names."""
         path = self._place / name
         return whole_name(name) in (*self._sums, SUMS) and path.is_file() and not path.is_symlink()
 
     def _list_sums(self, sums: Mapping[str, set[str]]) -> None:
-        """Write the list: from then on what it names is known as ours, whatever ends us."""
+        """Write the list of sums; its files are ours from then on, even after a crash."""
         lines = [f"{one}  {name}" for name, some in sums.items() for one in sorted(some)]
         text = "\n".join([_HEAD.format(self.kind.title), *lines, ""])
         data = text.encode(errors="surrogateescape")
@@ -660,7 +637,7 @@ class OwnFiles:
 
 
 def _sum_of(content: bytes | PiecesFile) -> str:
-    """Return the sum of what is to be a file."""
+    """Return the SHA-256 sum of a file's content."""
     return content.sum if isinstance(content, PiecesFile) else sha256(content).hexdigest()
 
 
@@ -672,7 +649,7 @@ def _in_the_way(path: Path, what: str) -> InputError:
 
 
 def _list_in(folder: Path) -> bytes | None:
-    """Return the list that stands in a folder; None where there is none that is a file."""
+    """Return the content of a folder's list of sums; None if there is no such file."""
     path = folder / SUMS
     if path.is_symlink():
         return None
@@ -683,14 +660,14 @@ def _list_in(folder: Path) -> bytes | None:
 
 
 def _sums_of(text: bytes | None) -> tuple[str | None, dict[str, set[str]]]:
-    """Read from a list of ours what is there, and the sums of its files; a user's has none.
+    """Parse a list of sums: its kind, and the sums by file name; None if it is not ours.
 
-    While files are replaced, the list has the old sums and the new ones.
+    While files are replaced, the list has the old and the new sums.
     """
     head, *lines = (text or b"").decode(errors="surrogateescape").split("\n")
     kind = next((kind for kind in KINDS if head == _HEAD.format(kind.title)), None)
     sums: dict[str, set[str]] = {}
-    if kind is None or not lines or lines.pop():  # each line has its end
+    if kind is None or not lines or lines.pop():  # each line ends with a newline
         return None, {}
     for line in lines:
         found = _LINE.fullmatch(line)
@@ -701,13 +678,13 @@ def _sums_of(text: bytes | None) -> tuple[str | None, dict[str, set[str]]]:
 
 
 def _names_in(folder: Path) -> Iterator[str]:
-    """Name all that is in a folder and below it, relative to it; no link is followed."""
+    """Yield the names of everything in and below a folder, relative to it, following no link."""
     for place, folders, files in os.walk(folder):
         for name in (*folders, *files):
             yield (Path(place) / name).relative_to(folder).as_posix()
 
 
 def _remove(paths: Iterable[Path]) -> None:
-    """Remove files, as far as they are there."""
+    """Remove files, if they exist."""
     for path in paths:
         path.unlink(missing_ok=True)

@@ -1,4 +1,4 @@
-"""Angles and poses in the plane.
+"""Angles and poses in the plane: wrapping, ranges and bearings, interpolation.
 
 A pose is x, y [m] and heading [rad], counter-clockwise from +x. A bearing is relative to the
 heading, counter-clockwise. Angles are wrapped to [-pi, pi).
@@ -22,18 +22,8 @@ def wrap_angle(angle: float) -> float:
 
 
 def wrap(angle: Float[np.ndarray, "*n"] | float) -> Float[np.ndarray, "*n"]:
-    """Wrap angles to [-pi, pi).
+    """Wrap angles to [-pi, pi) [rad].
 
-    Parameters
-    ----------
-    angle : (*n) [rad]
-
-    Returns
-    -------
-    (*n) [rad]
-
-    Examples
-    --------
     >>> wrap(np.array([0.0, np.pi, 3.5 * np.pi])) / np.pi
     array([ 0. , -1. , -0.5])
     """
@@ -50,22 +40,10 @@ def range_and_bearing(
               \phi_i = \operatorname{atan2}(y_i - y_v, x_i - x_v) - \theta_v
        :label: eq-6
 
-    Parameters
-    ----------
-    pose : (3) [m, m, rad]
-    points : (n, 2) [m]
+    `pose` [m, m, rad]; `points` [m]. Returns range [m] and bearing [rad].
 
-    Returns
-    -------
-    range : (n) [m]
-    bearing : (n) [rad]
-
-    Notes
-    -----
     Bradley & Abaid, Eq. (6), without its noise.
 
-    Examples
-    --------
     >>> pose = np.array([1.0, 0.0, np.pi / 2])
     >>> range_and_bearing(pose, np.array([[1.0, 2.0]]))
     (array([2.]), array([0.]))
@@ -79,20 +57,10 @@ def range_and_bearing(
 def circular_mean(
     angle: Float[np.ndarray, " n"], weight: Float[np.ndarray, " n"] | None = None
 ) -> float:
-    """Return the weighted mean direction of angles.
+    """Return the weighted mean direction of angles, in [-pi, pi) [rad].
 
-    Parameters
-    ----------
-    angle : (n) [rad]
-    weight : (n), optional
-        Non-negative; equal weights by default.
+    `weight`: non-negative; equal weights by default.
 
-    Returns
-    -------
-    [rad], in [-pi, pi)
-
-    Examples
-    --------
     >>> round(circular_mean(np.array([np.pi - 0.1, -np.pi + 0.3])) + np.pi, 12)
     0.1
     """
@@ -103,22 +71,10 @@ def circular_mean(
 def poses_at(
     time: Float[np.ndarray, " k"], known: Float[np.ndarray, " n"], path: Float[np.ndarray, "n 3"]
 ) -> Float[np.ndarray, "k 3"]:
-    """Return the poses at other times, linear in between, NaN outside.
+    """Interpolate poses linearly at other times; NaN outside.
 
-    Parameters
-    ----------
-    time : (k) [s]
-    known : (n) [s]
-        Times of the poses that are known, rising.
-    path : (n, 3) [m, m, rad]
-        These poses, the heading unwrapped.
+    `time`, `known` [s]: the latter increasing, of the `path` [m, m, rad], its heading unwrapped.
 
-    Returns
-    -------
-    (k, 3) [m, m, rad]
-
-    Examples
-    --------
     >>> path = np.array([[0.0, 0.0, 3.0], [1.0, 2.0, 4.0]])
     >>> poses_at(np.array([0.25, 2.0]), np.array([0.0, 1.0]), path)
     array([[0.25, 0.5 , 3.25],
@@ -131,7 +87,7 @@ def poses_at(
 def path_at(
     time: Float[np.ndarray, " k"], known: Float[np.ndarray, " n"], path: Float[np.ndarray, "n 3"]
 ) -> Float[np.ndarray, "k 3"]:
-    """Return poses at other times as `poses_at`, of a path with wrapped headings, which stay so."""
+    """Interpolate poses of a path with wrapped headings at other times; NaN outside."""
     x, y, heading = path.T
     poses = poses_at(time, known, np.column_stack((x, y, np.unwrap(heading))))
     poses[:, 2] = wrap(poses[:, 2])
@@ -141,5 +97,5 @@ def path_at(
 def points_at(
     time: Float[np.ndarray, " k"], known: Float[np.ndarray, " n"], points: Float[np.ndarray, "n d"]
 ) -> Float[np.ndarray, "k d"]:
-    """Return points at other times, linear in between; before and after they stand."""
+    """Interpolate points linearly at other times; the ends are held outside."""
     return np.column_stack([np.interp(time, known, column) for column in points.T])

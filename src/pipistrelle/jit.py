@@ -1,16 +1,16 @@
-"""How kernels, loops over arrays, are compiled: serially, kept in the cache, IEEE arithmetic.
+"""Compilation of kernels, loops over arrays, by Numba: serial, cached, with IEEE arithmetic.
 
-A division by zero makes infinity, as in NumPy, and no exception. Nothing is reordered or fused
-(no ``fastmath``): a result does not depend on how many numbers the processor takes at a time.
-No kernel is called from C, so none has a wrapper for it: a sixth of the time to compile them.
+Division by zero gives infinity, as in NumPy, without an exception. Nothing is reordered or fused
+(no ``fastmath``), so results do not depend on the processor's vector length. No kernel is called
+from C, so none has a C wrapper, which saves a sixth of the compile time.
 
-A kernel takes eight arguments at most; what belongs together is a record, a NamedTuple. At its door
-a record costs a microsecond and a plain tuple nothing, so a kernel that is called for every frame
-is handed the columns as a tuple and makes the record of them itself, which is free. None calls
-itself: those that are called are linked (`kernel_linking`), which recursion prevents.
+A kernel takes eight arguments at most; related ones are a record, a NamedTuple. As an argument from
+Python a record costs a microsecond and a plain tuple nothing, so a kernel that is called for every
+frame takes the columns as a tuple and makes the record itself, which is free. Recursion is not
+possible, as called kernels are linked (`kernel_linking`).
 
-Linking and checked files need private parts of Numba. Where a Numba has them no more, kernels are
-compiled and kept by its public functions, with the same numbers, and a line says so.
+Linking and checked files use private parts of Numba. If these are missing, kernels are compiled and
+cached by Numba's public functions, with the same results, and a message is printed.
 """
 
 import sys
@@ -26,7 +26,7 @@ from pipistrelle import kernel_clock
 from pipistrelle.kernel_folder import place_kernels
 
 _fault: Exception | None = None
-"""Why kernels are compiled by Numba's public functions."""
+"""Why kernels are compiled by Numba's public functions; None if they are not."""
 try:
     from pipistrelle.kernel_linking import Kernel, check, checked
 
@@ -36,7 +36,7 @@ try:
 except Exception as error:
     _fault = error
 if not place_kernels(plain=_fault is not None) and _fault is not None:
-    with suppress(OSError, AttributeError):  # there is no reader
+    with suppress(OSError, AttributeError):  # no standard error
         print(
             f"pipistrelle: Numba {numba.__version__} is not as those that were tested "
             f"({type(_fault).__name__}): compiling kernels takes longer; install numba<0.69",
@@ -44,16 +44,16 @@ if not place_kernels(plain=_fault is not None) and _fault is not None:
         )
 
 Whole = int | np.integer
-"""A whole number in a kernel: Numba's are Python's, those of arrays NumPy's."""
+"""An integer in a kernel: Python's or NumPy's."""
 Flag = bool | np.bool_
-"""The same of a truth value."""
+"""A truth value in a kernel: Python's or NumPy's."""
 
 
 _Function = TypeVar("_Function", bound=Callable[..., Any])
 
 
 def _compiler(*, twice: bool = True, **options: bool | str) -> Callable[[_Function], _Function]:
-    """Return a decorator that compiles, and keeps what it compiled in checked files."""
+    """Return a decorator that compiles functions, and caches them in checked files."""
     public: dict[str, Any] = {name: value for name, value in options.items() if name == "inline"}
     public |= {"nopython": True, "error_model": "numpy"}
     options |= public | {"no_cfunc_wrapper": True}
@@ -74,23 +74,22 @@ kernel = _compiler()
 """Compile a kernel."""
 
 optimised_once = _compiler(twice=False)
-"""Compile a large kernel of small matrices, in which little can be vectorised: a fifth faster."""
+"""Compile a large kernel of small matrices, with little to vectorise: a fifth faster."""
 
 no_alloc = _compiler(_nrt=False)
 """Compile a kernel that makes no array, calls none that does, and returns none to one that does.
 
-It borrows the arrays that it is given, and does not count references to them and to parts of them.
-Counting is atomic, some 5 ns each time, for every array of a record at every call: a fifth of a
-filter's time.
+It borrows its arrays without counting references. Counting is atomic, some 5 ns for every array of
+a record at every call: a fifth of a filter's time.
 """
 
 substituted = _compiler(inline="always")
-"""Compile a formula: it is put in place of its call before the caller is compiled."""
+"""Compile a formula that is substituted for its call before the caller is compiled."""
 
 inlined = _compiler(forceinline=True)
-"""Compile a piece of a loop's body, without which the loop would not be vectorised."""
+"""Compile a part of a loop's body that must be inlined for the loop to be vectorised."""
 
 no_alloc_inlined = _compiler(_nrt=False, forceinline=True)
-"""Compile a piece that is handed wide records: laid on the stack at every call, they would cost a
-twentieth of the filter's time. Every kernel above it is compiled with it, so it stands low down.
-"""
+"""Compile a function with wide records as arguments, inlined: copying them to the stack at every
+call would cost a twentieth of the filter's time. Its callers are all compiled with it, so keep
+it low in the call tree."""

@@ -1,7 +1,7 @@
-"""Clocks that stand still while kernels are compiled or loaded: that is no filter's time.
+"""Clocks that stop while kernels are compiled or loaded, so that estimators' times exclude it.
 
-The first kernel of a process that is compiled, and not merely loaded, is announced before: it takes
-long. It is announced once, and never while input is judged, for a refusal should stand alone.
+The first compilation in a process is announced, as it takes long; loading is not. The announcement
+is suppressed while input is checked, so that an error message is not preceded by it.
 """
 
 import sys
@@ -12,18 +12,18 @@ from typing import Any
 
 try:
     from numba.core import event as _events
-except ImportError:  # of another Numba than those that were tested: nothing is announced
+except ImportError:  # another Numba than tested: no announcement
     _events: Any = None
 
 COMPILING = (
     "Compiling the kernels of this kind of task, kept for the next time (a minute or two) ..."
 )
 _COMPILE, _LOCK = "numba:compile", "numba:compiler_lock"
-"""Numba tells when it compiles, and when it compiles or loads."""
+"""Numba's events of compilation, and of compilation or loading."""
 
 
 class _Clock(_events.Listener if _events else object):  # pyrefly: ignore[invalid-inheritance]
-    """Sum up the time in which kernels are compiled or loaded, and announce the first."""
+    """Listener that sums the time of compilation and loading, and announces the first."""
 
     def __init__(self) -> None:
         self.tell: Callable[[str], object] | None = _say
@@ -42,7 +42,7 @@ class _Clock(_events.Listener if _events else object):  # pyrefly: ignore[invali
         self._depth += 1
 
     def on_end(self, event: Any) -> None:
-        """Let the clocks go on, when the outermost of nested events is at its end."""
+        """Restart the clocks at the end of the outermost event."""
         self._depth -= 1
         if not self._depth:
             (wall, cpu), began = _now(), self._began
@@ -50,27 +50,24 @@ class _Clock(_events.Listener if _events else object):  # pyrefly: ignore[invali
 
 
 def wall_s() -> float:
-    """Return the time by the clock [s], without that of compiling and loading kernels."""
+    """Return the wall-clock time [s], without compilation and loading of kernels."""
     return time.perf_counter() - _CLOCK.lost[0]
 
 
 def cpu_s() -> float:
-    """Return this thread's processor time [s], without that of compiling and loading kernels."""
+    """Return this thread's processor time [s], without compilation and loading of kernels."""
     return time.thread_time() - _CLOCK.lost[1]
 
 
 def _say(line: str) -> None:
-    """Write a line to standard error, if anybody can read it."""
+    """Write a line to standard error, if it is open."""
     if sys.stderr is not None:
         with suppress(OSError):
             print(line, file=sys.stderr, flush=True)
 
 
 def announce(tell: Callable[[str], object] | None = _say) -> None:
-    """Set the function that is called when the first kernel of this process is compiled.
-
-    `tell`: called at most once in a process; None: there is no message.
-    """
+    """Set the function that is called once, at the first compilation; None for none."""
     _CLOCK.tell = tell
 
 
@@ -85,7 +82,7 @@ def judging() -> Iterator[None]:
 
 
 def _now() -> tuple[float, float]:
-    """Return the time by the clock and this thread's processor time [s]."""
+    """Return the wall-clock time and this thread's processor time [s]."""
     return time.perf_counter(), time.thread_time()
 
 

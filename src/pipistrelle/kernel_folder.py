@@ -1,16 +1,14 @@
-"""Where compiled kernels are kept: a folder of one's own, one per state of the sources.
+"""The cache folder of compiled kernels: one per state of the sources, private to the user.
 
-Beside each source, Numba's own choice, an update of one file would leave the kernels of another as
-they were. Whatever lies in the folder is run, so it is trusted only where no other user can write:
-it and all that is made in it are this user's and closed to others, and nobody can put another
-folder in its place. Where there is none, a temporary one takes its place, and a line says so. Of
-other states of the sources, the kernels that were used last are kept and the rest are removed.
+With Numba's default, beside each source, an update of one file would leave outdated kernels of
+others. Files in the folder are executed, so it is used only if no other user can write to it or
+replace it: the folder and its content belong to this user and are closed to others. Otherwise a
+temporary folder is used, and a message printed. The kernels of the most recently used states are
+kept, the others removed.
 
-One process compiles a kernel; another that needs it waits, and loads what the first has kept.
-
-A process that compiles holds a lock on one byte of a file in the folder of kernels, and the system
-lets go of it when the process ends, however it ends. Where files cannot be locked, or a process
-that was stopped holds on to its turn, each compiles for itself.
+A process that compiles a kernel holds a lock on one byte of a file in the folder; another that
+needs the kernel waits, and loads it then. The system releases the lock when the process ends. If
+files cannot be locked, or a stopped process holds its lock too long, each process compiles.
 """
 
 import os
@@ -32,19 +30,19 @@ except ImportError:  # on Windows
     fcntl = None
 
 _LONGEST_S = 60.0
-"""For how long to wait: several times what the largest kernel takes [s]."""
+"""Longest wait for a lock [s]: several times the compilation of the largest kernel."""
 _PAUSE_S = 0.02
-"""Time between two tries [s]."""
+"""Time between two attempts [s]."""
 
 
 class Turn:
-    """The turn of this process to compile a kernel; it has one at a time."""
+    """The lock of this process to compile a kernel; one at a time."""
 
     def __init__(self) -> None:
         self._file: int | None = None
 
     def take(self, kernel: Path) -> None:
-        """Wait until no other process compiles what is kept in a file, and let none do so."""
+        """Wait for the lock of a kernel's file, and hold it."""
         self.end()
         if fcntl is None:
             return
@@ -60,7 +58,7 @@ class Turn:
                     return
 
     def end(self) -> None:
-        """Let others have their turn."""
+        """Release the lock."""
         if self._file is not None:
             os.close(self._file)
             self._file = None
@@ -76,26 +74,26 @@ except ImportError:  # on Windows
     grp = pwd = None
 
 _MAX_STATES = 3
-"""How many states of the sources keep their kernels."""
+"""Number of source states with cached kernels."""
 _KEY = "[0-9a-f]{16}"
-"""How the name of a state's folder looks (`sources_key`)."""
+"""Pattern of the name of a state's folder (`sources_key`)."""
 _NO_CODE = re.compile(rb'^ *r?"{3}[^"]*(?:"{1,2}[^"]+)*"{3}\n|^ *#.*\n|^ *\n', re.MULTILINE)
 """Docstrings, lines of comments and empty lines."""
 _MIN_ROOM = 64_000_000
-"""Bytes that all kernels of a state have room in, several times over."""
+"""Room for all kernels of a state, several times over [byte]."""
 
 
 def place_kernels(*, plain: bool = False) -> bool:
-    """Tell Numba where to keep compiled kernels, by ``NUMBA_CACHE_DIR``, below which a user may.
+    """Set Numba's cache folder, ``NUMBA_CACHE_DIR``, below the user's if that is already set.
 
-    Processes that are started by this one keep theirs there, too; whether one that has started this
-    did so is returned. ``plain``: whether Numba compiles and keeps kernels in its own way.
+    Processes started by this one inherit it; returns whether this process has inherited it.
+    ``plain``: whether Numba compiles and caches kernels in its own way.
     """
     told = os.environ.get("NUMBA_CACHE_DIR")
     folder = wanted = _wanted(plain)
     if why := _unfit(wanted):
         folder = _temporary() / wanted.name
-        with suppress(OSError, AttributeError):  # there is no reader
+        with suppress(OSError, AttributeError):  # no standard error
             print(
                 f"pipistrelle: {wanted} {why}: compiled kernels are kept in {folder}; set "
                 "NUMBA_CACHE_DIR to a folder of your own that lasts",
@@ -103,7 +101,7 @@ def place_kernels(*, plain: bool = False) -> bool:
             )
     os.environ["NUMBA_CACHE_DIR"] = str(folder)
     _drop_old(folder)
-    if "numba" in sys.modules:  # it looked when it was imported
+    if "numba" in sys.modules:  # it has already read its configuration
         sys.modules["numba"].core.config.reload_config()
     return told == str(folder)
 
@@ -111,8 +109,8 @@ def place_kernels(*, plain: bool = False) -> bool:
 def sources_key(plain: bool = False) -> str:
     """Hash the interpreter's version and the code of every source that compiles a kernel.
 
-    Docstrings and lines of comments are left out: kernels do not depend on them. Returns sixteen
-    hexadecimal digits, others where kernels are compiled by plain Numba.
+    Docstrings and lines of comments are excluded, as kernels do not depend on them. Returns sixteen
+    hexadecimal digits, different ones for plain Numba.
     """
     digest = sha256(sys.version.encode() + b"plain" * plain)
     for source in sorted(Path(__file__).parent.rglob("*.py")):
@@ -123,18 +121,18 @@ def sources_key(plain: bool = False) -> str:
 
 
 def close_to_others(folder: Path) -> None:
-    """Let no other user into a folder that was made as the process makes any."""
+    """Remove other users' permissions on a new folder."""
     if os.name == "posix" and folder.stat().st_mode & 0o077:
         folder.chmod(0o700)
 
 
 def _unfit(folder: Path) -> str | None:
-    """Make a folder for kernels; return the reason if they cannot be kept there."""
+    """Create the cache folder; return the reason if it cannot be used."""
     try:
         for one in (*reversed(folder.parents), folder):
             if not one.exists():
                 one.mkdir(mode=0o700, exist_ok=True)
-        if _is_mine(folder.parent, writable=True):  # of this package, as it is made above
+        if _is_mine(folder.parent, writable=True):  # the package's folder, made above
             close_to_others(folder.parent)
         with tempfile.TemporaryFile(dir=folder):
             pass
@@ -148,7 +146,7 @@ def _unfit(folder: Path) -> str | None:
 
 
 def _open_to_others(folder: Path) -> str | None:
-    """Return how another user could put kernels into a folder; None if none can."""
+    """Return how another user could put kernels into a folder; None if impossible."""
     if os.name != "posix":
         return None
     inside = (one for one in folder.iterdir() if one.is_dir())
@@ -166,10 +164,7 @@ def _open_to_others(folder: Path) -> str | None:
 
 
 def _is_mine(folder: Path, *, writable: bool = False) -> bool:
-    """Tell whether a folder is this user's, no link, and no other can write to it.
-
-    ``writable``: whether others may be able to.
-    """
+    """Return whether a folder is this user's, no link, and closed to others unless `writable`."""
     if os.name != "posix":
         return True
     state = folder.lstat()
@@ -178,7 +173,7 @@ def _is_mine(folder: Path, *, writable: bool = False) -> bool:
 
 
 def _is_private(group: int) -> bool:
-    """Tell whether a group is this user's alone, by its name, as many systems make one for each."""
+    """Return whether a group has this user as only member, by its name."""
     if pwd is None or grp is None:
         return False
     try:
@@ -203,21 +198,21 @@ def _temporary() -> Path:
 
 
 def _of_user() -> str:
-    """Return the name of a folder of this user's among those of others."""
+    """Return the name of this user's folder in a shared folder."""
     return f"pipistrelle-{os.getuid() if hasattr(os, 'getuid') else ''}"
 
 
 def _wanted(plain: bool) -> Path:
-    """Return where compiled kernels should be kept."""
+    """Return the preferred cache folder."""
     key = sources_key(plain)
     if chosen := os.environ.get("NUMBA_CACHE_DIR"):
         folder = Path(chosen).absolute()
         ours = folder.parent.name in ("pipistrelle", _of_user())
-        if ours and re.fullmatch(_KEY, folder.name):  # by the process that has started this one
+        if ours and re.fullmatch(_KEY, folder.name):  # set by a parent process
             return folder.with_name(key)
         return Path(os.path.realpath(folder)) / _of_user() / key
     cache = Path(os.environ.get("XDG_CACHE_HOME", ""))
-    if not cache.is_absolute():  # as the specification wants it
+    if not cache.is_absolute():  # as the specification requires
         try:
             cache = Path("~/.cache").expanduser()
         except RuntimeError:  # a user without a home
@@ -226,12 +221,12 @@ def _wanted(plain: bool) -> Path:
 
 
 def _drop_old(folder: Path) -> None:
-    """Mark a state's kernels as used, and remove those of the states used longest ago."""
+    """Mark a state's kernels as used, and remove the least recently used states."""
     try:
         os.utime(folder)
         states = [other for other in folder.parent.iterdir() if re.fullmatch(_KEY, other.name)]
         states.sort(key=lambda state: state.stat().st_mtime)
-    except OSError:  # another process removes them just now
+    except OSError:  # another process is removing them
         return
     for old in states[:-_MAX_STATES]:
         shutil.rmtree(old, ignore_errors=True)

@@ -1,14 +1,12 @@
-"""How kernels (`pipistrelle.jit`) that call each other become machine code: once, and together.
+"""Linking of kernels (`pipistrelle.jit`): callees as LLVM code, compiled once with their caller.
 
-Numba compiles each function to machine code, and again within each function that calls it, and so
-on up. Here a kernel that kernels call is brought into LLVM's language only; with the kernel that
-Python calls it is optimised and becomes machine code, which takes half the time.
+Numba compiles each function to machine code, and again within each caller. Here a kernel that is
+called by kernels is only translated to LLVM's language; it is optimised and compiled with the
+kernel that Python calls, in half the time.
 
-Files of compiled kernels, each with its sum: what was cut or changed is compiled anew.
-
-Numba keeps a kernel (what `pipistrelle.jit` compiles) in two files, an index and its code, and runs
-whatever it finds there. Here each ends in the SHA-256 of what stands before it, which Numba does
-not look at when it reads them.
+Numba caches a kernel in two files, an index and its code, and executes them unchecked. Here each
+file ends with the SHA-256 of its content, which Numba ignores when reading; a damaged file is
+removed, and its kernel compiled again.
 """
 
 import gc
@@ -33,22 +31,22 @@ from numba.core.registry import CPUDispatcher
 from pipistrelle.kernel_folder import TURN
 
 _said: set[str] = set()
-"""What was said once need not be said for every kernel."""
+"""Messages that were already printed."""
 
 
 class CheckedFiles(IndexDataCacheFile):
-    """A kernel's two files."""
+    """The cache files of a kernel, with checksums."""
 
     def load(self, key: Any) -> Any:
-        """Load a kernel; None if it must be compiled, for which it is this process's turn."""
+        """Load a kernel; None if it must be compiled, with the lock for it taken."""
         found = super().load(key)
         if found is None:
             TURN.take(Path(self._index_path))
-            found = super().load(key)  # another process may have kept it meanwhile
+            found = super().load(key)  # another process may have saved it meanwhile
         return found
 
     def save(self, key: Any, data: Any) -> None:
-        """Keep what was compiled, if there is room: without it, it is compiled again next time."""
+        """Save a compiled kernel; without room it is compiled again next time."""
         try:
             super().save(key, data)
         except OSError as error:
@@ -59,17 +57,17 @@ class CheckedFiles(IndexDataCacheFile):
             )
 
     def _load_index(self) -> dict[Any, str]:
-        """Load the index of kernels; it is empty where the file is damaged."""
+        """Load the index of kernels; empty if the file is damaged."""
         return super()._load_index() if self._is_sound(Path(self._index_path)) else {}
 
     def _load_data(self, name: str) -> Any:
-        """Return a kernel's code; Numba takes an error for a file that is gone."""
+        """Load a kernel's code; raise if the file is damaged, as Numba then compiles."""
         if not self._is_sound(Path(self._data_path(name))):
             raise FileNotFoundError(name)
         return super()._load_data(name)
 
     def _is_sound(self, path: Path) -> bool:
-        """Tell whether a file is as it was written, or is not there; remove any other."""
+        """Return whether a file is undamaged or missing; remove a damaged file."""
         try:
             state = path.stat()
             if S_ISREG(state.st_mode):  # a pipe would be waited for
@@ -87,7 +85,7 @@ class CheckedFiles(IndexDataCacheFile):
 
     @contextmanager
     def _open_for_write(self, filepath: str) -> Iterator[BytesIO]:  # pyrefly: ignore[bad-override]
-        """Write a file, and its sum after it."""
+        """Write a file, followed by its checksum."""
         buffer = BytesIO()
         yield buffer
         content = buffer.getvalue()
@@ -96,11 +94,11 @@ class CheckedFiles(IndexDataCacheFile):
 
 
 def checked(dispatcher: Any) -> Any:
-    """Let a compiled function keep its code in checked files.
+    """Make a compiled function use checked cache files.
 
-    They are named after the function, and neither after its line nor after the folder of the
-    package: the folder of kernels belongs to one state of all code. Where compilation is switched
-    off, the function itself takes the dispatcher's place.
+    They are named only after the function, without its line and the package's folder, as the cache
+    folder belongs to one state of all code. If compilation is disabled, `dispatcher` is the
+    function itself.
     """
     if cache := getattr(dispatcher, "_cache", None):
         function = dispatcher.py_func
@@ -119,16 +117,16 @@ def _say(line: str) -> None:
     """Print a message once."""
     if line not in _said:
         _said.add(line)
-        with suppress(OSError, AttributeError):  # there is no reader
+        with suppress(OSError, AttributeError):  # no standard error
             print(f"pipistrelle: {line}", file=sys.stderr)
 
 
 TESTED = (0, 68)
-"""The newest Numba whose private classes are known to be as they are taken here."""
+"""The newest Numba version with known private classes."""
 
 
 class Kernel(CPUDispatcher):
-    """A compiled function; the kernels that call it see its linked form."""
+    """A compiled function; kernels that call it use its linked form."""
 
     def __init__(self, function: Any, options: dict[str, Any], *, twice: bool) -> None:
         pipeline = _Compiling if twice else _CompilingOnce
@@ -136,18 +134,18 @@ class Kernel(CPUDispatcher):
 
     @cached_property
     def linked(self) -> CPUDispatcher:
-        """The same function, without machine code of its own."""
+        """The same function, without machine code."""
         return CPUDispatcher(
             self.py_func, targetoptions=self.targetoptions, pipeline_class=_Linking
         )
 
     @property
     def _numba_type_(self) -> types.Dispatcher:
-        """What a kernel that calls this one sees."""
+        """The type that a calling kernel uses."""
         return types.Dispatcher(self.linked)
 
     def compile(self, sig: Any) -> Any:
-        """Load, or compile in turn, without collecting garbage: it takes a seventh of the time."""
+        """Load or compile a kernel without garbage collection, a seventh of the time."""
         collecting = gc.isenabled()
         gc.disable()
         try:
@@ -162,7 +160,7 @@ class _CodeOnce(JITCodeLibrary):
     """The machine code of a kernel with all that it calls."""
 
     def _finalize_specific(self) -> None:
-        """Compile, and tell the linked kernels their environments, as Numba does when it loads."""
+        """Compile, and set the linked kernels' environments, as Numba does when loading."""
         super()._finalize_specific()
         for variable in self._final_module.global_variables:
             if (environment := lookup_environment(variable.name)) is not None:
@@ -170,7 +168,7 @@ class _CodeOnce(JITCodeLibrary):
 
 
 class _Code(_CodeOnce):
-    """The same, optimised twice: what is called, then what became of it in its callers."""
+    """Machine code that is optimised twice: callees first, then their inlined code in callers."""
 
     def _optimize_final_module(self) -> None:
         """Optimise twice."""
@@ -179,15 +177,15 @@ class _Code(_CodeOnce):
 
 
 class _LinkedCode(JITCodeLibrary):
-    """The code of a linked kernel in LLVM's language, not optimised."""
+    """The unoptimised LLVM code of a linked kernel."""
 
     @property
     def codegen(self) -> Any:
-        """What is told the kernel's environment: nothing here needs it."""
+        """The receiver of the kernel's environment, which is ignored."""
         return self
 
     def set_env(self, *_: Any) -> None:
-        """Leave the environment to the machine code's library."""
+        """Ignore the environment, as the machine code's library has it."""
 
     def get_pointer_to_function(self, name: str) -> int:
         """Return no address, as there is no machine code."""
@@ -195,20 +193,20 @@ class _LinkedCode(JITCodeLibrary):
         return 0
 
     def _optimize_final_module(self) -> None:
-        """Leave it as it is."""
+        """Skip the optimisation."""
 
     def _finalize_final_module(self) -> None:
-        """Be ready to be linked."""
+        """Mark the code as ready to be linked."""
         self._finalized = True
 
 
 class _Compiling(Compiler):
-    """Numba's compiler, with a library of ours for the code."""
+    """Numba's compiler with a custom code library."""
 
     library: type[JITCodeLibrary] = _Code
 
     def define_pipelines(self) -> Any:
-        """Make the library, and return Numba's passes, which use one that is there."""
+        """Create the library, and return Numba's passes, which use it."""
         state = self.state
         state.library = self.library(state.targetctx.codegen(), state.func_id.func_qualname)
         state.library.enable_object_caching()
@@ -216,24 +214,24 @@ class _Compiling(Compiler):
 
 
 class _CompilingOnce(_Compiling):
-    """The same with code that is optimised once."""
+    """The compiler for code that is optimised once."""
 
     library = _CodeOnce
 
 
 class _Linking(_Compiling):
-    """The same for a linked kernel, which Python never calls."""
+    """The compiler for a linked kernel, which Python never calls."""
 
     library = _LinkedCode
 
     def define_pipelines(self) -> Any:
-        """Leave out the wrapper for Python, too."""
+        """Skip the wrapper for Python."""
         self.state.flags.no_cpython_wrapper = True
         return super().define_pipelines()
 
 
 def check() -> None:
-    """Compile a kernel that calls another, by a Numba that is newer than any tested; or raise."""
+    """Compile a test kernel if Numba is newer than the tested versions; raise if it fails."""
     if numba.version_info.short <= TESTED:
         return
     called = Kernel(_halved, {"nopython": True}, twice=True)
@@ -247,5 +245,5 @@ def check() -> None:
 
 
 def _halved(x: float) -> float:
-    """Be compiled within another."""
+    """Be compiled within another kernel."""
     return 0.5 * x

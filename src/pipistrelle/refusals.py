@@ -1,7 +1,7 @@
-"""What a refusal says: where it is, what was found, what was expected, and the fix.
+"""Error messages for invalid input: place, found value, expected value and fix.
 
-Settings, plans and logs are all written by hand, and refused in the same words. Most are checked
-by pydantic first; here its faults become words, and a misspelt name the one that was meant.
+Settings, plans and logs are written by hand, and rejected with the same form of message. Most are
+validated by pydantic; its errors are reworded here, and a correction of a misspelt name suggested.
 """
 
 from collections.abc import Iterable
@@ -15,13 +15,13 @@ from pipistrelle.config import InputError
 _MAX_LENGTH = 80
 _PREFIXES = ("Value error, ", "Input should be ", "Value should ")
 _IN_WORDS = {"bool_parsing": "true or false", "bool_type": "true or false", "tuple_type": "a list"}
-"""What pydantic says of these kinds of fault is about Python."""
+"""Replacements of pydantic messages in terms of Python."""
 
 
 def refusal(where: object, found: str, expected: str, fix: str) -> InputError:
-    """Return the error that says where it is, what was found, what was expected and the fix.
+    """Return the error of an invalid input, with place, found value, expected value and fix.
 
-    `where`: A path, perhaps with a line or a key, as text.
+    `where`: a path, perhaps with a line or a key.
 
     >>> str(refusal("posts.csv, line 3", "x 'left'", "a finite number", "correct the field"))
     "posts.csv, line 3: found x 'left', expected a finite number; correct the field"
@@ -32,16 +32,6 @@ def refusal(where: object, found: str, expected: str, fix: str) -> InputError:
 def shown(value: Any) -> str:
     """Return the text of a found value, shortened to one line.
 
-    Parameters
-    ----------
-    value : object
-
-    Returns
-    -------
-    str
-
-    Examples
-    --------
     >>> shown("left"), shown([1] * 1000)[-10:]
     ("'left'", '1, 1, 1...')
     """
@@ -64,9 +54,9 @@ def expectation(fault: Any) -> str:
 
 
 def values_expected(fault: Any, field: FieldInfo) -> int | None:
-    """Return the expected number of values of a tuple, if the number is the fault.
+    """Return the expected number of values of a tuple, if a wrong number is the error.
 
-    `field` is the setting that was refused.
+    `field`: the rejected setting.
 
     >>> from pipistrelle.config import FilterConfig
     >>> field = FilterConfig.model_fields["initial_pose_std"]
@@ -78,7 +68,7 @@ def values_expected(fault: Any, field: FieldInfo) -> int | None:
 
 
 def meant(name: str, known: Iterable[str]) -> str | None:
-    """Find the name that was probably meant: one spelt alike, or one that ends in the same part.
+    """Return the known name closest to a misspelt one, by spelling or by equal last part.
 
     Dots separate the parts of the `name`.
 

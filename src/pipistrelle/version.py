@@ -1,7 +1,7 @@
-"""Which version this is: of a clone what its tags say now, else what was installed.
+"""The version of the package: from git's tags in a clone, else from the installed metadata.
 
-The metadata of an editable install are those of the day when it was made, and a clone moves on: in
-one, git is asked by what makes the metadata, hatch-vcs, wherever that is installed.
+The metadata of an editable install are of the day of installation, and a clone may have changed
+since. So in a clone hatch-vcs, which makes the metadata, asks git, if it is installed.
 """
 
 import tomllib
@@ -10,21 +10,16 @@ from functools import cache
 from pathlib import Path
 
 UNKNOWN = "0.0"
-"""The version of a copy that is not installed and says nothing of its origin."""
+"""The version of a copy that is neither installed nor a clone."""
 
 
 @cache
 def find_version() -> str:
-    """Find the version; git and metadata are slow, so it is asked for where it is written.
+    """Return the version by PEP 440; cached, as git and metadata are slow.
 
-    Returns
-    -------
-    str
-        As PEP 440 has it: "0.1.0" is a release, "0.1.1.dev3+g1a2b3c4d5" three commits later, with
-        ".d" and a date after it where something was changed that is not committed.
+    "0.1.0" is a release, "0.1.1.dev3+g1a2b3c4d5" three commits later, with ".d" and a date after it
+    if there are uncommitted changes.
 
-    Examples
-    --------
     >>> find_version().startswith("0.")
     True
     """
@@ -32,19 +27,10 @@ def find_version() -> str:
 
 
 def version_of_clone(folder: Path) -> str | None:
-    """Ask git for the version of a clone.
+    """Return the version of a clone by git, or None.
 
-    Parameters
-    ----------
-    folder : Path
+    None if the folder is not a clone of this project, or git or hatch-vcs is missing.
 
-    Returns
-    -------
-    str or None
-        None where it is no clone of this project, or git or hatch-vcs is not there to ask.
-
-    Examples
-    --------
     >>> version_of_clone(Path("somewhere else")) is None
     True
     """
@@ -61,7 +47,7 @@ def version_of_clone(folder: Path) -> str | None:
 
 
 def _installed() -> str:
-    """Read the version that was installed."""
+    """Return the version in the installed metadata."""
     from importlib.metadata import PackageNotFoundError, version
 
     try:

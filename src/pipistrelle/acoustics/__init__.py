@@ -1,10 +1,8 @@
 """How a call leaves, spreads, fades and comes back (Bradley & Abaid, Secs. II-A and II-B).
 
-`emitter` shapes the vehicle's call by the aperture that sends it; `propagation` takes from it what
-distance and air take, and shifts its tone by the motion; `target` says how much of it a landmark
-throws in each direction. `callers` lists who calls: the vehicle, the beacon. `arrivals` puts all
-together, over the `paths` that sound takes: every echo and call that one emission brings to the
-vehicle, as plain arrays for the ears of `arrays`.
+`call`: waveforms; `emitter`: the vehicle's directivity and the target strength of landmarks;
+`propagation`: spreading, absorption and Doppler shift; `paths`: callers and the sound paths to the
+vehicle; `arrivals`: all echoes and calls of an emission, as arrays for `arrays`.
 """
 
 from lazy_loader import attach

@@ -1,8 +1,7 @@
-"""Everything that one emission of all callers brings to the vehicle.
+"""Arrivals: all echoes and direct calls at the vehicle after one emission of all callers.
 
-Stop-and-hop: path lengths and directions are those of the moment of emission, as if the vehicle
-stood still until the last echo; of its motion, and of that of callers that move, only the Doppler
-shift is kept.
+Stop-and-hop: path lengths and directions are frozen at the moment of emission; of the motion of the
+vehicle and of callers only the Doppler shift is used.
 """
 
 from collections.abc import Callable, Sequence
@@ -44,23 +43,23 @@ _DEEPEST_NULL = 1e-12
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Arrivals:
-    """Sound that reaches the vehicle after one emission."""
+    """Echoes and calls that reach the vehicle after one emission."""
 
     delay: Float[np.ndarray, " a"]
     """Since the emission [s]."""
     level_db: Float[np.ndarray, " a"]
-    """On the scale of the source levels [dB]."""
+    """Relative to the source levels' reference [dB]."""
     bearing: Float[np.ndarray, " a"]
-    """Where it comes from, relative to the heading, in [-pi, pi) [rad]."""
+    """Direction of the source, relative to the heading, in [-pi, pi) [rad]."""
     frequency: Float[np.ndarray, " a"]
-    """As received, Doppler shift included [Hz]."""
+    """As received, with Doppler shift [Hz]."""
     caller: Int8[np.ndarray, " a"]
-    """Index into the list of callers: VEHICLE, or from 1 on."""
+    """Index into the list of callers: VEHICLE, or from 1."""
     landmark: Int[np.ndarray, " a"]
-    """Label of what it comes from: landmark i (from 0) bears i + 1, caller j (from 1) n + j."""
+    """Label of the source: landmark i (from 0) has i + 1, caller j (from 1) n + j."""
     departure: Float[np.ndarray, " a"] | None = None
-    """Where it left another vehicle, relative to that one's heading; NaN of a caller
-    without a beam [rad]. None where there is no other vehicle."""
+    """Direction of departure from another vehicle, relative to its heading; NaN for callers
+    without a beam [rad]. None if there is no other vehicle."""
 
 
 def arrivals_of_emission(
@@ -75,47 +74,24 @@ def arrivals_of_emission(
     .. math:: L = L_0 - \beta - \alpha d + TS(\gamma), \qquad t = d / c, \qquad
               f' = f \, \frac{c + v}{c - s}
 
-    The vehicle calls in all directions within 90 degrees of its heading, with the same pressure:
-    `through_piston` gives it a beam. Path lengths and directions are frozen at the emission
-    (stop-and-hop); of the motion only the Doppler shift is kept, with v the vehicle's speed towards
-    where the sound comes from and s the caller's along the sound that it sends. What reflects on
-    the move, at a speed r towards the one who called and q towards the vehicle, adds the factor
-    (c + r) / (c - q). Absorption is that of the nominal frequency.
+    The vehicle calls with equal pressure in all directions within 90 degrees of its heading; apply
+    `through_piston` for its beam. Path lengths and directions are frozen at the emission
+    (stop-and-hop); v is the vehicle's speed towards the source of the sound and s the caller's
+    along the sound that it sends. A moving reflector, with the speed r towards the caller and q
+    towards the vehicle, adds the factor (c + r) / (c - q). Absorption is at the nominal frequency.
 
-    Parameters
-    ----------
-    pose : (3) [m, m, rad]
-        Of the vehicle when it calls.
-    velocity : (2) [m/s]
-        In the world frame.
-    landmarks : (n, 2) [m]
-    callers : sequence of c Caller
-        The vehicle first; the others reflect each other's calls, and the vehicle's, as landmarks
-        do.
-    config : Config
-        Its sections air and target.
+    `pose` [m, m, rad]: of the vehicle when it calls; `velocity` [m/s]: in the world frame;
+    `landmarks` [m]; `callers`: the vehicle first; the others also reflect each other's calls and
+    the vehicle's, as landmarks do; `config`: sections of the medium and target are used.
 
-    Returns
-    -------
-    Arrivals
-        In this order: active echoes by label, those behind the baffle left out (the target
-        strength is 0 dB: all come straight back); then for each other caller its passive echoes
-        by label, among them, under its own label, its direct call, which no target has weakened;
-        of another vehicle those that left ahead of it, as `through_piston` takes them.
+    Returns first the active echoes by label, without landmarks behind the baffle (their target
+    strength is 0 dB); then for each other caller its passive echoes by label, with its direct call
+    under its own label, without target strength; for another vehicle only sound that left within 90
+    degrees of its heading. Raises InputError if two of vehicle, callers and landmarks coincide, a
+    coordinate is not finite, or a speed reaches the speed of sound.
 
-    Raises
-    ------
-    InputError
-        Two of vehicle, callers and landmarks at one point, a coordinate that is not finite, or
-        anyone as fast as sound.
-
-    Notes
-    -----
-    Bradley & Abaid, Secs. II-A and II-B, Eqs. (2) to (4).
-
-    Examples
-    --------
-    The second landmark is behind the baffle: only the beacon's call shows it.
+    Bradley & Abaid, Secs. II-A and II-B, Eqs. (2) to (4). The second landmark is behind the baffle:
+    only the beacon's call reveals it.
 
     >>> from pipistrelle.acoustics.paths import callers_of
     >>> east, still = np.zeros(3), np.zeros(2)
@@ -137,19 +113,19 @@ def arrivals_of_emissions(
     bodies: Bodies | None = None,
     medium: Medium | None = None,
 ) -> tuple[Arrivals, Int[np.ndarray, " k"]]:
-    """Return the arrivals of several emissions in one world, one emission after the other.
+    """Return the arrivals of several emissions in one world, sorted by emission.
 
-    `poses` [m, m, rad]; `velocities` [m/s]; `landmarks` [m]; `callers`: the vehicle first; paths
-    and velocities (k, 2), a row for each emission (`callers_at`); `bodies`: of the landmarks; as
-    the settings have them, by default. Those whose radius is stated throw sound from their surface
-    (`reflecting_points`): delay, bearing, Doppler shift, absorption and spreading are those of the
-    way over it. The target strength stays that of the turn about the centre, for which its
-    far-field formula stands. At a distance d from the surface a sphere's own echo would be 20
-    log10(1 + radius / d) fainter: 0.6 dB for 0.3 m at 4 m. Arrivals are those of the first
-    emission, then those of the second, and so on, each in the order of `arrivals_of_emission`;
-    `count`: how many belong to each emission. `medium`: that of the settings by default.
+    `poses` [m, m, rad]; `velocities` [m/s]; `landmarks` [m]; `callers`: the vehicle first, with
+    paths and velocities (k, 2), a row for each emission (`callers_at`); `bodies`: of the landmarks,
+    by default the settings'; `medium`: by default the settings'. Also returns the number of
+    arrivals of each emission; the order within an emission is that of `arrivals_of_emission`.
 
-    The vehicle turns round, and its next call meets the beacon instead of the landmark.
+    Bodies with a radius reflect at their surface (`reflecting_points`): delay, bearing, Doppler
+    shift, absorption and spreading are of the path over it. The target strength is of the turn
+    about the centre, as in its far-field formula; at a distance d from the surface a sphere's echo
+    would be 20 log10(1 + radius / d) fainter: 0.6 dB for 0.3 m at 4 m.
+
+    The vehicle turns round, and its next call meets the beacon instead of the landmark:
 
     >>> from pipistrelle.acoustics.paths import callers_of
     >>> poses, still = np.array([[0.0, 0.0, 0.0], [0.0, 0.0, np.pi]]), np.zeros((2, 2))
@@ -205,39 +181,22 @@ def through_piston(
     speed_of_sound: float,
     off_axis: str = "pressure",
 ) -> Arrivals:
-    r"""Return what arrives when a piston sends the vehicle's call.
+    r"""Apply the beam of a circular piston to the levels of the vehicle's active echoes.
 
     .. math:: L_\text{active} \leftarrow L_\text{active} + 20 \log_{10} p(\phi)
 
-    An echo left in the direction that it comes from, and the piston only sends, so its pressure p
-    counts once. In its nulls p is taken as 1e-12 (-240 dB): levels stay finite.
+    An echo left in the direction that it comes from, and the piston is only the source, so its
+    pressure p counts once. In its nulls p is 1e-12 (-240 dB), so that levels stay finite.
 
-    With ``off_axis = "power"`` the factor is 10, as if p were a ratio of powers. That is no
-    physics, but a slip that a program can hold unseen: the half-power beamwidths of the paper's
-    Appendix B are those of a pressure, and its fitted level hides the rest.
+    With ``off_axis = "power"`` the factor is 10, as if p were a ratio of powers. That is not
+    physics, but an easily overlooked slip: the half-power beamwidths of the paper's Appendix B are
+    a pressure's, and its fitted level hides the rest.
 
-    Parameters
-    ----------
-    arrivals : Arrivals
-        Of `arrivals_of_emission`.
-    radius : [m]
-        Of the piston.
-    frequency : [Hz]
-        Of the vehicle's call.
-    speed_of_sound : [m/s]
-    off_axis : "pressure" or "power"
+    `radius` [m]: of the piston; `frequency` [Hz]: of the vehicle's call; `speed_of_sound` [m/s].
+    Returns the same rows; other callers' are unchanged.
 
-    Returns
-    -------
-    Arrivals
-        The same rows in the same order; those of other callers as they were.
+    Bradley & Abaid, Eq. (1). One world is used with twelve pistons, with everything else shared.
 
-    Notes
-    -----
-    Bradley & Abaid, Eq. (1). One world is heard through twelve pistons; all else they share.
-
-    Examples
-    --------
     >>> one, beam = np.ones(2), np.array([0.0, 1.5])
     >>> level = through_piston(
     ...     Arrivals(delay=one, level_db=0 * one, bearing=beam, frequency=35e3 * one,
@@ -258,7 +217,7 @@ def through_piston(
 
 
 def arrivals_at(arrivals: Arrivals, rows: Bool[np.ndarray, " a"] | slice) -> Arrivals:
-    """Return some rows of the arrivals."""
+    """Select rows of the arrivals."""
     return Arrivals(
         delay=arrivals.delay[rows],
         level_db=arrivals.level_db[rows],
@@ -279,7 +238,7 @@ def arrivals_together(parts: Sequence[Arrivals]) -> Arrivals:
 def _own_echoes(
     paths: SoundPaths, caller: Caller, medium: Medium, usual: TargetConfig, bodies: Bodies | None
 ) -> tuple[Arrivals, Int[np.ndarray, " a"]]:
-    """Return the echoes of the vehicle's call from all targets ahead, and each one's emission."""
+    """Return the echoes of the vehicle's call from all targets ahead, and the emission of each."""
     c, absorption = medium.speed_of_sound, medium.absorption_db_per_m(caller.frequency)
     ahead = np.flatnonzero(in_front(paths.bearing))
     back, closing = paths.homeward.ravel()[ahead], paths.closing.ravel()[ahead]
@@ -309,7 +268,7 @@ def _own_echoes(
 def _sounds_of(
     j: int, paths: SoundPaths, caller: Caller, medium: Medium, strength_db: Float[np.ndarray, "k t"]
 ) -> Arrivals:
-    """Return another caller's sounds at all emissions, by label: its echoes and its direct call."""
+    """Return another caller's echoes and direct call at all emissions, by label."""
     c, (emissions, targets) = medium.speed_of_sound, paths.homeward.shape
     itself = paths.landmarks + j - 1
     incoming = paths.target - paths.target[:, itself : itself + 1]
@@ -331,7 +290,7 @@ def _sounds_of(
 def _departures(
     j: int, paths: SoundPaths, heading: Float[np.ndarray, " k"]
 ) -> Float[np.ndarray, " a"]:
-    """Return the angles, off its heading, at which sound leaves another vehicle [rad], by label."""
+    """Return the angles of departure from another vehicle, off its heading [rad]."""
     itself = paths.landmarks + j - 1
     way = paths.target - paths.target[:, itself : itself + 1]
     way[:, itself] = -paths.offset[:, itself]  # the direct call goes to the vehicle
@@ -346,13 +305,12 @@ def through_pistons(
     radius: float,
     speed_of_sound: float,
 ) -> Arrivals:
-    """Give the calls of the vehicle and of other vehicles the beams of pistons of one radius.
+    """Apply the beams of pistons of one radius to the calls of the vehicle and of other vehicles.
 
-    `arrivals`: of `arrivals_of_emission`; `callers`: of the same emission; `beam`: gives the
-    vehicle's call its directivity, as `through_piston` does; of another vehicle it is handed the
-    sounds as if they were echoes where they departed to; `radius` [m]; `speed_of_sound` [m/s].
-    The rows keep their order; those of callers without a beam are
-    unchanged.
+    `arrivals`: of `arrivals_of_emission`; `callers`: of the same emission; `beam`: applies the
+    vehicle's directivity, such as `through_piston`; another vehicle's arrivals are passed to it
+    with their departures as bearings; `radius` [m]; `speed_of_sound` [m/s]. Order and arrivals of
+    callers without a beam are unchanged.
     """
     c, own = speed_of_sound, callers[VEHICLE].frequency
     heard = beam(arrivals, radius=radius, frequency=own, speed_of_sound=c)
@@ -376,11 +334,11 @@ def _shifted(
     frequency: float,
     c: float,
 ) -> Float[np.ndarray, "k t"]:
-    """Shift the frequency of another caller's sounds by all who move, the vehicle last."""
+    """Apply the Doppler shifts of all moving bodies to another caller's sounds."""
     if paths.drift is None:
         return doppler_frequency(frequency, receiver_speed=paths.closing, speed_of_sound=c)
     echo = np.arange(paths.closing.shape[1]) != itself
-    with np.errstate(divide="ignore", invalid="ignore"):  # the caller's way to itself is not used
+    with np.errstate(divide="ignore", invalid="ignore"):  # the caller's path to itself is not used
         unit = incoming / outward[..., np.newaxis]
     sent = np.sum(paths.drift[:, itself : itself + 1] * unit, axis=-1)
     met = -np.sum(paths.drift * unit, axis=-1)
@@ -420,7 +378,7 @@ def _strength_db(
     usual: TargetConfig,
     bodies: Bodies | None,
 ) -> Float[np.ndarray, "k t"]:
-    """Return the target strength of every body that reflects a tone [Hz]."""
+    """Return the target strength of every body for a tone [Hz]."""
     c = medium.speed_of_sound
     if bodies is not None:
         return strength_of_bodies_db(turn, bodies, usual=usual, frequency=tone, speed_of_sound=c)

@@ -1,7 +1,7 @@
-r"""Calls: what a caller sends.
+r"""Calls: tone bursts, sweeps and recorded files; their waveforms, bands and cross talk.
 
-A `Call` is all that recorder and matched filter know of a waveform. The engine ``block`` has closed
-forms for a `ToneBurst` alone; ``dense`` takes any. A motion at the speed v scales a call in time,
+Recorder and matched filter know only the waveform of a `Call`. The engine ``block`` has closed
+forms for a `ToneBurst`; ``dense`` accepts any. A motion at the speed v scales a call in time,
 :math:`s(a (t - \tau))` with a the ratio of the received frequency to the sent one.
 
 A `Sweep` passes through a band. By the linear law its frequency is linear in time, by the
@@ -10,24 +10,16 @@ hyperbolic law its period is,
 .. math:: f(t) = f_0 + (f_1 - f_0) \frac{t}{T}, \qquad
           \frac{1}{f(t)} = \frac{1}{f_0} + \left(\frac{1}{f_1} - \frac{1}{f_0}\right) \frac{t}{T} ,
 
-and a call of the second law that is scaled in time is the same call at another time, but for its
-ends: no motion makes its echo fainter. Both laws take a Doppler shift for a delay,
+and a call of the second law that is scaled in time is the same call at another time, except at its
+ends: no motion makes its echo fainter. With both laws a Doppler shift looks like a delay,
 
 .. math:: \delta = -(a - 1) \frac{f_1 T}{f_1 - f_0} ,
 
 to first order (`coupling`).
 
-Sources: Klauder et al., Bell System Technical Journal 39 (1960), for the linear law; Kroszczynski,
-Proceedings of the IEEE 57 (1969), and Altes & Titlebaum, Journal of the Acoustical Society of
-America 48 (1970), for the hyperbolic one.
-
-Calls as the settings have them: a tone, a sweep, or a WAV file of one's own.
-
-Bands: which frequencies a call has, and how much of it is another's.
-
 A real recording is matched in each call's band, the middle of its spectrum that holds nearly all of
-its energy. Outputs of the matched filter follow it so closely that nothing between them is lost:
-twice as many in a second as the widest band has Hz, at least. Of the spectrum S in the band,
+its energy. The matched filter has at least twice as many outputs per second as the widest band has
+Hz, so that nothing between them is lost. With the spectrum S in the band,
 
 .. math:: f_c = \frac{\int f |S|^2}{\int |S|^2}, \qquad
           \beta^2 = (2\pi)^2 \frac{\int (f - f_c)^2 |S|^2}{\int |S|^2} ,
@@ -35,7 +27,10 @@ twice as many in a second as the widest band has Hz, at least. Of the spectrum S
 the Cramer-Rao bound of a delay is :math:`1 / (2 p \beta^2)`, with p the power of the output in
 units of its noise.
 
-Source: Van Trees, Detection, Estimation, and Modulation Theory III (1971), Sec. 10.2.
+Sources: Klauder et al., Bell System Technical Journal 39 (1960), for the linear law; Kroszczynski,
+Proceedings of the IEEE 57 (1969), and Altes & Titlebaum, Journal of the Acoustical Society of
+America 48 (1970), for the hyperbolic law; Van Trees, Detection, Estimation, and Modulation Theory
+III (1971), Sec. 10.2, for the bound.
 """
 
 import math
@@ -54,7 +49,7 @@ from pipistrelle.settings import CALL_KEYS, CALLERS, Layer, beside
 
 
 class Call(Protocol):
-    """One call of one caller, of constant envelope or not."""
+    """The waveform of a call, of constant envelope or not."""
 
     @property
     def frequency(self) -> float:
@@ -71,14 +66,14 @@ class Call(Protocol):
     ) -> Complex[np.ndarray, "*n"]:
         """Return the analytic signal, of unit amplitude, at times since its start [s].
 
-        `frequency`: the centre as it is received, Doppler shift included [Hz].
+        `frequency`: the centre as received, with Doppler shift [Hz].
         """
         ...
 
 
 @dataclass(frozen=True, slots=True)
 class ToneBurst:
-    """A tone switched on and off (Bradley & Abaid, Sec. II-A): the answer is a triangle."""
+    """A tone switched on and off (Bradley & Abaid, Sec. II-A): its matched output is a triangle."""
 
     frequency: float
     """[Hz]."""
@@ -88,7 +83,7 @@ class ToneBurst:
     def waveform(
         self, time: Float[np.ndarray, "*n"], frequency: float
     ) -> Complex[np.ndarray, "*n"]:
-        """Return the tone as it is received.
+        """Return the tone as received.
 
         >>> ToneBurst(35e3, 2.8e-3).waveform(np.array([0.0, 1e-5]), 50e3).round(9)
         array([ 1.+0.j, -1.+0.j])
@@ -98,18 +93,18 @@ class ToneBurst:
 
 @dataclass(frozen=True, slots=True)
 class Sweep:
-    """A tone that passes through a band, by a law of its frequency or period."""
+    """A call that sweeps through a band, with frequency or period linear in time."""
 
     start: float
     end: float
-    """`start` and `end`: frequency at which it begins and ends; alike, it is a tone [Hz]."""
+    """`start` and `end`: frequency at its beginning and end [Hz]; if equal, it is a tone."""
     duration: float
     """[s]."""
     law: Literal["linear", "hyperbolic"] = "linear"
     """Whether the frequency or the period is linear in time."""
     taper: float = 0.0
-    """Share of the call in which it rises and falls as a cosine does (Tukey's window): 0 switches
-    it on and off, 1 is Hann's window."""
+    """Share of the call with a cosine rise and fall (Tukey's window): 0 is rectangular, 1 Hann's
+    window."""
 
     @property
     def frequency(self) -> float:
@@ -119,7 +114,7 @@ class Sweep:
     def waveform(
         self, time: Float[np.ndarray, "*n"], frequency: float
     ) -> Complex[np.ndarray, "*n"]:
-        """Return the sweep as it is received; silence before and after.
+        """Return the sweep as received, zero outside its duration.
 
         >>> slow = Sweep(60e3, 35e3, 2.8e-3, taper=1.0)
         >>> abs(slow.waveform(np.array([0.0, 1.4e-3, 2.8e-3]), 47.5e3)).round(9)
@@ -136,7 +131,7 @@ class Sweep:
 
 
 def tapered(share: Float[np.ndarray, "*n"], taper: float) -> Float[np.ndarray, "*n"]:
-    """Return Tukey's window at shares of the call; 0 outside it.
+    """Return Tukey's window at relative times of the call; 0 outside it.
 
     >>> tapered(np.array([0.0, 0.1, 0.5, 1.1]), 0.4).round(3)
     array([0. , 0.5, 1. , 0. ])
@@ -150,10 +145,10 @@ def tapered(share: Float[np.ndarray, "*n"], taper: float) -> Float[np.ndarray, "
 
 
 def coupling(call: Call) -> float:
-    r"""Return by how much a call's echo seems later for a Doppler shift [s].
+    """Return the apparent delay of a call's echo per unit of relative Doppler shift a - 1 [s].
 
-    By the call's matched filter, per unit of a - 1, where a is the ratio of received to sent
-    frequency. What is not known is 0: tones and files have none to first order, or none stated.
+    By the call's matched filter, with a the ratio of received to sent frequency. It is 0 for tones
+    to first order, and for files, for which it is unknown.
 
     >>> round(1e3 * coupling(Sweep(60e3, 35e3, 2.8e-3)), 2), coupling(ToneBurst(35e3, 2.8e-3))
     (3.92, 0.0)
@@ -167,34 +162,34 @@ if TYPE_CHECKING:
     from scipy.interpolate import CubicSpline
 
 FINER = 8
-"""How much finer than its file's samples a recorded call is interpolated."""
+"""Interpolation factor of a recorded call."""
 LEAST_SAMPLES = 10
 """Fewest samples of a recorded call."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RecordedCall:
-    """A call from a file, between its samples as its band has it, and silence after them."""
+    """A call from a sound file, interpolated within its band, and silent after its samples."""
 
     path: str
     frequency: float
-    """Where its band lies [Hz]."""
+    """Centre of its band [Hz]."""
     duration: float
-    """Length, silence included [s]."""
+    """Length, with silence [s]."""
     rate: float
     """Sample rate of the file [Hz]."""
     samples: Float[np.ndarray, " n"]
-    """As the file has them."""
+    """Samples of the file."""
     _envelope: "CubicSpline" = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
-        """Interpolate the analytic signal, turned back by the band's frequency."""
+        """Interpolate the analytic signal, shifted down by the band's frequency."""
         from scipy.fft import fft, ifft, next_fast_len
         from scipy.interpolate import CubicSpline
 
         count = next_fast_len(2 * self.samples.size + 64)
         spectrum = fft(self.samples - self.samples.mean(), count)
-        spectrum[count // 2 :] = 0.0  # what is left is the analytic signal's half
+        spectrum[count // 2 :] = 0.0  # half of the analytic signal remains
         fine = np.zeros(FINER * count, dtype=np.complex128)
         fine[: count // 2] = spectrum[: count // 2]
         signal = 2.0 * FINER * ifft(fine)[: FINER * self.samples.size]
@@ -205,7 +200,7 @@ class RecordedCall:
     def waveform(
         self, time: Float[np.ndarray, "*n"], frequency: float
     ) -> Complex[np.ndarray, "*n"]:
-        """Return the call as it is received; silence before and after."""
+        """Return the call as received, zero outside its samples."""
         own = np.asarray(time) * (frequency / self.frequency)
         inside = (own >= 0.0) & (own <= (self.samples.size - 1) / self.rate)
         turned = np.exp(2j * np.pi * self.frequency * own)
@@ -213,9 +208,9 @@ class RecordedCall:
 
 
 def sound_of(settings: CallConfig, duration: float, key: str) -> Call | None:
-    """Return what a caller sends, or None where it is a plain tone.
+    """Return the call in a caller's settings; None for a plain tone.
 
-    `duration`: of every call [s]; `key`: the caller's section, for refusals.
+    `duration`: of every call [s]; `key`: the caller's section, for errors.
 
     >>> sound_of(CallConfig(call="sweep"), 2.8e-3, "emitter")
     Sweep(start=60000.0, end=35000.0, duration=0.0028, law='linear', taper=0.0)
@@ -235,7 +230,7 @@ def sound_of(settings: CallConfig, duration: float, key: str) -> Call | None:
 
 
 def settings_of(sound: Call | None) -> dict[str, Any]:
-    """Return the settings that give a caller's sound again; none of a plain tone.
+    """Return the settings that reproduce a call; empty for a plain tone.
 
     >>> settings_of(Sweep(60e3, 35e3, 2.8e-3))["band"]
     [60000.0, 35000.0]
@@ -251,7 +246,7 @@ def settings_of(sound: Call | None) -> dict[str, Any]:
 
 
 def with_calls(layer: Layer) -> Layer:
-    """Return settings whose calls' files are named from the root, so that they hold anywhere."""
+    """Return settings with absolute paths of the calls' files."""
     here = Path.cwd() / "settings"
     calls = {key: given for key, given in layer.items() if key in CALL_KEYS}
     named = {
@@ -266,10 +261,10 @@ def with_calls(layer: Layer) -> Layer:
 
 
 def read_call(path: Path, frequency: float, duration: float, where: str) -> RecordedCall:
-    """Read a call from a sound file of one channel, or refuse it.
+    """Read a call from a sound file of one channel; raise if it is not suitable.
 
-    `frequency`: where its band lies [Hz]; `duration`: the longest that it may be [s]; `where` the
-    file is named, for refusals.
+    `frequency`: centre of its band [Hz]; `duration`: longest allowed [s]; `where`: the setting that
+    names the file, for errors.
     """
     rate, samples = _samples(path, where)
     place, longest = f"{where}: {path}", round(duration * rate)
@@ -290,7 +285,7 @@ def read_call(path: Path, frequency: float, duration: float, where: str) -> Reco
 
 
 def _samples(path: Path, where: str) -> tuple[float, Float[np.ndarray, " n"]]:
-    """Return rate and samples of a sound file of one channel, or refuse it."""
+    """Return rate and samples of a sound file of one channel; raise if it cannot be read."""
     try:
         import soundfile
     except ImportError:
@@ -316,34 +311,34 @@ def _samples(path: Path, where: str) -> tuple[float, Float[np.ndarray, " n"]]:
 
 
 ENERGY = 0.995
-"""Share of a call's energy that its band holds."""
+"""Share of a call's energy in its band."""
 MAX_CROSS_TALK = 0.06
-"""Largest share of a call's power that the matched filter of another may answer."""
+"""Largest allowed relative power of a call in the matched filter of another."""
 PADDING = 8
-"""How much finer than its length asks for a call's spectrum is looked at."""
+"""Zero-padding factor of a call's spectrum."""
 
 
 class Band(NamedTuple):
-    """The frequencies of a call."""
+    """The frequency band of a call."""
 
     low: float
     high: float
     centre: float
-    """`low`, `high` and `centre`, the mean over the energy [Hz]."""
+    """`low`, `high` and the energy-weighted mean `centre` [Hz]."""
     spread: float
     """Root mean square angular frequency about the centre [rad/s]."""
     energy: float
-    """Sum of the squares of its samples, in units of its amplitude's."""
+    """Sum of the squares of its samples, in units of its squared amplitude."""
 
 
 def replica(call: Call, rate: float, scale: float = 1.0) -> Complex[np.ndarray, " n"]:
-    """Return a call's samples, as it is received a times as high (`scale`)."""
+    """Return a call's samples, with its frequency scaled by a factor."""
     time = np.arange(math.ceil(call.duration * rate - 1e-6)) / rate
     return call.waveform(time, scale * call.frequency)
 
 
 def band_of(call: Call, rate: float) -> Band:
-    """Return the band of a call that is sampled at a rate [Hz].
+    """Return the band of a call at a sample rate [Hz].
 
     >>> band = band_of(Sweep(60e3, 35e3, 2.8e-3, taper=0.2), 200e3)
     >>> round(band.low / 1e3), round(band.high / 1e3), round(band.centre / 1e3, 1)
@@ -364,10 +359,7 @@ def band_of(call: Call, rate: float) -> Band:
 
 
 def extent_of(call: Call, rate: float) -> tuple[float, float]:
-    """Return the frequencies between which a call lies: of a tone its own, else those of its band.
-
-    A sweep's are those at which it begins and ends, where its samples would alias.
-    """
+    """Return the lowest and highest frequency of a call: a tone's own, or the ends of its band."""
     if isinstance(call, ToneBurst):
         return call.frequency, call.frequency
     band = band_of(call, rate)
@@ -376,9 +368,9 @@ def extent_of(call: Call, rate: float) -> tuple[float, float]:
 
 
 def cross_talk(calls: Sequence[Call], rate: float) -> Float[np.ndarray, "c c"]:
-    """Return how much of a call's power the matched filter of another answers, at the worst lag.
+    """Return the relative power of each call in the matched filter of another, at the worst lag.
 
-    `rate` [Hz]. Row i is of the filter of call i.
+    `rate` [Hz]. Row i is the filter of call i.
     """
     sent = [replica(call, rate) for call in calls]
     count = 2 * max(one.size for one in sent)
@@ -388,7 +380,7 @@ def cross_talk(calls: Sequence[Call], rate: float) -> Float[np.ndarray, "c c"]:
 
 
 def lag_step(calls: Sequence[Call], rate: float) -> int:
-    """Return the samples from one output of the matched filters to the next, at a rate [Hz].
+    """Return the step between outputs of the matched filters in samples, at a rate [Hz].
 
     >>> lag_step([ToneBurst(35e3, 2.8e-3)], 200e3)
     6

@@ -1,15 +1,12 @@
-"""The vehicle's emitter: a circular piston that calls forward only.
+"""The vehicle's emitter, a back-baffled circular piston, and the target strength of bodies.
 
 The wider the piston, the narrower its beam. The paper names its emitters by their half-power
-beamwidth, the full angle within which the power stays above half of that on the axis.
+beamwidth, the full angle within which the power exceeds half of the axial.
 
-What a landmark throws in each direction, relative to what it throws back.
-
-`SHAPES` lists the shapes by name; another one is another `Shape` in it. The two here are Morse's
-short-wave limit of a rigid body: sound that mirrors off the lit side, and around the forward
-direction the shadow, which radiates as the body's outline would. Interference of the two is left
-out, so the formulae are near the exact series (0.1 to 0.9 dB) at 90 to 180 degrees and a smooth
-version of it nearer to the forward direction.
+`SHAPES` contains the shapes of bodies by name. The two here are Morse's short-wave limit of a rigid
+body: a mirror on the lit side, and around the forward direction the shadow, which radiates like the
+body's outline. Their interference is left out, so the formulae are near the exact series (0.1 to
+0.9 dB) at 90 to 180 degrees and a smooth version of it nearer to the forward direction.
 """
 
 from collections.abc import Callable
@@ -22,7 +19,7 @@ from scipy.special import j1
 from pipistrelle.config import Config, InputError, TargetConfig
 
 HALF_POWER = 1.6163399483107033
-"""Root x of (2 J1(x) / x)^2 = 1/2: ka sin(angle) where the beam has fallen to half its power."""
+"""Root x of (2 J1(x) / x)^2 = 1/2: ka sin(angle) at half the axial power."""
 
 
 def jinc(x: Float[np.ndarray, "*n"] | float) -> Float[np.ndarray, "*n"]:
@@ -30,7 +27,7 @@ def jinc(x: Float[np.ndarray, "*n"] | float) -> Float[np.ndarray, "*n"]:
 
     .. math:: \operatorname{jinc}(x) = 2 J_1(x) / x
 
-    `x`: ka times the sine of the angle off the axis. The values lie in [-0.133, 1].
+    `x`: ka times the sine of the angle off the axis. The values are in [-0.133, 1].
 
     >>> jinc(np.array([0.0, 1.0, 5.1356])).round(3)
     array([ 1.   ,  0.88 , -0.132])
@@ -41,9 +38,7 @@ def jinc(x: Float[np.ndarray, "*n"] | float) -> Float[np.ndarray, "*n"]:
 
 
 def in_front(bearing: Float[np.ndarray, "*n"] | float) -> Bool[np.ndarray, "*n"]:
-    """Tell whether a direction is within 90 degrees of a back-baffled emitter's axis.
-
-    `bearing` [rad].
+    """Return whether a direction [rad] is within 90 degrees of a back-baffled emitter's axis.
 
     Bradley & Abaid, Sec. II-A.
 
@@ -66,28 +61,12 @@ def piston_directivity(
               \text{ for } |\phi| \le 90°, \text{ else } 0, \qquad k = 2\pi f / c
        :label: eq-1
 
-    Parameters
-    ----------
-    bearing : (*n) [rad]
-        Angle off the axis, which is the vehicle's heading.
-    frequency : [Hz]
-    radius : [m]
-        Radius a of the piston.
-    speed_of_sound : [m/s]
+    `bearing` [rad]: angle off the axis, the vehicle's heading; `frequency` [Hz]; `radius` [m]: a of
+    the piston; `speed_of_sound` [m/s]. Returns a ratio in [0, 1].
 
-    Returns
-    -------
-    (*n)
-        Pressure ratio in [0, 1].
-
-    Notes
-    -----
     Bradley & Abaid, Eq. (1), after Arditi et al. (2015). As printed, its brackets leave the sine
-    out of the Bessel function's argument; here it is inside.
-
-    Examples
-    --------
-    At the edge of its beamwidth a piston sends half of its power.
+    out of the Bessel function's argument; here it is inside. At the edge of its beamwidth a piston
+    sends half of its power:
 
     >>> call = dict(frequency=35e3, speed_of_sound=343.0)
     >>> edge = beamwidth(0.0088, **call) / 2
@@ -105,28 +84,12 @@ def beamwidth(
 
     .. math:: 2 \arcsin \frac{x}{ka}, \quad (2 J_1(x) / x)^2 = \tfrac12, \quad x = 1.6163...
 
-    Parameters
-    ----------
-    radius : (*n) [m]
-    frequency : [Hz]
-    speed_of_sound : [m/s]
+    `radius` [m]; `frequency` [Hz]; `speed_of_sound` [m/s]. Returns the full width [rad], pi if the
+    power exceeds half within 90 degrees of the axis. Raises InputError if a radius is not a
+    positive number.
 
-    Returns
-    -------
-    (*n) [rad]
-        Full width; pi where the power never falls to half within 90 degrees of the axis.
-
-    Raises
-    ------
-    InputError
-        A radius that is not a positive number.
-
-    Notes
-    -----
     Bradley & Abaid, Sec. II-A and Appendix B.
 
-    Examples
-    --------
     >>> radius = np.array([0.0025, 0.0088])
     >>> np.degrees(beamwidth(radius, frequency=35e3, speed_of_sound=343.0)).round(1)
     array([180. ,  33.3])
@@ -138,9 +101,7 @@ def beamwidth(
 
 
 def beamwidth_of(config: Config) -> float:
-    """Return the half-power beamwidth of the vehicle's call, as the settings have it.
-
-    Returns [rad].
+    """Return the half-power beamwidth of the settings' vehicle [rad].
 
     >>> round(float(np.degrees(beamwidth_of(Config()))), 1)
     33.3
@@ -152,7 +113,7 @@ def beamwidth_of(config: Config) -> float:
 def piston_radius(
     beamwidth: Float[np.ndarray, "*n"] | float, *, frequency: float, speed_of_sound: float
 ) -> Float[np.ndarray, "*n"]:
-    r"""Return the radius of the piston that makes a half-power beamwidth.
+    r"""Return the radius of the piston with a half-power beamwidth.
 
     .. math:: a = \frac{x}{k \sin(\text{beamwidth} / 2)}, \quad (2 J_1(x) / x)^2 = \tfrac12
 
@@ -177,21 +138,21 @@ def piston_radius(
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Shape:
-    """How bodies of a shape scatter sound."""
+    """The scattering law of a shape of body."""
 
     intensity: Callable[
         [Float[np.ndarray, "*n"] | float, float | Float[np.ndarray, " m"]], Float[np.ndarray, "*n"]
     ]
-    """Scattered intensity relative to backscatter, I(angle) / I(pi), by the angle [rad] by which
-    the sound is turned and by kr, the wavenumber times the radius."""
+    """Scattered intensity relative to backscatter, I(angle) / I(pi), by the turn of the sound
+    [rad] and kr, the wavenumber times the radius."""
     growth: float
-    """Backscatter grows with the radius to this power."""
+    """Backscatter is proportional to this power of the radius."""
 
 
 def _cylinder(
     angle: Float[np.ndarray, "*n"] | float, kr: float | Float[np.ndarray, " m"]
 ) -> Float[np.ndarray, "*n"]:
-    """Return the intensity of a cylinder, Eq. (4)."""
+    """Return the relative intensity scattered by a cylinder, Eq. (4)."""
     lit = np.abs(np.sin(np.asarray(angle) / 2.0))
     shadow = 1.0 - lit**2  # cos^2 of half the angle
     return lit + 4.0 * kr / np.pi * (shadow * np.sinc(kr * np.sin(angle) / np.pi)) ** 2
@@ -200,7 +161,7 @@ def _cylinder(
 def _sphere(
     angle: Float[np.ndarray, "*n"] | float, kr: float | Float[np.ndarray, " m"]
 ) -> Float[np.ndarray, "*n"]:
-    """Return the intensity of a sphere."""
+    """Return the relative intensity scattered by a sphere."""
     shadow = 1.0 - np.abs(np.sin(np.asarray(angle) / 2.0)) ** 2
     return 1.0 + (kr * shadow * jinc(kr * np.sin(angle))) ** 2
 
@@ -213,13 +174,12 @@ SHAPES = {
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Bodies:
-    """Sizes and shapes of things that reflect, each its own."""
+    """Radius and shape of each reflecting body."""
 
     radius: Float[np.ndarray, " n"]
-    """NaN of a body whose size is not stated: it has the usual target's, and counts as a point
-    [m]."""
+    """[m]; NaN if not stated: the settings' target, at a point."""
     shape: Shaped[np.ndarray, " n"]
-    """Name of each one's shape, of `SHAPES`."""
+    """Name of its shape in `SHAPES`."""
 
 
 def target_strength_db(
@@ -241,35 +201,14 @@ def target_strength_db(
     Written with :math:`\cot(\gamma/2) = 2\cos^2(\gamma/2) / \sin\gamma` they are finite everywhere:
     in the forward direction :math:`I(0)/I(\pi)` is :math:`4kr/\pi` and :math:`1 + (kr)^2`.
 
-    Parameters
-    ----------
-    angle : (*n) [rad]
-        By how much the sound is turned: pi is back to where it came from, 0 straight on.
-    radius : [m]
-        Or one for each of the last axis of the angles.
-    frequency : [Hz]
-    shape : str
-        Of `SHAPES`.
-    speed_of_sound : [m/s]
+    `angle` [rad]: turn of the sound, pi is back to the source, 0 straight on; `radius` [m]: one, or
+    one for each entry of the last axis of `angle`; `frequency` [Hz]; `shape`: in `SHAPES`. Returns
+    [dB]: 0 at pi; even, and of period 2 pi, in the angle. Raises InputError for an unknown shape.
 
-    Returns
-    -------
-    (*n) [dB]
-        0 at pi; even, and of period 2 pi, in the angle.
-
-    Raises
-    ------
-    InputError
-        An unknown shape.
-
-    Notes
-    -----
     Bradley & Abaid, Eq. (4), which is the cylinder with two misprints: as printed (a sine of the
-    full angle, a sine not squared) I(pi) is 0 and I goes negative. Source: Morse, Vibration and
+    full angle, a sine not squared) I(pi) is 0 and I becomes negative. Source: Morse, Vibration and
     Sound, scattering from cylinders and spheres at short wavelengths.
 
-    Examples
-    --------
     >>> tin = dict(radius=0.025, frequency=30e3, shape="cylinder", speed_of_sound=343.0)
     >>> target_strength_db(np.radians([180.0, 90.0, 0.0]), **tin).round(2)
     array([ 0.  , -1.39, 12.43])
@@ -279,7 +218,7 @@ def target_strength_db(
 
 
 def shape_of(name: str) -> Shape:
-    """Return the shape of a name; refuse one that is not there."""
+    """Return the shape of a name; raise if it is unknown."""
     if name not in SHAPES:
         expected = " or ".join(map(repr, SHAPES))
         raise InputError(f"target.shape: found {name!r}, expected {expected}; choose")
@@ -294,17 +233,16 @@ def strength_of_bodies_db(
     frequency: float,
     speed_of_sound: float,
 ) -> Float[np.ndarray, "*k n"]:
-    r"""Return the scattered intensity relative to backscatter of the usual target.
+    r"""Return the scattered intensity of bodies relative to the usual target's backscatter.
 
-    Backscatter grows with the radius as :math:`I(\pi) = r / 2` of a cylinder and :math:`r^2 / 4` of
-    a sphere, so a body of radius r throws back :math:`10 \log_{10} (r / r_0)` or :math:`20
-    \log_{10} (r / r_0)` more than one of its shape with the usual radius :math:`r_0`, for which the
-    source levels stand.
+    Backscatter grows with the radius as :math:`I(\pi) = r / 2` for a cylinder and :math:`r^2 / 4`
+    for a sphere, so a body of radius r has :math:`10 \log_{10} (r / r_0)` or :math:`20 \log_{10} (r
+    / r_0)` more than one of its shape with the usual radius :math:`r_0`, to which the source levels
+    refer.
 
-    `angle` [rad]: by how much the sound is turned; `frequency` [Hz]; `speed_of_sound` [m/s].
-    Returns [dB].
+    `angle` [rad]: turn of the sound; `frequency` [Hz]; `speed_of_sound` [m/s]. Returns [dB].
 
-    Bradley & Abaid, Eq. (4), of which only the relative part is theirs. See `target_strength_db`.
+    Bradley & Abaid, Eq. (4), for the relative part. See `target_strength_db`.
 
     >>> shapes = np.array(["cylinder", "cylinder", "sphere"])
     >>> posts = Bodies(radius=np.array([0.025, 0.25, 0.25]), shape=shapes)
@@ -325,24 +263,18 @@ def strength_of_bodies_db(
 
 
 def backscatter_db(bodies: Bodies, usual: TargetConfig) -> Float[np.ndarray, " n"]:
-    """Return how much more bodies throw back than one of their shape with the usual radius.
-
-    Returns [dB]: as `strength_of_bodies_db` at an angle of pi.
-    """
+    """Return the backscatter of bodies relative to their shape with the usual radius [dB]."""
     growth = np.array([shape_of(name).growth for name in bodies.shape.tolist()])
     return 10.0 * growth * np.log10(_radius(bodies, usual) / usual.radius)
 
 
 def _radius(bodies: Bodies, usual: TargetConfig) -> Float[np.ndarray, " n"]:
-    """Return the bodies' radii, the usual target's where none is stated [m]."""
+    """Return the bodies' radii [m], or the usual target's if not stated."""
     return np.where(np.isnan(bodies.radius), usual.radius, bodies.radius)
 
 
 def with_usual(bodies: Bodies, count: int, usual: TargetConfig) -> Bodies:
-    """Append point bodies of the settings' shape.
-
-    The given bodies come first.
-    """
+    """Append point bodies of the settings' shape to the given bodies."""
     return Bodies(
         radius=np.append(bodies.radius, np.full(count, np.nan)),
         shape=np.append(bodies.shape, np.full(count, usual.shape)),

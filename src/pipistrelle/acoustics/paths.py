@@ -1,22 +1,17 @@
-"""Paths of sound from every target to the vehicle: length, direction and rate of change.
+"""Callers, and the sound paths from every target to the vehicle: length, direction, Doppler speed.
 
-Targets are the landmarks, which stand still, followed by all callers but the vehicle, which may
-move. Paths are frozen at the moment of emission; of the motion only the speeds along them are kept.
+Targets are the landmarks, which are at rest, then all callers but the vehicle, which may move.
+Paths are frozen at the moment of emission; of the motion only the speeds along them are used. A
+body is a circle in the plane of the map: a vertical cylinder, or a sphere at the height of the
+microphones. It reflects at the point of its surface on the path from caller to vehicle.
 
-Where a body throws sound: the point of its surface on the way from a caller to the vehicle.
+The first caller is the vehicle, at the microphones. The vehicle and other vehicles, which have a
+heading, may have a beam; other callers are omnidirectional, at rest or on a path. All call when the
+vehicle does, unless they have an independent clock. Each has its own tone or sweep, which
+identifies it. The paper has two: the vehicle and the beacon.
 
-In the plane of the map a body is a circle: a vertical cylinder, or a sphere at the ears' height.
-
-Callers: the vehicle itself, and all others that it listens to.
-
-Callers are a list. The first is the vehicle, the only one that moves with the ears. Its call is
-given a beam, and so is that of other vehicles, which have a heading; the others call alike in all
-directions, from a place or along a path. All call when the vehicle does, except those that have a
-clock of their own. Each has a tone or a sweep of its own, by which its call is told from the rest.
-The paper's list is of two: the vehicle and the beacon.
-
-A caller other than the vehicle is also a landmark: it reflects the calls of all but itself, and is
-heard directly in its own tone. Landmarks bear the labels 1 to n, caller j the label n + j.
+A caller other than the vehicle is also a landmark: it reflects all calls but its own, and its
+direct call is received. Landmarks have the labels 1 to n, caller j the label n + j.
 """
 
 import math
@@ -31,7 +26,7 @@ from pipistrelle.config import MAX_OTHERS, Config, InputError
 from pipistrelle.geometry import wrap
 
 _MAX_NEWTON_STEPS = 60
-"""Newton steps at most; a dozen do, even from 1e-6 m before a surface."""
+"""Most Newton steps; a dozen suffice, even from 1e-6 m before a surface."""
 _MAX_LAST_STEP = 1e-13
 """Length of the last Newton step, along the surface [m]."""
 
@@ -42,28 +37,26 @@ def reflecting_points(
     centre: Float[np.ndarray, "_ t 2"],
     radius: Float[np.ndarray, " t"],
 ) -> Float[np.ndarray, "k t 2"]:
-    r"""Return the points of bodies on the shortest path of sound from a source to a receiver.
+    r"""Return the points of bodies on the shortest sound path from a source to a receiver.
 
-    On the lit side it is the mirror's point (Alhazen's problem): at the angle t along the surface,
-    from below the receiver, that makes both angles of incidence the same,
+    On the lit side it is the mirror point (Alhazen's problem): at the angle t along the surface,
+    from the direction of the receiver, at which both angles of incidence are equal,
 
     .. math:: i(t; b) = i(w - t; a), \qquad
               i(u; d) = \operatorname{atan2}(d \sin u, d \cos u - r)
 
     with a and b the distances of source and receiver from the centre, w the angle between them
-    there and r the radius. Both sides are monotonic in t. For a source at the receiver's place t =
-    0: the echo is straight back, from the distance of the centre less the radius.
+    there and r the radius. Both sides are monotonic in t. If source and receiver coincide, t = 0:
+    the path is radial.
 
-    Where the body stands between the two, the least way is the straight one, that of the wave which
-    makes the shadow: its point is the one of the line that is nearest the centre. Where the line
-    grazes the surface both points are the same, so nothing jumps.
+    If the body is between the two, the shortest path is the straight line, of the wave that makes
+    the shadow: the point is the nearest to the centre on the line. If the line grazes the surface
+    both points are equal, so the point is continuous.
 
-    `source` [m]; `receiver` [m]: both outside the bodies; `centre` [m]; `radius` [m]: 0 of a point,
-    which is its own. Returns [m]: to 1e-12 m.
+    `source`, `receiver` [m]: outside the bodies; `centre` [m]; `radius` [m]: 0 for a point body.
+    Returns [m], to 1e-12 m. A departure: the landmarks of Bradley & Abaid are points.
 
-    A departure: the landmarks of Bradley & Abaid are points.
-
-    Straight back, in a right angle, and in the shadow.
+    Radial, at a right angle, and in the shadow:
 
     >>> at, here = np.array([[[5.0, 0.0]]]), np.zeros((1, 1, 2))
     >>> callers = np.array([[[0.0, 0.0]], [[5.0, 5.0]], [[9.0, 0.2]]])
@@ -77,7 +70,7 @@ def reflecting_points(
     sized = np.flatnonzero(radius)
     middle, r = point[:, sized], radius[sized]
     line = source - receiver
-    with np.errstate(invalid="ignore"):  # no line from a place to itself
+    with np.errstate(invalid="ignore"):  # undefined from a place to itself
         along = np.sum((middle - receiver) * line, axis=-1) / np.sum(line * line, axis=-1)
     crossing = receiver + np.clip(along, 0.0, 1.0)[..., np.newaxis] * line
     between = _length(crossing - middle) < r
@@ -91,7 +84,7 @@ def _mirror_points(
     receiver: Float[np.ndarray, "k t 2"],
     radius: Float[np.ndarray, " t"],
 ) -> Float[np.ndarray, "k t 2"]:
-    """Solve Alhazen's problem by Newton steps kept in a bracket; vectors start at the centres."""
+    """Solve Alhazen's problem by bracketed Newton steps; vectors start at the centres."""
     out, home = _length(source), _length(receiver)
     cross = receiver[..., 0] * source[..., 1] - receiver[..., 1] * source[..., 0]
     turn = np.arctan2(cross, np.sum(receiver * source, axis=-1))
@@ -99,7 +92,7 @@ def _mirror_points(
     low, high = np.zeros_like(span), span
     near_out, near_home = out / (out - radius), home / (home - radius)  # slopes at an angle of 0
     angle = span * near_out / (near_out + near_home)
-    going = np.ones(span.shape, dtype=bool)  # each by itself: its bits hang on no other
+    going = np.ones(span.shape, dtype=bool)  # each row stops independently
     for _ in range(_MAX_NEWTON_STEPS):
         here, rise = _incidence(angle, home, radius)
         there, fall = _incidence(span - angle, out, radius)
@@ -136,59 +129,43 @@ def _incidence(
 
 
 VEHICLE = 0
-"""Where the vehicle stands in every list of callers."""
+"""Index of the vehicle in every list of callers."""
 MAX_CALLERS = 1 + MAX_OTHERS
-"""Callers that one recording can tell apart."""
+"""Most callers in a recording."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Caller:
-    """Someone whose calls the vehicle hears."""
+    """An emitter that the vehicle receives, or the vehicle itself."""
 
     name: str
     """Name in messages and figures."""
     frequency: float
     """Tone, or centre of the band [Hz]."""
     level_db: float
-    """Source level at 1 m; of the vehicle, on its axis [dB]."""
+    """Source level at 1 m; for the vehicle, on its axis [dB]."""
     place: Float[np.ndarray, "2"] | Float[np.ndarray, "t 2"] | None = None
-    """Where it calls from: one place, or one for each time (of a scenario) or emission; None for
-    the vehicle, which calls from where it is [m]."""
+    """Position, or one for each time (of a scenario) or emission; None for the vehicle [m]."""
     velocity: Float[np.ndarray, "2"] | Float[np.ndarray, "t 2"] | None = None
-    """Of a caller that moves, where it calls; None where it stands, or where `callers_at` is to
-    take it from the path [m/s]."""
+    """Velocity at each position; None if at rest, or if `callers_at` computes it from the path
+    [m/s]."""
     key: str = ""
-    """Its section of the settings, where it has one: a refusal then names that."""
+    """Its section of the settings, for errors; empty if it has none."""
     heading: Float[np.ndarray, " t"] | None = None
-    """Heading of another vehicle's piston at each place [rad]; None of a caller without a beam."""
+    """Heading of another vehicle's piston at each position [rad]; None without a beam."""
     mission: tuple[Float[np.ndarray, "t 3"], Float[np.ndarray, "t-1 2"]] | None = None
-    """Poses [m, m, rad] and assumed controls of a caller that maps the world, too."""
+    """Poses [m, m, rad] and assumed controls of a caller that also maps the world."""
     calls: Float[np.ndarray, " m"] | None = None
-    """Rising times of its calls [s]; None of one that calls when the vehicle does."""
+    """Increasing times of its calls [s]; None if it calls when the vehicle does."""
     sound: Call | None = None
     """The call; None is a tone burst."""
 
 
 def callers_of(config: Config, beacon: Float[np.ndarray, "2"]) -> tuple[Caller, Caller]:
-    """List the paper's two callers, vehicle and beacon, with the settings' tones and levels.
+    """Return the paper's two callers, vehicle and beacon, with the settings' tones and levels.
 
-    Parameters
-    ----------
-    config : Config
-        Its sections emitter and beacon.
-    beacon : (2) [m]
-        Where the beacon stands.
+    `beacon`: its position [m]. Bradley & Abaid, Sec. II.
 
-    Returns
-    -------
-    The vehicle and the beacon.
-
-    Notes
-    -----
-    Bradley & Abaid, Sec. II.
-
-    Examples
-    --------
     >>> [(caller.name, caller.frequency) for caller in callers_of(Config(), np.zeros(2))]
     [('vehicle', 35000.0), ('beacon', 30000.0)]
     """
@@ -213,7 +190,7 @@ def callers_of(config: Config, beacon: Float[np.ndarray, "2"]) -> tuple[Caller, 
 
 
 def check_caller(caller: Caller) -> None:
-    """Refuse a caller with a tone, level, place or velocity that is not finite or of wrong shape.
+    """Raise if a caller's tone, level, position or velocity is not finite or has a wrong shape.
 
     >>> check_caller(Caller(name="boat", frequency=30e3, level_db=42.8, place=np.zeros(3)))
     Traceback (most recent call last):
@@ -229,11 +206,11 @@ def check_caller(caller: Caller) -> None:
 
 
 def _check(caller: Caller, part: str, unit: str, *, pairs: bool) -> None:
-    """Refuse a value of a caller that is neither one finite number nor x and y or rows of them."""
+    """Raise if a value of a caller is not one finite number or, with `pairs`, finite x and y."""
     value = getattr(caller, part)
     try:
         numbers = np.asarray(value, dtype=np.float64)
-    except (TypeError, ValueError):  # text, or rows of unlike lengths
+    except (TypeError, ValueError):  # text, or rows of unequal lengths
         found = f"{value!r}"
     else:
         found = f"an array of shape {numbers.shape}"
@@ -251,7 +228,7 @@ def _check(caller: Caller, part: str, unit: str, *, pairs: bool) -> None:
 
 
 def moves(caller: Caller) -> bool:
-    """Tell whether a caller other than the vehicle calls along a path.
+    """Return whether a caller other than the vehicle moves.
 
     >>> [moves(caller) for caller in callers_of(Config(), np.zeros(2))]
     [False, False]
@@ -264,12 +241,11 @@ def moves(caller: Caller) -> bool:
 def callers_at(
     callers: Sequence[Caller], time: Float[np.ndarray, " t"], steps: Int[np.ndarray, " k"]
 ) -> tuple[Caller, ...]:
-    """Return the callers with their places and velocities at some times.
+    """Return the callers with their positions and velocities at given times.
 
-    Where no velocities are given, those of the steps that end there are taken, as for the vehicle.
-
-    `callers`: the vehicle first; `time` [s]: of the paths; `steps`: which of the times. Returns
-    paths and velocities (k, 2); those that stand as they were.
+    `callers`: the vehicle first; `time` [s]: of the paths; `steps`: indices of times. Missing
+    velocities are computed from the steps that end there, as for the vehicle. Returns paths and
+    velocities (k, 2); callers at rest are unchanged.
 
     >>> path = np.array([[0.0, 5.0], [0.5, 5.0], [1.5, 5.0]])
     >>> vehicle, _ = callers_of(Config(), path[0])
@@ -292,7 +268,7 @@ def callers_at(
 
 
 def _at(caller: Caller, time: Float[np.ndarray, " t"], steps: Int[np.ndarray, " k"]) -> Caller:
-    """Return the places and velocities of a path at some of its times."""
+    """Return a moving caller with the positions and velocities at some of its times."""
     path, velocity = np.asarray(caller.place), caller.velocity
     shapes = {path.shape, path.shape if velocity is None else np.shape(velocity)}
     if shapes != {(len(time), 2)}:
@@ -311,7 +287,7 @@ def _at(caller: Caller, time: Float[np.ndarray, " t"], steps: Int[np.ndarray, " 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SoundPaths:
-    """Paths from t targets, landmarks and then callers, to the vehicle at each of k emissions."""
+    """Sound paths from t targets, landmarks and then callers, to the vehicle at k emissions."""
 
     poses: Float[np.ndarray, "k 3"]
     """Poses of the vehicle [m, m, rad]."""
@@ -330,7 +306,7 @@ class SoundPaths:
     closing: Float[np.ndarray, "k t"]
     """Speed of the vehicle towards each target [m/s]."""
     drift: Float[np.ndarray, "_ t 2"] | None
-    """Velocities of the targets; None where all stand [m/s]."""
+    """Velocities of the targets; None if all are at rest [m/s]."""
     approach: Float[np.ndarray, "k t"] | float
     """Speed of the targets towards the vehicle [m/s]."""
 
@@ -341,10 +317,10 @@ def paths_to_vehicle(
     landmarks: Float[np.ndarray, "n 2"],
     callers: Sequence[Caller],
 ) -> SoundPaths:
-    """Measure the paths from all targets to the vehicle, as they are when it calls.
+    """Compute the sound paths from all targets to the vehicle at each emission.
 
-    `poses` [m, m, rad]: of the vehicle at each emission; `velocities` [m/s]; `landmarks` [m];
-    `callers`: the vehicle first; paths of k places.
+    `poses` [m, m, rad]: of the vehicle; `velocities` [m/s]; `landmarks` [m]; `callers`: the vehicle
+    first; paths of k positions.
 
     >>> from pipistrelle.acoustics.paths import callers_of
     >>> from pipistrelle.config import Config
@@ -366,14 +342,13 @@ def paths_to_vehicle(
 def paths_over_surfaces(
     paths: SoundPaths, caller: int, extent: Float[np.ndarray, " t"]
 ) -> SoundPaths:
-    """Measure the paths from the points of the targets' surfaces that reflect a caller's sound.
+    """Compute the sound paths from the surface points that reflect a caller's sound.
 
-    The points move with caller and vehicle, but the path is the shortest one, so that to first
-    order its length changes with its ends alone.
+    The points move with caller and vehicle, but as the path is the shortest, the change of its
+    length depends to first order only on its ends.
 
-    `paths`: from the targets' centres; `caller`: its number in the list of callers; `extent` [m]:
-    radius of each target; 0 of a point. The paths are the same to the bit where all targets are
-    points.
+    `paths`: from the targets' centres; `caller`: its number; `extent` [m]: radius of each target, 0
+    for a point. If all targets are points, the paths are returned unchanged.
 
     >>> from pipistrelle.acoustics.paths import callers_of
     >>> from pipistrelle.config import Config
@@ -398,7 +373,7 @@ def _measured(
     target: Float[np.ndarray, "_ t 2"],
     drift: Float[np.ndarray, "_ t 2"] | None,
 ) -> SoundPaths:
-    """Measure the paths from all targets, the first of which are landmarks, to the vehicle."""
+    """Compute the sound paths from all targets, landmarks first, to the vehicle."""
     offset = target - poses[:, np.newaxis, :2]
     homeward = np.hypot(offset[..., 0], offset[..., 1])
     east, north = velocities[:, :1], velocities[:, 1:]
@@ -424,7 +399,7 @@ def _measured(
 def _joined(
     landmarks: Float[np.ndarray, "n 2"], callers: Sequence[np.ndarray | None]
 ) -> Float[np.ndarray, "_ t 2"]:
-    """Append the callers' positions (or velocities) to those of the landmarks."""
+    """Append the callers' positions (or velocities) to the landmarks'."""
     rows = [np.reshape(np.asarray(caller), (-1, 1, 2)) for caller in callers]
     parts = [landmarks[np.newaxis], *rows]
     count = max(len(part) for part in parts)
@@ -434,7 +409,7 @@ def _joined(
 def turn_of_sound(
     incoming: Float[np.ndarray, "_ t 2"], offset: Float[np.ndarray, "k t 2"]
 ) -> Float[np.ndarray, "k t"]:
-    """Return the angle by which a target turns sound; pi is straight back.
+    """Return the deflection angle of sound at a target; pi is straight back.
 
     `incoming` [m]: from the caller to each target; `offset` [m]: from the vehicle to each target.
     Returns [rad].
@@ -451,9 +426,9 @@ def turn_of_sound(
 def refuse_impossible(
     paths: SoundPaths, callers: Sequence[Caller], extent: Float[np.ndarray, " t"]
 ) -> None:
-    """Refuse points that coincide, coordinates that are not finite, and points within a body.
+    """Raise if points coincide, coordinates are not finite, or a point is within a body.
 
-    `paths`: from the targets' centres; `extent` [m]: radius of each target; 0 of a point.
+    `paths`: from the targets' centres; `extent` [m]: radius of each target, 0 for a point.
     """
     between, within = [paths.homeward], [extent]
     for itself in range(paths.landmarks, paths.homeward.shape[1]):

@@ -1,8 +1,6 @@
-"""The way through air or water: spreading, absorption and the shift of the tone by motion.
+"""Propagation in air or water: spreading, absorption, Doppler shift, and the medium's properties.
 
-Losses are positive decibels. A reference distance of 1 m makes spreading loss 0 there.
-
-Medium: the speed of sound, and the losses on a path.
+Losses are positive decibels, relative to a distance of 1 m.
 """
 
 from collections.abc import Callable
@@ -19,30 +17,15 @@ from pipistrelle.config import AirConfig, InputError, WaterConfig
 def spreading_loss_db(
     path: Float[np.ndarray, "*n"] | float, *, ways: Literal[1, 2] = 1
 ) -> Float[np.ndarray, "*n"]:
-    r"""Return the spherical spreading over a path, re 1 m.
+    r"""Return the spherical spreading loss over a path, re 1 m.
 
     .. math:: \beta = r \, 20 \log_{10} \frac{d}{r}
        :label: eq-2
 
-    Parameters
-    ----------
-    path : (*n) [m]
-        Whole distance d that the sound has travelled, > 0.
-    ways : 1 or 2
-        r: 1 from a source to a receiver, 2 to a scatterer and back to its source, where the sound
-        spreads anew from the scatterer.
+    `path` [m]: total distance d that the sound has travelled, > 0; `ways`: r, 1 from a source to a
+    receiver, 2 to a scatterer and back, as the sound spreads again from there. Returns [dB].
 
-    Returns
-    -------
-    (*n) [dB]
-
-    Notes
-    -----
-    Bradley & Abaid, Eq. (2).
-
-    Examples
-    --------
-    An echo from 10 m away loses 40 log10(10).
+    Bradley & Abaid, Eq. (2). An echo from 10 m away loses 40 log10(10):
 
     >>> float(spreading_loss_db(20.0, ways=2))
     40.0
@@ -56,19 +39,17 @@ def passive_spreading_loss_db(
     *,
     law: Literal["paper", "bistatic"],
 ) -> Float[np.ndarray, "*n"]:
-    r"""Return the spreading of someone else's call on its way over a landmark, re 1 m.
+    r"""Return the spreading loss of another caller's call over a landmark, re 1 m.
 
     .. math:: \beta_\text{paper} = 20 \log_{10}(d_1 + d_2), \qquad
               \beta_\text{bistatic} = 20 \log_{10} d_1 + 20 \log_{10} d_2
 
     `outward` [m]: from the source to the landmark, > 0; `homeward` [m]: from the landmark to the
-    receiver, > 0; `law`: A mirror, as the paper's r = 1 has it, or a point scatterer that sends the
-    sound out anew. Returns [dB].
+    receiver, > 0; `law`: a mirror, as in the paper (r = 1), or a point scatterer. Returns [dB].
 
-    Bradley & Abaid, Eq. (2) with r = 1; the bistatic law is a departure (physics, e.g. Urick's
-    bistatic sonar equation).
-
-    Back at the source the bistatic law is that of an active echo; the mirror is far louder.
+    Bradley & Abaid, Eq. (2) with r = 1; the bistatic law is a departure (e.g. Urick's bistatic
+    sonar equation). If source and receiver coincide, the bistatic law is that of an active echo;
+    the mirror is far louder:
 
     >>> float(passive_spreading_loss_db(10.0, 10.0, law="bistatic"))
     40.0
@@ -105,25 +86,13 @@ def absorption_db_per_m(
     and the molar concentration of water vapour :math:`h` [%], relative humidity times saturation
     pressure over p.
 
-    Parameters
-    ----------
-    frequency : (*n) [Hz]
-    temperature_c : [degrees Celsius]
-    relative_humidity : in [0, 1]
-    pressure_kpa : [kPa]
+    `frequency` [Hz]; `temperature_c` [degrees Celsius]; `relative_humidity` in [0, 1];
+    `pressure_kpa` [kPa]. Returns [dB/m].
 
-    Returns
-    -------
-    (*n) [dB/m]
-
-    Notes
-    -----
     Bradley & Abaid, Eq. (3), which is this formula at 20 °C and 101.325 kPa, with its last
-    coefficient mended: 1.1552e-6, printed 1.5552e-6. Source: ISO 9613-1:1993, Eqs. (3) to (5) and
-    Annex B.
+    coefficient corrected: 1.1552e-6, printed 1.5552e-6. Source: ISO 9613-1:1993, Eqs. (3) to (5)
+    and Annex B.
 
-    Examples
-    --------
     >>> air = dict(temperature_c=20.0, relative_humidity=0.5, pressure_kpa=101.325)
     >>> absorption_db_per_m(np.array([30e3, 35e3]), **air).round(3)
     array([0.937, 1.133])
@@ -149,7 +118,7 @@ def water_absorption_db_per_m(
     depth: float,
     ph: float,
 ) -> Float[np.ndarray, "*n"]:
-    r"""Return the absorption of a pure tone by water, of the sea or fresh.
+    r"""Return the absorption of a pure tone by sea or fresh water.
 
     .. math:: \alpha = A_1 \frac{f_1 f^2}{f_1^2 + f^2} + A_2 P_2 \frac{f_2 f^2}{f_2^2 + f^2}
               + A_3 P_3 f^2
@@ -165,30 +134,16 @@ def water_absorption_db_per_m(
               P_2 &= 1 - 1.37 \cdot 10^{-4} D + 6.2 \cdot 10^{-9} D^2 \\
               P_3 &= 1 - 3.83 \cdot 10^{-5} D + 4.9 \cdot 10^{-10} D^2
 
-    and :math:`A_3` a cubic in T, one up to 20 degrees and another above.
+    and :math:`A_3` a cubic in T, with other coefficients above 20 degrees.
 
-    Parameters
-    ----------
-    frequency : (*n) [Hz]
-    temperature_c : [degrees Celsius]
-    salinity : [parts per thousand]
-        0 leaves pure water alone.
-    depth : [m]
-    ph : pH
+    `frequency` [Hz]; `temperature_c` [degrees Celsius]; `salinity` [parts per thousand], 0 for pure
+    water; `depth` [m]; `ph`. Returns [dB/m].
 
-    Returns
-    -------
-    (*n) [dB/m]
-
-    Notes
-    -----
     Source: R. E. Francois and G. R. Garrison, Sound absorption based on ocean measurements, J.
-    Acoust. Soc. Am. 72 (1982), part I 896-907, part II 1879-1890; for 200 Hz to 1 MHz. Of part II
-    are A1, printed 8.68 in some textbooks, and Table IV.
+    Acoust. Soc. Am. 72 (1982), part I 896-907, part II 1879-1890; for 200 Hz to 1 MHz. A1, printed
+    8.68 in some textbooks, and Table IV are from part II.
 
-    Examples
-    --------
-    The sea at 10 degrees, and a fresh lake, at 100 and 200 kHz, in dB/km.
+    The sea at 10 degrees, and a fresh lake, at 100 and 200 kHz, in dB/km:
 
     >>> lake = dict(temperature_c=10.0, salinity=0.0, depth=0.0, ph=8.0)
     >>> 1e3 * water_absorption_db_per_m(np.array([1e5, 2e5]), **lake | {"salinity": 35.0}).round(4)
@@ -218,16 +173,16 @@ def doppler_frequency(
     source_speed: Float[np.ndarray, "*n"] | float = 0.0,
     speed_of_sound: float,
 ) -> Float[np.ndarray, "*n"]:
-    r"""Return the frequency that a receiver hears, source and receiver moving through still air.
+    r"""Return the received frequency with source and receiver moving in a medium at rest.
 
     .. math:: f' = f \frac{c + v_r}{c - v_s}
 
-    A vehicle's own echo has both speeds, the vehicle's towards the landmark. A beacon's call, or
-    its echo, has the receiver's alone, towards where the sound comes from. A reflector on the move
-    receives and sends in turn.
+    For a vehicle's own echo both speeds are the vehicle's towards the landmark. For a beacon's call
+    or its echo only the receiver moves. Apply it twice for a moving reflector.
 
     `frequency` [Hz]: as emitted; `receiver_speed` [m/s]: towards the sound; `source_speed` [m/s]:
-    along the sound; `speed_of_sound` [m/s]. Returns [Hz].
+    along the sound; `speed_of_sound` [m/s]. Returns [Hz]. Raises InputError for speeds of sound or
+    more.
 
     Bradley & Abaid, Sec. II-B, which calls the shift not appreciable: it is not negligible in a
     matched filter of 2.8 ms.
@@ -250,9 +205,7 @@ def doppler_frequency(
 class Medium:
     """A homogeneous medium at rest.
 
-    Examples
-    --------
-    Helium, if it took nothing from the sound.
+    Helium, without absorption:
 
     >>> helium = Medium(speed_of_sound=1007.0, absorption_db_per_m=lambda frequency: 0.0)
     >>> helium.spreading
@@ -262,16 +215,16 @@ class Medium:
     speed_of_sound: float
     """[m/s]."""
     absorption_db_per_m: Callable[[float], float]
-    """Loss of a tone [dB/m], by its frequency [Hz]."""
+    """Absorption of a tone [dB/m], by its frequency [Hz]."""
     spreading: Literal["paper", "bistatic"] = "paper"
-    """Law of the loss on the way over a landmark (`propagation.passive_spreading_loss_db`)."""
+    """Law of the spreading loss over a landmark (`passive_spreading_loss_db`)."""
 
 
 @lru_cache(maxsize=64)
 def medium_of(section: AirConfig | WaterConfig) -> Medium:
     """Return the medium of a section of the settings (`Config.medium`).
 
-    Air absorbs as ISO 9613-1 says, water as Francois and Garrison do.
+    Absorption in air is from ISO 9613-1, in water from Francois and Garrison.
 
     >>> air, water = medium_of(AirConfig()), medium_of(WaterConfig())
     >>> air.speed_of_sound, round(air.absorption_db_per_m(30e3), 3)

@@ -1,7 +1,7 @@
 """Arithmetic that must give the same bits everywhere: elementary functions, counted noise.
 
-`elementary` has the logarithms, angles and roots that a processor takes many at a time, alike in
-every lane; `random_stream` the complex normals of which any sample is known by its number alone.
+`elementary`: vectorisable logarithms, angles and roots, equal in every lane; `random_stream`:
+complex normal noise, each sample computed from its number.
 """
 
 from lazy_loader import attach

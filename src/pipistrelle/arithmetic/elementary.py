@@ -1,13 +1,12 @@
-r"""Elementary functions for lanes: a loop over particles that calls these runs several at a time.
+"""Elementary functions that vectorise: a loop that calls them computes several arguments at once.
 
-The C library's functions take one number and branch on it, so a loop that calls them stays a loop
-over single numbers. These have no branches and no tables: each brings its argument near zero,
-sums the first terms of the Taylor series there, as many as double precision can see, and puts
-back what it took away. The compiler then computes as many arguments at once as the processor has
-lanes, with the same result, to the last bit, as one by one.
+The C library's functions take one number and branch, so a loop that calls them is not vectorised.
+These have no branches and no tables: each reduces its argument to near zero, sums a Taylor series
+to double precision, and undoes the reduction. The compiler then computes as many arguments at once
+as the processor has lanes, with bit-identical results.
 
-They are exact to three units in the last place on the domains they state. Outside, and for what
-is not a number, they promise nothing.
+They are exact to three units in the last place on the stated domains, and undefined outside and for
+NaN.
 """
 
 import math
@@ -17,7 +16,7 @@ import numpy as np
 from pipistrelle.jit import inlined
 
 _INTEGER = 1.5 * 2.0**52
-"""Added to a number it rounds it to an integer, which the last bits of the sum hold."""
+"""Adding it rounds a number to an integer, in the last bits of the sum."""
 _MANTISSA = 52
 _TINY = 2.0**-1022
 _LN2_HEAD = float.fromhex("0x1.62e42fee00000p-1")
@@ -37,7 +36,7 @@ _KNOWN = tuple(math.atan(slope) for slope in (0.25, 0.5, 0.75, 1.0))
 
 @inlined
 def _series(coefficients, x):
-    """Return the sum of coefficients times powers of x, the highest first."""
+    """Return the sum of coefficients times powers of x, the highest power first."""
     total = 0.0
     for coefficient in coefficients:
         total = total * x + coefficient
@@ -84,8 +83,8 @@ def cosine_and_sine(angle):
 def arctangent(y, x):
     """Return the direction of the point (x, y) in [-pi, pi] [rad]; zero for the origin.
 
-    Within an eighth of a turn the direction is that of the nearest of five slopes, known, and of
-    the small rest between the two.
+    Within an eighth of a turn, it is the tabulated direction of the nearest of five slopes plus the
+    arctangent of the remainder.
     """
     across, along = abs(y), abs(x)
     small, large = min(across, along), max(across, along)

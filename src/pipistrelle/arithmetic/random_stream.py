@@ -1,10 +1,9 @@
-r"""Counter-based complex normal noise: any sample of any stream, by its number alone.
+"""Counter-based complex normal noise: each sample is computed from its stream and number.
 
-Number i of the stream with a 64-bit key is a hash of key and i (the SplitMix64 finaliser of
-Steele, Lea & Flood 2014), turned into a complex normal by Box and Muller: no state, so neither
-order nor workers can change a result, and the loops vectorise, which a frame's 180,000 normals
-need. Logarithm, sine and cosine are short series, good to single precision, far finer than any
-statistic of the noise.
+Number i of the stream with a 64-bit key is a hash of key and i (the SplitMix64 finaliser of Steele,
+Lea & Flood 2014), transformed to a complex normal by Box and Muller. There is no state, so neither
+order nor workers can change a result, and the loops vectorise, as 180,000 normals per frame
+require. Logarithm, sine and cosine are short series, good to single precision.
 """
 
 import hashlib
@@ -26,22 +25,10 @@ _QUARTER_TURN = _F(0.5 * math.pi)
 
 
 def stream_key(seed: int, iteration: int, purpose: str, frame: int = 0) -> int:
-    """Return the key of a random stream: four arguments always give the same 64-bit number.
+    """Return the key of a random stream, in [0, 2^64): equal arguments give an equal key.
 
-    Parameters
-    ----------
-    seed, iteration : int
-    purpose : str
-        What the numbers are for; streams of different purposes are independent.
-    frame : int
+    `purpose`: use of the numbers; streams of different purposes are independent.
 
-    Returns
-    -------
-    int
-        In [0, 2^64).
-
-    Examples
-    --------
     >>> stream_key(7, 0, "noise", 3) == stream_key(7, 0, "noise", 3)
     True
     >>> stream_key(7, 0, "noise", 3) == stream_key(7, 0, "noise", 4)
@@ -58,23 +45,9 @@ def complex_noise(
 ) -> Complex[np.ndarray, "..."]:
     """Draw circular complex normal noise.
 
-    Parameters
-    ----------
-    shape : tuple of int
-        Sample i, in C order, is number i of the stream.
-    std : float
-        Root of the mean of abs(noise)**2.
-    key : int
-        From `stream_key`.
-    out : (*shape) complex, contiguous, optional
-        Written and returned instead of a new array.
+    Sample i, in C order, is number i of the stream. `std`: root of the mean of abs(noise)**2;
+    `key`: from `stream_key`; `out`: contiguous, written and returned instead of a new array.
 
-    Returns
-    -------
-    (*shape) complex
-
-    Examples
-    --------
     >>> noise = complex_noise((1000, 10), 2.0, stream_key(7, 0, "example"))
     >>> bool(abs(np.mean(abs(noise) ** 2) - 4.0) < 5 * 4.0 / np.sqrt(noise.size))
     True
@@ -86,10 +59,7 @@ def complex_noise(
 
 @kernel
 def _fill(out, variance, key):
-    """Fill interleaved real and imaginary parts with the stream's first numbers.
-
-    By chunks that stay in the cache, a short loop per step: each of them vectorises, one would not.
-    """
+    """Fill interleaved real and imaginary parts with the first numbers of a stream."""
     count = out.size // 2
     radial, angular = np.empty(_CHUNK, dtype=np.uint32), np.empty(_CHUNK, dtype=np.uint32)
     modulus, mantissa = np.empty(_CHUNK, dtype=np.float32), np.empty(_CHUNK, dtype=np.uint32)
@@ -138,7 +108,7 @@ def _modulus(mantissa, exponent, length, variance, modulus):
 
 @kernel
 def _turn(modulus, angular, length, real, imaginary):
-    """Turn moduli by angles of 32 bits: a half turn, a quarter turn, 30 bits of a quarter turn."""
+    """Rotate moduli by 32-bit angles: a half turn, a quarter turn, 30 bits of a quarter turn."""
     for i in range(length):
         fraction = _F(np.int32(angular[i] & np.uint32(0x3FFFFFFF))) * _F(2.0**-30)
         x = (fraction - _F(0.5)) * _QUARTER_TURN

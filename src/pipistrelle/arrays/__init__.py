@@ -1,9 +1,9 @@
-"""Where the ears are and what they hear.
+"""Microphone arrays: geometry, sampling, recording of arrivals and beamforming.
 
-`layout` puts the microphones on the faces of a square and `receiver` lets them hear (Bradley &
-Abaid, Sec. II-C): arrivals become a recording, sample by sample or, with the same statistics, as
-sums over 0.2 ms blocks (`sampling` settles how). `beamforming` says what such an array can tell of
-a direction: its scan, its beampattern and the smallest error of a bearing.
+`array_file` reads microphones, and `layout` groups them into faces and lines (Bradley & Abaid, Sec.
+II-C). `receiver` makes a recording of arrivals, sample by sample or, with the same statistics, as
+sums over 0.2 ms blocks; `sampling` chooses rate and blocks. `beamforming` computes scan, beam
+pattern and the bound of a bearing.
 """
 
 from lazy_loader import attach

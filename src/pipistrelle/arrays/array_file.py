@@ -1,4 +1,4 @@
-r"""Files of microphone arrays: where each channel's microphone is.
+"""Files of microphone arrays: the position, gain and face of each channel's microphone.
 
 A file is ``array.csv``, a row per channel, in metres, in the vehicle's frame, x ahead and y to the
 left:
@@ -9,9 +9,9 @@ left:
     1,0.03,-0.02,0,front,0
     2,0.03,0.02,0,front,0
 
-of which ``z``, ``face`` and ``gain_db`` may be left out; or the XML of Acoular,
-``<MicArray name="..."><pos Name="..." x="..." y="..." z="..."/></MicArray>``, in the encoding that
-it declares, whose microphones are numbered from 1 in the order of the file.
+where ``z``, ``face`` and ``gain_db`` may be left out; or the XML of Acoular, ``<MicArray
+name="..."><pos Name="..." x="..." y="..." z="..."/></MicArray>``, in its declared encoding, with
+microphones numbered from 1 in the order of the file.
 """
 
 import codecs
@@ -35,13 +35,13 @@ from pipistrelle.settings import ARRAY_KEY, Layer
 MAX_MICROPHONES = 256
 """Most microphones of an array."""
 MAX_BYTES = 1_000_000
-"""Largest file of an array: more is something else."""
+"""Largest size of an array's file [byte]."""
 MAX_EXTENT = 10.0
-"""Widest array [m]: a wider one was written in millimetres."""
+"""Largest width of an array [m]: a wider one is probably in millimetres."""
 SAME_PLACE = 1e-4
-"""Two microphones nearer than this are one [m]."""
+"""Least distance of two microphones [m]."""
 MAX_GAIN_DB = 100.0
-"""Gains of microphones lie between this and its negative [dB]."""
+"""Largest gain of a microphone, and its negative the smallest [dB]."""
 REQUIRED = ("channel", "x", "y")
 OPTIONAL = ("z", "face", "gain_db")
 _MARKS = {
@@ -53,10 +53,10 @@ _MARKS = {
     b"<\0?\0": "utf-16-le",
     b"\0<\0?": "utf-16-be",
 }
-"""How XML of some encodings begins (XML 1.0, appendix F)."""
+"""First bytes of XML in some encodings (XML 1.0, appendix F)."""
 _DECLARED = re.compile(rb"""<\?xml\s[^>]*?\bencoding\s*=\s*(["'])(?P<name>[^"']*)\1""")
 _NAME = re.compile(r"[A-Za-z][A-Za-z0-9._-]{0,40}")
-"""Of an encoding, as XML has it."""
+"""Valid name of an encoding in XML."""
 _ON_WINDOWS = {
     "shift_jis": "cp932",
     "gb2312": "gb18030",
@@ -64,10 +64,10 @@ _ON_WINDOWS = {
     "big5": "cp950",
     "euc_kr": "cp949",
 }
-"""Encodings that have more characters where Windows writes them under the same name."""
+"""Encodings to which Windows adds characters under the same name."""
 _OF_PYTHON = ("idna", "punycode", "undefined", "unicode-escape", "unicode_escape",
               "raw-unicode-escape", "raw_unicode_escape")  # fmt: skip
-"""Codecs that are no encodings of files."""
+"""Python codecs that are not encodings of files."""
 _FACE = re.compile(r"[\w-]{0,40}")
 _LIMITS = {"x": 1e6, "y": 1e6, "z": 1e6, "gain_db": MAX_GAIN_DB}
 
@@ -77,20 +77,20 @@ class Microphones:
     """The microphones of an array, a row per channel."""
 
     channel: Int[np.ndarray, " m"]
-    """Number of each: without gaps, from 0 or 1 on, in the order of a recording's channels."""
+    """Channel number: without gaps, from 0 or 1, in the order of a recording's channels."""
     position: Float[np.ndarray, "m 3"]
-    """In the vehicle's frame: x ahead, y to the left, z up [m]."""
+    """Position in the vehicle's frame: x ahead, y to the left, z up [m]."""
     gain_db: Float[np.ndarray, " m"]
-    """How much louder than the others it hears a sound, beside the same noise [dB]."""
+    """Gain relative to the others, at equal noise [dB]."""
     face: tuple[str, ...]
-    """Name of the vehicle's face that it is on; empty: it hangs free."""
+    """Name of its face on the vehicle; empty without a face."""
 
 
 class _Row(NamedTuple):
-    """One microphone."""
+    """One microphone of a file or setting."""
 
     place: str
-    """Line of the file, or row of the setting, that it is from."""
+    """Line of the file, or row of the setting."""
     channel: int
     x: float
     y: float
@@ -100,28 +100,13 @@ class _Row(NamedTuple):
 
 
 def read_array(path: Path, *, some: bool = False) -> Microphones:
-    r"""Read the microphones of a file, CSV or Acoular's XML.
+    r"""Read the microphones of a file, CSV or Acoular's XML, sorted by channel.
 
-    Parameters
-    ----------
-    path : Path
-    some : bool
-        Whether the channels are some of a recording's, counted from 1.
+    `some`: whether the channels are a subset of a recording's, counted from 1. Raises InputError
+    with file, line and column if the file is not an array, or has fewer than two microphones, two
+    in one position, a channel twice or missing, numbers that are not finite, or coordinates in
+    millimetres.
 
-    Returns
-    -------
-    Microphones
-        In the order of their channels.
-
-    Raises
-    ------
-    InputError
-        With the file, the line and the column: for what is no array, fewer than two microphones,
-        two in one place, a channel that is there twice or missing, numbers that are not finite, and
-        coordinates that must be millimetres.
-
-    Examples
-    --------
     >>> from tempfile import TemporaryDirectory
     >>> with TemporaryDirectory() as place:
     ...     path = Path(place) / "array.csv"
@@ -156,7 +141,7 @@ def microphones_of(rows: Sequence[MicrophoneRow], where: str = "receiver.array")
 
 
 def with_array(layer: Layer) -> Layer:
-    """Replace the name of an array's file by the microphones in it: settings that need no file."""
+    """Replace the name of an array's file in a layer of settings by its microphones."""
     given = layer.get(ARRAY_KEY)
     if given is None or not isinstance(given.value, str) or given.value in ("", SQUARE):
         return layer
@@ -170,7 +155,7 @@ def with_array(layer: Layer) -> Layer:
 
 
 def _checked(where: str, rows: list[_Row], *, some: bool = False) -> Microphones:
-    """Return microphones, in the order of their channels; refuse what is no array."""
+    """Make microphones of rows sorted by channel; raise if they are not an array."""
     _check_channels(where, rows, some=some)
     _check_places(where, rows)
     return Microphones(
@@ -182,7 +167,7 @@ def _checked(where: str, rows: list[_Row], *, some: bool = False) -> Microphones
 
 
 def array_text(microphones: Microphones) -> str:
-    r"""Return the CSV file of microphones; columns that say nothing are left out.
+    r"""Format microphones as a CSV file, without columns of zeros or empty names.
 
     >>> pair = Microphones(channel=np.arange(2), position=np.array([[0, 0, 0], [0, 0.1, 0]]),
     ...                    gain_db=np.zeros(2), face=("", ""))
@@ -203,7 +188,7 @@ def array_text(microphones: Microphones) -> str:
 
 
 def write_array(path: Path, microphones: Microphones) -> None:
-    """Write microphones as a CSV file, which `read_array` reads again; replaces nothing."""
+    """Write microphones as a new CSV file for `read_array`; raise if the file exists."""
     try:
         write_whole(path, array_text(microphones).encode(), replace=False)
     except FileExistsError:
@@ -211,7 +196,7 @@ def write_array(path: Path, microphones: Microphones) -> None:
 
 
 def _rows_of_csv(path: Path, text: str) -> Iterator[_Row]:
-    """Yield the microphones of a CSV file; blank lines and those that begin with # are skipped."""
+    """Yield the microphones of a CSV file; blank lines and lines with # are skipped."""
     numbered = enumerate(text.splitlines(), start=1)
     content = [(line, row) for line, row in numbered if row.strip() and row[0] != "#"]
     expected = f"the header {','.join(REQUIRED)!r}, perhaps followed by {', '.join(OPTIONAL)}"
@@ -234,10 +219,7 @@ def _rows_of_csv(path: Path, text: str) -> Iterator[_Row]:
 
 
 def _text_of_xml(path: Path, data: bytes) -> str | None:
-    """Return a file's text if it is XML, as bytes of the encoding that it declares; else None.
-
-    A byte order mark goes before a declaration, and UTF-8 is what declares none.
-    """
+    """Decode XML by its byte order mark, declaration or UTF-8; return None for other files."""
     marked = next((name for mark, name in _MARKS.items() if data.startswith(mark)), None)
     if marked is None and not data.lstrip().startswith(b"<"):
         return None
@@ -248,7 +230,7 @@ def _text_of_xml(path: Path, data: bytes) -> str | None:
         codec = codecs.lookup(name).name if _NAME.fullmatch(name) else _OF_PYTHON[0]
         if codec not in _OF_PYTHON:
             text = data.decode(_ON_WINDOWS.get(codec, codec)).lstrip("\ufeff").lstrip()
-            text.encode()  # for the parser, which takes no half of a pair
+            text.encode()  # for the parser, which rejects lone surrogates
     except LookupError:
         pass
     except ValueError:
@@ -262,11 +244,9 @@ def _text_of_xml(path: Path, data: bytes) -> str | None:
 
 
 def _rows_of_xml(path: Path, text: str) -> Iterator[_Row]:
-    """Return the microphones of Acoular's XML; a document type, which may define entities, is not
-    read.
-    """
+    """Return the microphones of Acoular's XML; raise at a document type (entities)."""
     rows: list[_Row] = []
-    parser = expat.ParserCreate("utf-8")  # in place of what is declared: that was decoded before
+    parser = expat.ParserCreate("utf-8")  # overrides the declared encoding, as the text is decoded
     expected = "Acoular's <MicArray><pos x=... y=... z=.../></MicArray>"
 
     def refuse_type(*_: object) -> None:
@@ -295,7 +275,7 @@ def _rows_of_xml(path: Path, text: str) -> Iterator[_Row]:
 
 
 def _row(path: Path, line: int, fields: dict[str, str]) -> _Row:
-    """Return the microphone of a line's fields, or refuse one of them."""
+    """Return the microphone of a line's fields; raise at the first invalid field."""
     where, channel = f"{path}, line {line}", fields["channel"]
     if not (channel.isdecimal() and channel.isascii() and len(channel) < 10):
         found, expected = f"channel {shown(channel)}", "a whole number, from 0 or 1 on"
@@ -318,10 +298,7 @@ def _row(path: Path, line: int, fields: dict[str, str]) -> _Row:
 
 
 def _check_channels(path: str, rows: list[_Row], *, some: bool) -> None:
-    """Refuse rows, in the order of their channels, whose channels are not numbered as they should.
-
-    `some`: whether others may be between them.
-    """
+    """Raise if sorted rows have wrong channel numbers, or gaps unless `some`."""
     if not 2 <= len(rows) <= MAX_MICROPHONES:
         found = f"{len(rows)} microphone" + "s" * (len(rows) != 1)
         expected = f"2 to {MAX_MICROPHONES}"
@@ -346,7 +323,7 @@ def _check_channels(path: str, rows: list[_Row], *, some: bool) -> None:
 
 
 def _check_places(path: str, rows: list[_Row]) -> None:
-    """Refuse microphones that stand in one place, or implausibly far apart."""
+    """Raise if microphones coincide, or are implausibly far from each other."""
     place = np.array([(row.x, row.y, row.z) for row in rows])
     extent = float(np.ptp(place, axis=0).max())
     if extent > MAX_EXTENT:

@@ -1,13 +1,11 @@
-r"""Narrowband beamforming with a uniform line array: steering, pattern, scan, accuracy limit.
+r"""Narrowband beamforming: steering vectors, beam patterns, scan, and the bound of a bearing.
 
-Pattern: what a group of microphones can tell of a bearing, and what it cannot.
-
-A beam steered to :math:`\phi_0` answers a wave from :math:`\phi` with the power
+A beam steered to :math:`\phi_0` has for a wave from :math:`\phi` the power response
 
 .. math:: B(\phi) = \left| \sum_m w_m^2 e^{i k\, p_m \cdot (u(\phi) - u(\phi_0))} \right|^2 ,
 
-one where they agree. Half of it is the beam's width; another lobe that is nearly one is a direction
-that sounds the same. Waves are plane to an array of the aperture D from :math:`2 D^2 / \lambda` on.
+one where they agree. The beam's width is at half of it; another lobe near one is an ambiguous
+bearing. Waves are plane for an array of aperture D from :math:`2 D^2 / \lambda`.
 
 Source: van Trees, Optimum Array Processing (2002), ch. 2.
 """
@@ -21,20 +19,20 @@ from jaxtyping import Complex, Float
 from pipistrelle.arrays.layout import Scattered
 
 STEERED = 360
-"""Directions to which a beam is steered, at most."""
+"""Most steering directions."""
 MOST_WAVES = 4096
-"""Directions of waves for each, at most."""
+"""Most wave directions per beam."""
 PHASE_STEP = 0.1
-"""Distance of two such directions, as a root mean square phase [rad], where that many suffice."""
+"""Root mean square phase between two wave directions [rad], if `MOST_WAVES` suffice."""
 ALIKE_DB = -1.0
-"""A lobe as high as this sounds the same [dB]."""
+"""Least height of an ambiguous lobe [dB]."""
 
 UNKNOWN = math.pi / math.sqrt(3.0)
-"""Deviation of a bearing that is not known at all [rad]."""
+"""Standard deviation of a bearing that is uniform over the circle [rad]."""
 
 
 class Pattern(NamedTuple):
-    """Resolution and ambiguities of a group of microphones at one frequency."""
+    """Resolution and ambiguities of a group of microphones at a frequency."""
 
     microphones: int
     aperture: float
@@ -42,25 +40,24 @@ class Pattern(NamedTuple):
     nearest: float
     """Largest distance of a microphone from its nearest neighbour [m]."""
     far_field: float
-    """Distance from which on waves are plane [m]."""
+    """Distance from which waves are plane [m]."""
     width: tuple[float, float]
-    """Half-power width of the narrowest beam and of the widest [rad]."""
+    """Half-power width of the narrowest and of the widest beam [rad]."""
     lobe_db: float
-    """Highest other lobe of any beam [dB]."""
+    """Highest side lobe of any beam [dB]."""
     worst: tuple[float, float]
-    """The bearing of that beam, and of the lobe [rad]."""
+    """Bearing of that beam, and of the lobe [rad]."""
     alike: float
-    """Share of the bearings for which some other one sounds the same (`ALIKE_DB`)."""
+    """Share of the bearings with a lobe of `ALIKE_DB` elsewhere."""
     std: tuple[float, float]
-    """Cramer-Rao bound of a bearing at 20 dB at each microphone, at best and at worst [rad]."""
+    """Smallest and largest Cramer-Rao bound of a bearing at 20 dB per microphone [rad]."""
 
 
 def pattern_of(layout: Scattered, g: int, *, frequency: float, speed_of_sound: float) -> Pattern:
-    """Work out what a group of microphones can tell at a frequency.
+    """Compute resolution and ambiguities of a group of microphones at a frequency [Hz].
 
-    Bearings are all, or of a line on a face those within 75 degrees of its normal.
-
-    `frequency` [Hz]; `speed_of_sound` [m/s].
+    Over all bearings, or for a line on a face within 75 degrees of its normal. `speed_of_sound`
+    [m/s].
 
     >>> from pipistrelle.arrays.array_file import microphones_of
     >>> from pipistrelle.arrays.layout import scattered
@@ -109,7 +106,7 @@ def beam_power(
     frequency: float,
     speed_of_sound: float,
 ) -> Float[np.ndarray, " n"]:
-    """Return the answer of a group's beam to waves from bearings [rad], 1 where it is steered."""
+    """Return the power response of a group's beam to waves from bearings [rad]; 1 at the peak."""
     members = layout.group == g
     share = layout.amplitude[members] ** 2 / np.sum(layout.amplitude[members] ** 2)
     lead = (layout.lead(bearing) - layout.lead(steered))[:, members]
@@ -119,7 +116,7 @@ def beam_power(
 def _bearings(
     normal: float, place: Float[np.ndarray, "k 2"], share: Float[np.ndarray, " k"], wave: float
 ) -> tuple[Float[np.ndarray, " n"], bool]:
-    """Return the bearings that a group may hear from, and whether they close a circle."""
+    """Return the bearings that a group can receive from, and whether they form a circle."""
     around = np.linspace(-np.pi, np.pi, STEERED, endpoint=False)
     turn = wave * np.sqrt(spread_towards(around, place, np.sqrt(share)).max())
     count = min(max(math.ceil(2.0 * np.pi * turn / PHASE_STEP), STEERED), MOST_WAVES)
@@ -134,10 +131,10 @@ def spread_towards(
     position: Float[np.ndarray, "k 2"],
     weight: Float[np.ndarray, " k"],
 ) -> Float[np.ndarray, "*n"]:
-    r"""Return the variance of microphones' places across a direction [m^2].
+    r"""Return the variance of the microphones' positions across a direction [m^2].
 
-    Each counts by its weight squared. Times the wavenumber squared it is :math:`\kappa`: how far
-    the phases turn with the bearing, of which the Cramer-Rao bound is made
+    Weighted by the squared weights. Times the wavenumber squared it is :math:`\kappa`, the squared
+    slope of the phases in the bearing in the Cramer-Rao bound
     (`pipistrelle.detection.full_circle`).
 
     >>> pair, equal = np.array([[0.0, 0.1], [0.0, -0.1]]), np.full(2, 0.5**0.5)
@@ -150,7 +147,7 @@ def spread_towards(
 
 
 def _width_and_lobe(power: Float[np.ndarray, " n"], i: int, closed: bool) -> tuple[int, float, int]:
-    """Return a beam's width at half power, in steps, its highest other lobe and where that is."""
+    """Return a beam's half-power width in steps, its highest side lobe, and the lobe's index."""
     n = len(power)
     turned = np.roll(power, n // 2 - i) if closed else power
     i, away = (n // 2, i - n // 2) if closed else (i, 0)
@@ -202,12 +199,12 @@ def beampattern(
     frequency: float,
     speed_of_sound: float,
 ) -> Float[np.ndarray, "*n"]:
-    r"""Return the power response of a beamformer steered to one angle to waves from others.
+    r"""Return the power response of a beam steered to one angle to waves from others.
 
     .. math:: B(\theta) = \left| \frac{1}{N} v(\theta_0)^H v(\theta) \right|^2
 
     `angle` [rad]; `steered` [rad]; `position` [m]; `frequency` [Hz]; `speed_of_sound` [m/s].
-    Returns [0, 1]: 1 at the steered angle.
+    Returns a ratio in [0, 1], 1 at the steered angle.
 
     >>> ears = {"position": np.arange(10) * 0.0049, "frequency": 35e3, "speed_of_sound": 343.0}
     >>> null = np.arcsin(0.2)
@@ -227,7 +224,7 @@ def beamscan(
     frequency: float,
     speed_of_sound: float,
 ) -> Float[np.ndarray, " n"]:
-    r"""Return the power of a conventional beam over angles: where a snapshot's sound comes from.
+    r"""Return the power of a conventional beam over angles, with peaks at a snapshot's sources.
 
     .. math:: P(\theta) = \left| v(\theta)^H x \right|^2
 
@@ -248,30 +245,15 @@ def beamscan(
 def bearing_bound(
     snr: float, angle: float, *, elements: int, spacing: float, wavelength: float
 ) -> float:
-    r"""Return the least standard deviation of an unbiased bearing (Cramer-Rao) of one snapshot.
+    r"""Return the Cramer-Rao bound of a bearing from one snapshot, as a standard deviation [rad].
 
     .. math:: \sigma_\theta \ge \sqrt{\frac{6}{\mathrm{SNR}\, N (N^2 - 1)}}
               \Big/ \left( \frac{2\pi d}{\lambda} \cos\theta \right)
 
-    Parameters
-    ----------
-    snr : float
-        Power ratio of one element's matched-filter output.
-    angle : [rad]
-        Off the array's normal.
-    elements : int
-    spacing, wavelength : [m]
+    `snr`: power ratio of one element's matched-filter output; `angle` [rad]: off the array's
+    normal; `spacing`, `wavelength` [m]. Stoica & Nehorai (1989), for an unknown deterministic
+    amplitude.
 
-    Returns
-    -------
-    [rad]
-
-    Notes
-    -----
-    Stoica & Nehorai (1989), for an unknown deterministic amplitude.
-
-    Examples
-    --------
     >>> bound = bearing_bound(10.0, 0.0, elements=10, spacing=0.5, wavelength=1.0)
     >>> round(float(np.degrees(bound)), 2)
     0.45

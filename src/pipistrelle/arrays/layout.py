@@ -1,4 +1,4 @@
-"""Where the microphones are: line arrays on the faces of a vehicle, or anywhere."""
+"""Array geometry: line arrays on the faces of a vehicle, or microphones in any positions."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -11,15 +11,15 @@ from pipistrelle.config import SQUARE, Config, InputError, ReceiverConfig
 from pipistrelle.geometry import wrap
 
 LINE_TOLERANCE = 1e-5
-"""Most that a microphone of a line may be off its place, for the fast scan [m]."""
+"""Largest deviation of a microphone from its position on a line [m]."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Layout:
     """Equal, back-baffled line arrays around one phase centre, the vehicle's position.
 
-    An element hears within 90 degrees of its face's normal. The faces' own offsets from the
-    centre (some 25 mm) are left out: they would shift delays by less than 0.1 ms.
+    An element receives within 90 degrees of its face's normal. The faces' offsets from the centre
+    (some 25 mm) are neglected: they would shift delays by less than 0.1 ms.
     """
 
     normal: Float[np.ndarray, " f"]
@@ -29,15 +29,15 @@ class Layout:
 
     @property
     def shape(self) -> tuple[int, int]:
-        """Faces and elements of each, as a recording has them."""
+        """Number of faces, and elements of each."""
         return self.normal.size, self.position.size
 
     def members(self, g: int) -> tuple[int, Int[np.ndarray, " k"]]:
-        """Return the row of a recording that a face is in, and which microphones of it it has."""
+        """Return the row of a face in a recording, and the indices of its microphones there."""
         return g, np.arange(self.position.size)
 
     def places(self, g: int) -> tuple[Float[np.ndarray, "k 2"], Float[np.ndarray, " k"]]:
-        """Return where a face's microphones are in the vehicle's frame [m], and their gains."""
+        """Return positions of a face's microphones in the vehicle's frame [m], and their gains."""
         left = np.array([-np.sin(self.normal[g]), np.cos(self.normal[g])])
         return np.outer(self.position, left), np.ones(self.position.size)
 
@@ -47,11 +47,11 @@ class Layout:
         frequency: float,
         speed_of_sound: float,
     ) -> Float[np.ndarray, "*n e"]:
-        r"""Return the phases at the elements of a plane wave from an angle off a face's normal.
+        r"""Return the phases [rad] at the elements of a plane wave at an angle off a face's normal.
 
         .. math:: \varphi_e(\theta) = 2\pi f \, y_e \sin\theta / c
 
-        `angle` [rad]; `frequency` [Hz]; `speed_of_sound` [m/s]. Returns [rad].
+        `angle` [rad]; `frequency` [Hz]; `speed_of_sound` [m/s].
 
         >>> pair = Layout(normal=np.zeros(1), position=np.array([0.0, 0.0049]))
         >>> pair.phases(np.pi / 2, 35e3, 343.0).round(9)
@@ -63,11 +63,10 @@ class Layout:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Scattered:
-    """Microphones anywhere on the vehicle, in groups whose outputs are scanned together.
+    """Microphones in any positions on the vehicle, in groups that are scanned together.
 
-    Each hears a plane wave when it reaches it, earlier than the vehicle's centre by p . u / c, with
-    p its place and u the unit vector to where the wave comes from. Sound travels horizontally:
-    heights do not count.
+    A plane wave reaches a microphone at p earlier than the vehicle's centre by p . u / c, with u
+    the unit vector to the source. Sound travels horizontally: heights are ignored.
     """
 
     position: Float[np.ndarray, "e 2"]
@@ -75,29 +74,29 @@ class Scattered:
     amplitude: Float[np.ndarray, " e"]
     """Gain of each microphone; the noise of all is the same."""
     group: Int[np.ndarray, " e"]
-    """Number of the group of each."""
+    """Number of each microphone's group."""
     normal: Float[np.ndarray, " f"]
-    """Direction of each group's normal, of a line on a face, which hears within 90 degrees of it;
-    NaN of any other group, which hears all around [rad]."""
+    """Normal of each group [rad]: a line on a face receives within 90 degrees of it; NaN for a
+    group that receives from all directions."""
     name: tuple[str, ...]
     """Name of the face of each group; empty for microphones without a face."""
 
     @property
     def shape(self) -> tuple[int, int]:
-        """One row of elements, as a recording has them."""
+        """One row, and the number of microphones."""
         return 1, len(self.position)
 
     def members(self, g: int) -> tuple[int, Int[np.ndarray, " k"]]:
-        """Return the row of a recording that a group is in, and which microphones of it it has."""
+        """Return the row of a group in a recording, and the indices of its microphones there."""
         return 0, np.flatnonzero(self.group == g)
 
     def places(self, g: int) -> tuple[Float[np.ndarray, "k 2"], Float[np.ndarray, " k"]]:
-        """Return where a group's microphones are in the vehicle's frame [m], and their gains."""
+        """Return positions of a group's microphones in the vehicle's frame [m], and their gains."""
         _, members = self.members(g)
         return self.position[members], self.amplitude[members]
 
     def lead(self, bearing: Float[np.ndarray, "*n"] | float) -> Float[np.ndarray, "*n e"]:
-        """Return how far the microphones are on the way of sound from a bearing [rad], in metres.
+        """Return the microphones' positions along the direction to a bearing [rad], in metres.
 
         >>> pair = scattered(microphones_of([(0.1, 0, 0, 0, ""), (0, 0.2, 0, 0, "")]))
         >>> pair.lead(np.pi / 2).round(9)
@@ -108,7 +107,7 @@ class Scattered:
 
 
 def layout_of(config: Config) -> Layout | Scattered:
-    """Return the arrays of the settings: the only place that chooses them."""
+    """Return the array of the settings, as lines on a square or scattered microphones."""
     if config.receiver.array == SQUARE:
         return square_of_four(config.receiver)
     return scattered(microphones_in(config))
@@ -123,11 +122,11 @@ def microphones_in(config: Config) -> Microphones:
 
 
 def scattered(microphones: Microphones, where: str = "receiver.array") -> Scattered:
-    """Group the microphones of an array: by face, and those that hang free.
+    """Group the microphones of an array by face; microphones without a face form a group.
 
-    A face whose microphones are alike and stand in one equally spaced line hears on one side, the
-    one away from the middle of the array; of a line through the middle, the one on whose left its
-    last channel is. `where` they are from is said in refusals.
+    A face whose microphones have equal gains and form an equally spaced line receives on one side,
+    away from the middle of the array; for a line through the middle, the side with its last channel
+    on the left. `where`: origin of the microphones, for errors.
 
     >>> front = [(0.03, -0.02, 0, 0, "front"), (0.03, 0.02, 0, 0, "front")]
     >>> stern = [(-0.05, 0.0, 0, 0, ""), (-0.05, 0.01, 0, 0, "")]
@@ -157,10 +156,9 @@ def scattered(microphones: Microphones, where: str = "receiver.array") -> Scatte
 
 
 def at_one_centre(microphones: Microphones, where: str) -> tuple[Layout, Int[np.ndarray, "f e"]]:
-    """Return faces of equal lines as if all stood at the vehicle's point.
+    """Return faces of equal lines as if at the vehicle's position, and each element's microphone.
 
-    The number of each element's microphone is returned, too. Faces are in the order of their first
-    channels; `where` they are from is said in refusals.
+    Faces are sorted by their first channels; `where`: their origin, for errors.
 
     >>> layout, microphone = at_one_centre(square_microphones(ReceiverConfig(elements=2)), "")
     >>> layout.shape, microphone.tolist()
@@ -183,12 +181,12 @@ def at_one_centre(microphones: Microphones, where: str) -> tuple[Layout, Int[np.
 
 
 def _first(line: tuple[Int[np.ndarray, " k"], Layout]) -> int:
-    """Return the first of a line's microphones."""
+    """Return the smallest index of a line's microphones."""
     return int(line[0].min())
 
 
 def square_microphones(receiver: ReceiverConfig) -> Microphones:
-    """Return the square's microphones where a vehicle has them, on four faces around its centre.
+    """Return the microphones of the square, on four faces around the vehicle's centre.
 
     >>> square_microphones(ReceiverConfig()).position.shape
     (40, 3)
@@ -204,7 +202,7 @@ def square_microphones(receiver: ReceiverConfig) -> Microphones:
 
 
 def along_line(layout: Scattered, g: int) -> tuple[Int[np.ndarray, " k"], Layout]:
-    """Return a line's microphones from right to left, and it alone as a layout."""
+    """Return the indices of a line's microphones from right to left, and its layout."""
     _, members = layout.members(g)
     left = np.array([-np.sin(layout.normal[g]), np.cos(layout.normal[g])])
     along = layout.position[members] @ left
@@ -218,7 +216,7 @@ def along_line(layout: Scattered, g: int) -> tuple[Int[np.ndarray, " k"], Layout
 
 
 def _normal(place: Float[np.ndarray, "k 2"], middle: Float[np.ndarray, "2"]) -> float:
-    """Return the direction that a line of microphones faces; NaN if they are no such line."""
+    """Return the direction of a line's outward normal; NaN if microphones are not on a line."""
     centre = place.mean(axis=0)
     far = place[np.argmax(np.linalg.norm(place - place[0], axis=1))] - place[0]
     along = far / max(np.linalg.norm(far), LINE_TOLERANCE)
@@ -235,24 +233,10 @@ def _normal(place: Float[np.ndarray, "k 2"], middle: Float[np.ndarray, "2"]) -> 
 
 
 def square_of_four(receiver: ReceiverConfig) -> Layout:
-    """Return four faces, to the front, left, back and right.
+    """Return the layout of four faces, to the front, left, back and right.
 
-    Parameters
-    ----------
-    receiver : ReceiverConfig
-        Number of elements and their spacing [m].
+    `receiver` has the number of elements and their spacing [m]. Bradley & Abaid, Sec. II-C.
 
-    Returns
-    -------
-    Layout
-        4 faces.
-
-    Notes
-    -----
-    Bradley & Abaid, Sec. II-C.
-
-    Examples
-    --------
     >>> layout = square_of_four(ReceiverConfig())
     >>> np.degrees(layout.normal).tolist()
     [0.0, 90.0, -180.0, -90.0]

@@ -1,43 +1,37 @@
-r"""Arrivals -> what the microphones record, by two engines with one contract.
+r"""Recording of arrivals by microphones, with two equivalent engines, ``block`` and ``dense``.
 
-An arrival of delay tau, amplitude A and received frequency f' is heard by element e of a face as
+An arrival of delay tau, amplitude A and received frequency f' is at element e of a face
 
 .. math:: x_e(t) = A e^{2\pi i f'(t - \tau)} e^{2\pi i f' y_e \sin\theta / c},
           \qquad \tau \le t < \tau + T f / f'
 
-with theta the angle off the face's normal and y the element's place on the face: a plane wave
+with theta the angle off the face's normal and y the element's position on the face: a plane wave
 whose envelope reaches all elements of a face at once (they differ by at most 4.5 % of the call).
 Samples are complex (the analytic signal) and so is the noise, of variance sigma^2 per sample.
 
-``dense`` writes every sample at 200 kHz. ``block`` writes the sums over 0.2 ms blocks, one per
+``dense`` writes every sample at 200 kHz. ``block`` writes the sums over 0.2 ms blocks for each
 tone,
 
 .. math:: S_{b} = \sum_{n=40b}^{40b+39} x[n] e^{-2\pi i f_p n / f_s} ,
 
 which are closed-form geometric sums for the arrivals, and for white noise exactly independent
-normals of variance 40 sigma^2, because all tones are whole bins of a 40-sample transform.
-Everything later, the matched filter first, needs no more than these sums: a whole number of
-blocks makes the call.
+normals of variance 40 sigma^2, as all tones are whole bins of a 40-sample transform. A call is a
+whole number of blocks, so the matched filter and later stages need only these sums.
 
-Microphones anywhere (`Scattered`) each hear a wave when it reaches them, so that in an array that
-is wide beside the call's length every one has an envelope of its own:
+With microphones in any positions (`Scattered`), each has its own envelope:
 
 .. math:: x_m(t) = g_m A e^{2\pi i f'(t - \tau_m)}, \qquad \tau_m \le t < \tau_m + T f / f',
           \qquad \tau_m = \tau - p_m \cdot u / c
 
-Block sums -> the real samples of microphones that hold just these sums.
-
-A microphone's samples are real. Of the call of frequency f a real sound holds half at f and half at
--f, so its sums over a block are half those of the analytic signal, and real white noise of variance
+**Real samples from block sums.** Of the call of frequency f a real signal has half at f and half at
+-f, so its block sums are half the analytic signal's, and real white noise of variance
 :math:`\sigma^2 / 4` has, at f, the density of complex noise of variance :math:`\sigma^2`:
 
 .. math:: S_b = 2 \sum_{n=bB}^{(b+1)B-1} x[n] e^{-2\pi i f_p n / f_s} .
 
-The waveforms of the arrivals and white noise are written first, and then in each block what lies at
-the tones is replaced by what the front end heard there, which are whole bins of a block's transform
-(`pipistrelle.arrays.receiver`). So what is heard of the samples is what was heard of the sums, to
-rounding, noise and all. Where every sample was recorded as a real one (`Sampling.real`), these are
-what was heard.
+The waveforms of the arrivals and white noise are written first, and then the components at the
+tones in each block are replaced by the given sums. So the sums of the samples are the given ones up
+to rounding, including noise. With `Sampling.real`, the recorded samples are used unchanged.
 """
 
 import math
@@ -62,10 +56,10 @@ def noise_blocks(
     key: int,
     out: Complex[np.ndarray, "b f c e"] | None = None,
 ) -> Complex[np.ndarray, "b f c e"]:
-    """Draw the block sums of the microphones' noise.
+    """Draw the block sums of the microphones' noise: independent, of variance 40 sigma^2.
 
-    `key`: of the random stream; a block's noise does not depend on how many are drawn; `out`:
-    written and returned instead of a new array. The sums are independent, of variance 40 sigma^2.
+    `key`: of the random stream; a block's noise does not depend on their number; `out`: written and
+    returned instead of a new array.
     """
     std = math.sqrt(sampling.block) * sampling.noise_std
     return complex_noise(block_shape(blocks, layout, sampling), std, key, out)
@@ -77,10 +71,7 @@ def add_echo_blocks(
     layout: Layout | Scattered,
     sampling: Sampling,
 ) -> None:
-    """Add the block sums of arrivals to a recording, in place.
-
-    The first block of `signal` follows the vehicle's call.
-    """
+    """Add the block sums of arrivals to a recording, from the end of the vehicle's call."""
     for call in sampling.calls:
         if not isinstance(call, ToneBurst):
             raise InputError(
@@ -101,9 +92,9 @@ def add_echo_blocks(
 def _heard_by_each(
     arrivals: Arrivals, layout: Scattered, speed_of_sound: float
 ) -> tuple[Float[np.ndarray, "a e"], Float[np.ndarray, "a e"]]:
-    """Return how much earlier than at the centre each microphone hears [s], and how loud."""
+    """Return each microphone's lead over the centre [s] and gain, for each arrival."""
     off = np.cos(arrivals.bearing[:, np.newaxis] - layout.normal[layout.group])
-    ahead = ~(off < 0.0)  # NaN hears all around
+    ahead = ~(off < 0.0)  # NaN: all directions
     early = layout.lead(arrivals.bearing) / speed_of_sound
     return early, np.where(ahead, layout.amplitude, 0.0)
 
@@ -119,26 +110,12 @@ def record_samples(
 ) -> Complex[np.ndarray, "t f e"] | Float[np.ndarray, "t f e"]:
     """Record every sample of a frame at the full rate: the reference engine.
 
-    Of a call that is no tone burst each element hears the wave when it reaches it. Real samples
-    (`Sampling.real`) are the real part of the analytic signal, and white noise of variance
-    a quarter of the complex one's, which has at each frequency the density of the complex noise
-    (`pipistrelle.arrays.receiver`).
+    `blocks`: length; the first sample follows the vehicle's call; `rng`: None records without
+    noise; `single`: in single precision. Returns (blocks * 40, faces, elements).
 
-    Parameters
-    ----------
-    blocks : int
-        Length of the recording; its first sample follows the vehicle's call.
-    arrivals : Arrivals
-    layout : Layout or Scattered
-    sampling : Sampling
-    rng : Generator or None
-        Source of the noise; None records without.
-    single : bool
-        In single precision, as a recording would be kept.
-
-    Returns
-    -------
-    (blocks * 40, faces, elements) complex, or real
+    A call that is not a tone burst reaches each element at its own time. Real samples
+    (`Sampling.real`) are the real part of the analytic signal, with white noise of a quarter of the
+    complex variance, which has the same density at each frequency.
     """
     shape = (blocks * sampling.block, *layout.shape)
     signal = _noise(shape, sampling, rng, single=single)
@@ -179,7 +156,7 @@ def _add_tone(
     layout: Layout,
     sampling: Sampling,
 ) -> None:
-    """Add an arrival whose envelope reaches all elements of a face at once."""
+    """Add an arrival with the same envelope at all elements of a face."""
     n, pulse = _sound(heard, arrivals, a, arrivals.delay[a], duration, sampling)
     phases = layout.phases(angle, arrivals.frequency[a], sampling.speed_of_sound)
     wave = np.outer(pulse, np.exp(1j * phases))
@@ -195,7 +172,7 @@ def _add_wave(
     layout: Layout,
     sampling: Sampling,
 ) -> None:
-    """Add an arrival that reaches each element of a face at its own time."""
+    """Add an arrival to the elements of a face, each with its time of arrival."""
     for e, early in enumerate(layout.position * math.sin(angle) / sampling.speed_of_sound):
         n, pulse = _sound(heard, arrivals, a, arrivals.delay[a] - early, duration, sampling)
         heard[n, e] += pulse.real if sampling.real else pulse
@@ -209,7 +186,7 @@ def _sound(
     duration: float,
     sampling: Sampling,
 ) -> tuple[slice, Complex[np.ndarray, " n"]]:
-    """Return the samples in which an arrival of a delay [s] is heard, and what it is there."""
+    """Return the range of samples of an arrival with a delay [s], and its waveform there."""
     first, rate = sampling.pulse * sampling.block, sampling.rate
     start = max(math.ceil(delay * rate), first)
     stop = max(min(math.ceil((delay + duration) * rate), first + len(heard)), start)
@@ -225,7 +202,7 @@ def _add_scattered_samples(
     layout: Scattered,
     sampling: Sampling,
 ) -> None:
-    """Add every sample of arrivals to a recording by microphones anywhere."""
+    """Add every sample of arrivals to a recording by microphones in any positions."""
     early, gain = _heard_by_each(arrivals, layout, sampling.speed_of_sound)
     for a, e in np.argwhere(gain > 0.0):
         delay = arrivals.delay[a] - early[a, e]
@@ -235,20 +212,18 @@ def _add_scattered_samples(
 
 
 def _durations(arrivals: Arrivals, sampling: Sampling) -> Float[np.ndarray, " a"]:
-    """Return the length of each arrival [s]: the Doppler shift compresses the call."""
+    """Return the length of each arrival [s]: the Doppler shift scales the call."""
     nominal, length = sampling.tones[arrivals.caller], [call.duration for call in sampling.calls]
     return np.array(length)[arrivals.caller] * nominal / arrivals.frequency
 
 
 class _Sounds(NamedTuple):
-    """Arrivals as the kernels take them."""
+    """Arrivals as the kernels use them."""
 
     delay: Float[np.ndarray, " a"]
     amplitude: Float[np.ndarray, " a"]
     bearing: Float[np.ndarray, " a"]
-    """Bearing [rad]."""
     frequency: Float[np.ndarray, " a"]
-    """Frequency [Hz]."""
     duration: Float[np.ndarray, " a"]
     """`delay` and `duration` [s]."""
 
@@ -257,35 +232,29 @@ class _Grid(NamedTuple):
     """The blocks and tones of a recording."""
 
     tones: Float[np.ndarray, " c"]
-    """Tones [Hz]."""
     rate: float
-    """Rate [Hz]."""
     block: int
     """Samples per block."""
     blank: int
-    """Blocks before the first that is heard."""
+    """Blocks before the first that is recorded."""
 
 
 class _Ears(NamedTuple):
     """A layout of arrays, and the speed of sound around it."""
 
     normal: Float[np.ndarray, " f"]
-    """Normal [rad]."""
     position: Float[np.ndarray, " e"]
-    """Position [m]."""
     speed_of_sound: float
-    """Speed of sound [m/s]."""
 
 
 class _Room(NamedTuple):
-    """Work arrays of one arrival, overwritten by the next."""
+    """Work arrays of an arrival, overwritten by the next."""
 
     sums: Complex[np.ndarray, "c b"]
-    """Its envelope's block sums, per tone."""
+    """Block sums of its envelope, per tone."""
     direct: Float[np.ndarray, " i"]
     turned: Float[np.ndarray, " i"]
-    """`direct` and `turned`: its steering vector and i times that, real and imaginary parts
-    neighbours."""
+    """`direct` and `turned`: its steering vector and i times that, as real and imaginary pairs."""
 
 
 @kernel
@@ -307,7 +276,7 @@ def _envelope(
     stop: Whole,
     block: Whole,
 ) -> Whole:
-    """Write a tone's block sums of exp(i omega n), start <= n < stop; return the blocks touched."""
+    """Write a tone's block sums of exp(i omega n), start <= n < stop; return their number."""
     first, last = start // block, (stop - 1) // block
     sums[p, 0] = _geometric_sum(omega, start, min(stop, (first + 1) * block))
     if last == first:
@@ -348,7 +317,7 @@ def _add_echo(
     frequency: float,
     ears: _Ears,
 ) -> None:
-    """Add an arrival's envelope to the blocks that it touches, times its steering vector."""
+    """Add an arrival's envelope, times its steering vector, to its blocks."""
     sums, direct, turned = room.sums, room.direct, room.turned
     for f in range(ears.normal.size):
         angle = bearing - ears.normal[f]
@@ -367,10 +336,7 @@ def _add_echo(
 def _add_echo_blocks(
     signal: Float[np.ndarray, "b f c i"], sounds: tuple, grid: tuple, ears: tuple
 ) -> None:
-    """Add every arrival; of the signal each element's real and imaginary part are neighbours.
-
-    The other arguments are the columns of a `_Sounds`, a `_Grid` and a `_Ears`.
-    """
+    """Add every arrival to interleaved block sums, with real and imaginary parts as neighbours."""
     sound, on, array = _Sounds(*sounds), _Grid(*grid), _Ears(*ears)
     blocks, _, tones, parts = signal.shape
     rate, block, blank = on.rate, on.block, on.blank
@@ -401,7 +367,7 @@ def _add_scattered_blocks(
     early: Float[np.ndarray, "a e"],
     gain: Float[np.ndarray, "a e"],
 ) -> None:
-    """Add every arrival to each microphone, earlier than at the centre [s], times its gain."""
+    """Add every arrival to each microphone's block sums, with its lead [s] and gain."""
     sound, on = _Sounds(*sounds), _Grid(*grid)
     blocks, tones, elements = signal.shape
     rate, block, blank = on.rate, on.block, on.blank
@@ -432,28 +398,13 @@ def real_samples(
     rng: np.random.Generator,
     leak: float = 0.0,
 ) -> Float[np.ndarray, "t m"]:
-    """Return what the microphones record from one call of the vehicle to the next.
+    """Return the real samples of the microphones from one call of the vehicle to the next.
 
-    Parameters
-    ----------
-    sums : (blocks, faces, callers, elements) complex, or (samples, faces, elements) real
-        As the front end heard them; the first follows the vehicle's call.
-    arrivals : Arrivals
-        That made them, beside the noise.
-    layout : Layout or Scattered
-    sampling : Sampling
-    length : int
-        Samples from the start of the vehicle's call to that of the next. What would come later is
-        left out; where the sums end earlier, noise follows.
-    rng : Generator
-        Source of the noise at other frequencies, and where there are no sums.
-    leak : float
-        Amplitude of the vehicle's own call in each microphone, while it lasts.
-
-    Returns
-    -------
-    (length, faces * elements) float32
-        Face by face.
+    `sums`: (blocks, faces, callers, elements) complex, or (samples, faces, elements) real, from the
+    end of the vehicle's call; `arrivals`: their sources, besides noise; `length`: samples from the
+    start of the vehicle's call to the next; sums beyond it are dropped, and noise follows shorter
+    ones; `rng`: source of the noise at other frequencies, and after the sums; `leak`: amplitude of
+    the vehicle's own call in each microphone. Returns float32, face by face.
     """
     faces, elements = layout.shape
     samples = rng.standard_normal((length, faces * elements), dtype=np.float32)
@@ -477,7 +428,7 @@ def real_samples(
 def _replace_tones(
     samples: Float[np.ndarray, "b n m"], sums: Complex[np.ndarray, "b f c e"], sampling: Sampling
 ) -> None:
-    """Give blocks of samples the sums at each tone that are wanted, in place."""
+    """Replace the components of blocks of samples at the tones by given sums, in place."""
     turns = np.outer(sampling.tones, np.arange(sampling.block)) / sampling.rate
     wave = np.exp(-2j * np.pi * turns)
     wanted = np.moveaxis(sums, 2, 1).reshape(len(sums), len(wave), samples.shape[2])

@@ -1,4 +1,4 @@
-r"""Sampling: the rate, the blocks and the tones of a recording, and how long one is."""
+"""Sampling of a recording: rate, block length, tones, and the length of a frame."""
 
 import math
 from collections.abc import Callable, Sequence
@@ -22,27 +22,26 @@ LEAST_SAMPLES = 10
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Sampling:
-    """How a frame is sampled; the receiver is blanked while the vehicle calls."""
+    """Rate, blocks and calls of a frame; the receiver is blanked while the vehicle calls."""
 
     rate: float
-    """Rate [Hz]."""
+    """[Hz]."""
     block: int
     """Samples per block."""
     pulse: int
-    """Blocks per call; the first block heard is the one after it."""
+    """Blocks per call; the first recorded block is the next."""
     dense: bool = False
     """Whether every sample is recorded."""
     real: bool = False
-    """Whether samples are real ones, matched in each call's band: where somebody sends no tone, or
-    rate, tones or pulse are no whole ones (`off_raster`)."""
+    """Whether samples are real, and matched in each call's band: if any call is not a tone, or
+    rate, tones or duration are off the raster (`off_raster`)."""
     calls: tuple[Call, ...]
     """The call of each caller, the vehicle first."""
     tones: Float[np.ndarray, " c"]
-    """Their frequencies [Hz]."""
+    """Frequencies of the calls [Hz]."""
     noise_std: float
-    """Of one complex sample."""
+    """Standard deviation of one complex sample."""
     speed_of_sound: float
-    """Speed of sound [m/s]."""
 
     @property
     def interval(self) -> float:
@@ -57,31 +56,14 @@ def sampling(
     call: Callable[[float, float], Call] = ToneBurst,
     medium: Medium | None = None,
 ) -> Sampling:
-    """Settle how a frame is sampled.
+    """Choose rate, blocks and calls of a frame from the settings and callers.
 
-    Parameters
-    ----------
-    config : Config
-    callers : sequence of c Caller, up to 8
-        The vehicle first. What they call at counts, not the settings' frequencies.
-    call : callable
-        Makes each one's `Call` of its frequency [Hz] and duration [s].
-    medium : Medium, optional
-        That of the settings by default.
+    `callers`: up to 8, the vehicle first; their calls replace the settings'; `call`: makes a call
+    of a frequency [Hz] and duration [s]; `medium`: by default the settings'. Raises InputError if
+    two calls are too similar, the rate is too low for one, there are too many callers, or as
+    `check_caller`; with the engine ``block``, also if a tone is not a whole bin of a block or the
+    call not whole blocks.
 
-    Returns
-    -------
-    Sampling
-
-    Raises
-    ------
-    InputError
-        When two calls cannot be told apart, the rate does not hold one, there are too many callers,
-        or as `check_caller`; with the engine ``block``, when a tone is no whole bin of a block or
-        the call no whole number of blocks.
-
-    Examples
-    --------
     >>> from pipistrelle.acoustics.paths import callers_of
     >>> settled = sampling(Config(), callers_of(Config(), np.zeros(2)))
     >>> settled.block, settled.pulse, settled.tones
@@ -120,7 +102,7 @@ def sampling(
 
 
 def off_raster(config: Config, callers: Sequence[Caller]) -> str | None:
-    """Return what keeps the sums of tones over 0.2 ms from being all that there is; None: nothing.
+    """Return the first reason why block sums of 0.2 ms do not suffice; None if they do.
 
     >>> from pipistrelle.acoustics.paths import callers_of
     >>> from pipistrelle.config import BeaconConfig
@@ -145,17 +127,17 @@ def off_raster(config: Config, callers: Sequence[Caller]) -> str | None:
 
 
 def _is_whole(count: float) -> bool:
-    """Tell whether a number is a whole one from 1 on."""
+    """Return whether a number is an integer from 1, up to rounding."""
     return round(count) >= 1 and abs(count - round(count)) <= 1e-6
 
 
 def _keys(callers: Sequence[Caller]) -> list[str]:
-    """Return the settings of the callers' tones."""
+    """Return the setting of each caller's frequency."""
     return [f"{caller.key or caller.name}.frequency" for caller in callers]
 
 
 def _refuse_undersampled(config: Config, callers: Sequence[Caller], calls: Sequence[Call]) -> None:
-    """Refuse sample rates too low for a call, and calls that cannot be told apart."""
+    """Raise if the sample rate is too low for a call, or two calls are too similar."""
     rate = config.receiver.sample_rate
     if not LEAST_RATE <= rate <= LARGEST_RATE:
         raise InputError(
@@ -188,15 +170,13 @@ def _refuse_undersampled(config: Config, callers: Sequence[Caller], calls: Seque
 
 
 def clear_frequency(config: Config) -> float:
-    r"""Return the highest tone without grating lobes and without aliases.
+    r"""Return the highest tone without grating lobes and without aliases [Hz].
 
-    Elements a distance d apart cannot tell the angle :math:`\theta` off their normal from another,
-    the grating lobe, :math:`\sin\theta_g = \sin\theta - \lambda / d`: of a longer wave than d times
-    :math:`1 + \sin\theta`, with the largest angle that is kept, it lies outside. Half the sampling
-    rate is the highest that real samples hold, and the only limit here of an array from a file
-    (`pipistrelle.arrays.beamforming` tells its lobes).
-
-    Returns [Hz].
+    Elements at a distance d cannot distinguish the angle :math:`\theta` off their normal from the
+    grating lobe, :math:`\sin\theta_g = \sin\theta - \lambda / d`. For a wavelength above d times (1
+    + sine of the largest used angle) it does not exist. Half the sampling rate is the highest
+    frequency of real samples, and the only limit for an array from a file
+    (`pipistrelle.arrays.beamforming` computes its lobes).
 
     Van Trees, Optimum Array Processing (2002), Sec. 2.4.
 
@@ -211,9 +191,7 @@ def clear_frequency(config: Config) -> float:
 
 
 def free_tones(config: Config, callers: Sequence[Caller], near: float) -> str:
-    """Return the two free unambiguous tones that are nearest to a tone, for a refusal.
-
-    `near` [Hz]. Returns for a refusal, in brackets; empty where there is none.
+    """Format the two nearest free unambiguous tones for an error; empty if there are none.
 
     >>> from pipistrelle.acoustics.paths import callers_of
     >>> free_tones(Config(), callers_of(Config(), np.zeros(2)), 31e3)
@@ -231,7 +209,7 @@ def free_tones(config: Config, callers: Sequence[Caller], near: float) -> str:
 
 
 def _refuse_alike(config: Config, callers: Sequence[Caller], keys: Sequence[str]) -> None:
-    """Refuse tones that fall into one bin of a block: equal ones, or ones a sampling rate apart."""
+    """Raise if two tones are in the same bin of a block, directly or by aliasing."""
     rate = config.receiver.sample_rate
     for j, (key, caller) in enumerate(zip(keys, callers, strict=True)):
         for other in callers[:j]:
@@ -252,17 +230,8 @@ def blocks_to_hear(
 ) -> int:
     """Count the blocks from the end of the vehicle's call to the end of the last arrival.
 
-    Parameters
-    ----------
-    arrivals : Arrivals
-        Of the frame, the inaudible ones too: the window must not depend on the beam.
-    sampling : Sampling
-    layout : Layout or Scattered, optional
-        Of microphones anywhere the last hears the arrival later than the vehicle's centre.
-
-    Returns
-    -------
-    int
+    `arrivals` include inaudible ones, as the length must not depend on the beam. With a `Scattered`
+    layout, the delay of the farthest microphone is added.
     """
     last = arrivals.delay.max(initial=0.0) / sampling.interval + sampling.pulse
     if isinstance(layout, Scattered):

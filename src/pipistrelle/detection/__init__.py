@@ -1,10 +1,10 @@
 """Samples, or a recorded log, to scans; the truth is never seen.
 
-`matched` filters a recording for calls, `snapshots` finds them where they are loudest (`loudness`)
-with their bearings, one by one or several at once (`overlaps`), and times of arrival (`onset`),
-`faces` and `merging` average what faces and tones say of one landmark, `noise` states how surely,
-and `scans` are what a filter is handed (Bradley & Abaid, Sec. II-D). Recorded drives take the place
-of all: `logs`.
+`front_end` finds calls and averages faces: `matched` filters a recording for calls and finds times
+of arrival, `snapshots` finds bearings on faces, `full_circle` with microphones anywhere, `wideband`
+of sweeps; `overlaps` resolves several echoes at once, and `direct` finds the direct calls of other
+callers. `noise` states standard deviations, and `scans` holds the measurements that an estimator
+receives (Bradley & Abaid, Sec. II-D). Recorded drives take the place of all: `logs`, `sounds`.
 """
 
 from lazy_loader import attach

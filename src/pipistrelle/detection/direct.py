@@ -1,21 +1,20 @@
-r"""The direct call of another caller: found by what it is, and when it began.
+r"""The direct call of another caller: found among the detections of its tone, and its beginning.
 
-Of all sound in a caller's tone that which came straight is the first, and as loud as anything; an
-echo may be louder only where a landmark stands so near the straight line that the sound it bends
-forward adds up. So: the loudest in the tone, and of what is not much fainter than that the first.
+The direct call is the first sound of a caller's tone, and rarely fainter than an echo: an echo may
+be louder only if its landmark is near the straight line and scatters forward. So it is the first
+detection that is not much fainter than the loudest.
 
-**When it began.** Echoes of what stands near the line set in while the direct call lasts, and draw
-the best fit of a whole call by up to its length, and the beam aside. Before it there is nothing. So
-its front edge is sought alone, in what the matched filter's outputs gain from a block to the next:
-what a new block brings less what an old one takes,
+**Beginning.** Echoes of landmarks near the line begin while the direct call lasts; they shift the
+best fit of a whole call by up to its length, and its bearing. Before the direct call there is only
+noise. So its front edge is sought in the differences of the matched filter's outputs between
+blocks, the newest block less the oldest,
 
 .. math:: s_k = y_{k+1} - y_k = x_{k+M} - x_k
 
-at each element; which is noise until the call begins, and its amplitudes A after the block in which
-it does, of which the call fills the share
-:math:`1 - q = \operatorname{Re}(A^H s_k) / \lVert A \rVert^2`. A is the mean of the two blocks that
-follow; no direction is asked. The edge is as sure as those few blocks are loud, and as well as they
-fit:
+at each element; noise until the call begins, and its amplitudes A after the block of its beginning,
+of which it fills the share :math:`1 - q = \operatorname{Re}(A^H s_k) / \lVert A \rVert^2`. A is the
+mean of the two blocks that follow; no direction is needed. The variance of the edge follows from
+the level of these blocks and the residual of the fit:
 
 .. math:: \sigma_q^2 = \frac{\sigma_s^2}{2 \lVert A \rVert^2} \left(1 + \frac{(1 - q)^2}{2}\right)
 """
@@ -30,21 +29,21 @@ from pipistrelle.detection.matched import reach_of
 from pipistrelle.jit import Whole, kernel, no_alloc
 
 MIN_RELATIVE_POWER = 0.1
-"""Least power of the direct call, as a share of the loudest of its tone."""
+"""Least power of the direct call, relative to the loudest detection of its tone."""
 MIN_EDGE_AMPLITUDE = 0.3
-"""Least amplitude of its front edge, as a share of what the loudest lag near makes expect."""
+"""Least amplitude of its front edge, relative to the expectation from the loudest lag nearby."""
 MAX_LEAKAGE = 0.005
-"""Power, as a share of a detection's of another tone at the same time, that may be its leakage."""
+"""Largest relative power of leakage from another tone at the same time."""
 MIN_EDGE_ENERGY = 3.0
-"""Least energy of its front edge, in means of that of the noise, over a face's elements."""
+"""Least energy of its front edge over a face's elements, in means of the noise's."""
 MIN_EDGE_ENERGY_OF_BEAM = 16.0
-"""The same of one beam, whose noise varies more: as rare, one in ten million."""
+"""`MIN_EDGE_ENERGY` of a single beam, with more variable noise: as rare, one in ten million."""
 EDGE_BLOCKS = 2
-"""Blocks behind the edge that tell the amplitude: what sets in later does not matter."""
+"""Blocks after the edge that give the amplitude; later echoes do not affect it."""
 
 
 class Lags(NamedTuple):
-    """Lags of a matched filter's output."""
+    """The lags of a matched filter's output: delay of the first, step, and call length."""
 
     start: float
     """Delay of lag 0 [s]."""
@@ -55,15 +54,15 @@ class Lags(NamedTuple):
 
 
 class DirectCalls(NamedTuple):
-    """Direct call of each caller: which detection it is, and when it began."""
+    """The direct call of each caller: its detection, and the time of its beginning."""
 
     detection: Int[np.ndarray, " c"]
-    """Number of a detection of it; -1 for the vehicle and for callers not heard."""
+    """Index of its detection; -1 for the vehicle and for callers that were not detected."""
     delay: Float[np.ndarray, " c"]
     delay_std: Float[np.ndarray, " c"]
-    """`delay` and `delay_std`: when it began; NaN likewise [s]."""
+    """`delay` and `delay_std`: of its beginning [s]; NaN if not detected."""
     pulse: float
-    """How long it lasts [s]."""
+    """Duration of a call [s]."""
 
 
 def own_alone(
@@ -72,27 +71,15 @@ def own_alone(
     own: Int[np.ndarray, " c"],
     missable: Bool[np.ndarray, " c"],
 ) -> DirectCalls:
-    """Drop direct calls with another label than the caller's own, of callers that may be missed.
+    """Drop direct calls with a wrong label, if the caller's direct call may be missed.
 
-    One that calls when the vehicle does, alike in all directions, is always heard first. One with a
-    beam may point away, and one with a clock of its own may call while the vehicle does: the first
-    of its tone is then an echo, which bears the label of what threw it.
+    A caller that calls with the vehicle, equally in all directions, is always received first. A
+    caller with a beam may point away, and with an independent clock it may call while the vehicle
+    does: the first of its tone is then an echo, with the label of its landmark.
 
-    Parameters
-    ----------
-    calls : DirectCalls
-    label : (d)
-        Whose echo each detection is.
-    own : (c)
-        The labels that the callers bear themselves.
-    missable : (c)
+    `label`: of each detection's landmark; `own`: of the callers as landmarks; `missable`: of
+    callers.
 
-    Returns
-    -------
-    DirectCalls
-
-    Examples
-    --------
     >>> time = np.array([np.nan, 0.01])
     >>> heard = DirectCalls(detection=np.array([-1, 0]), delay=time, delay_std=time, pulse=0.003)
     >>> named = np.array([-1, 51]), np.array([False, True])
@@ -107,7 +94,7 @@ def own_alone(
 
 
 def without_calls(calls: DirectCalls, dropped: Bool[np.ndarray, " c"]) -> DirectCalls:
-    """Return direct calls without those of some callers, as if these had not been heard."""
+    """Remove the direct calls of some callers, as if undetected."""
     return DirectCalls(
         detection=np.where(dropped, -1, calls.detection),
         delay=np.where(dropped, np.nan, calls.delay),
@@ -123,7 +110,7 @@ def loudest_first(
     power: Float[np.ndarray, " d"],
     p: Whole,
 ) -> Whole:
-    """Find the detection that is the direct call of caller p; -1 if there is none."""
+    """Return the index of caller p's direct call among detections; -1 if there is none."""
     loudest, first = 0.0, -1
     for d in range(caller.size):
         if caller[d] == p:
@@ -144,11 +131,11 @@ def front_edge(
     pulse: Whole,
     least: float,
 ) -> tuple[float, float]:
-    """Return the lag at which the first call of a tone begins, and its standard deviation.
+    """Return the first lag of the first call of a tone, and its standard deviation.
 
-    Sought from two calls before lag b to it, among blocks of at least so many means of the noise.
-    NaN where none stands out; and with an infinite deviation where something stood out that did not
-    last: a call that an echo at its heels has all but extinguished.
+    Searched from two calls before lag b to b, in blocks of energy above `least` means of the noise.
+    NaN if there is none. NaN with an infinite deviation if an edge does not last: a call that an
+    immediate echo has nearly cancelled.
     """
     stride, elements = max(pulse // 14, 1), matched.shape[3]
     low = max(b - 2 * (pulse + stride), b % stride)
@@ -178,7 +165,7 @@ def front_edge(
 
 @no_alloc
 def _mean_after(gain: Complex[np.ndarray, "k e"], begin: Whole, e: Whole) -> complex:
-    """Return the mean of the `EDGE_BLOCKS` blocks after one block, at an element."""
+    """Return the mean of the `EDGE_BLOCKS` blocks after block `begin`, at an element."""
     total = 0.0j
     for a in range(begin + 1, begin + 1 + EDGE_BLOCKS):
         total += gain[a, e]
@@ -187,10 +174,7 @@ def _mean_after(gain: Complex[np.ndarray, "k e"], begin: Whole, e: Whole) -> com
 
 @no_alloc
 def _fitted(gain: Complex[np.ndarray, "k e"], k: Whole, noise: float) -> tuple[float, float]:
-    """Fit the start of a call in block k or the one before; return it with its deviation.
-
-    In blocks from the first. What the fit leaves is noise, where it is more than that.
-    """
+    """Fit the start of a call in block k or k - 1; return it and its deviation, in blocks."""
     least, best, std, elements = math.inf, math.nan, math.nan, gain.shape[1]
     for begin in range(max(k - 1, 0), k + 1):
         square, along, misfit = 0.0, 0.0, 0.0
@@ -220,12 +204,11 @@ def direct_calls(
     tones: Whole,
     lags: Lags,
 ) -> tuple[Int[np.ndarray, " c"], Float[np.ndarray, "2 c"]]:
-    """Find the direct call of every caller but the vehicle, by loudness and order, and its edge.
+    """Find the direct call of every other caller, by loudness and order, and its beginning.
 
-    ``whole`` are face and caller of each detection, ``numbers`` delay, sine of the angle, power and
-    the standard deviations of bearing and delay; ``lags`` the delay of lag 0 [s], the distance of
-    two lags [s] and the lags of a call. Returns the columns of `DirectCalls`; of a call
-    that began before the record, or rises too little, the whole's best fit.
+    ``whole``: face and caller of each detection; ``numbers``: delay, sine of the angle, power, and
+    the standard deviations of bearing and delay. Returns the columns of `DirectCalls`; if the call
+    began before the record, or its edge is too faint, the time of the best fit of a whole call.
     """
     start, interval, pulse = lags
     found = np.full(tones, -1, dtype=np.int64)
@@ -249,11 +232,11 @@ def direct_calls(
 def may_leak(
     delay: Float[np.ndarray, " d"], power: Float[np.ndarray, " d"], d: Whole, within: float
 ) -> bool:
-    """Tell whether detection d is faint enough to be the leakage of another at the same time.
+    """Return whether detection d is faint enough to be leakage of another at the same time.
 
-    The loud one has another tone, as no direct call is so faint beside its own tone
-    (`MIN_RELATIVE_POWER`). It may be at any face: sound from behind a face leaks into it, too, and
-    is not listed there.
+    The louder has another tone, as no direct call is so faint in its own tone
+    (`MIN_RELATIVE_POWER`). It may be at any face, as sound from behind a face also leaks into it
+    without a detection there.
     """
     for other in range(delay.size):
         if abs(delay[other] - delay[d]) <= within and power[d] < MAX_LEAKAGE * power[other]:

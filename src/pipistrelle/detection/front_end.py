@@ -1,23 +1,17 @@
-"""The front end: what finds calls in the matched outputs of whatever microphones there are.
+"""The front end: detects calls in matched-filter outputs, and averages faces into measurements.
 
-Of a `Layout`, equal lines on faces, `snapshots` finds them. Of microphones anywhere (`Scattered`)
-each group is asked alone: a line on a face by `snapshots`, any other on the full circle
-(`full_circle`); bearings and delays are then those at the vehicle's centre.
+For a `Layout` of equal lines on faces, `snapshots` detects calls. For microphones anywhere
+(`Scattered`), each group is searched separately: a line on a face by `snapshots`, any other by
+`full_circle`; bearings and delays are then relative to the vehicle's centre.
 
-Calls that are no tone bursts are found over their whole band, each by itself (`wideband`). What one
-call leaves in the matched filter of another is `bands.cross_talk`; what is no more than twice that
-of a louder detection of the other is dropped.
+Calls that are not tones are found over their whole band, each separately (`wideband`). The leakage
+of a call into the matched filter of another is `acoustics.call.cross_talk`; a detection of no more
+than twice the leakage of a louder one is dropped.
 
-Faces: what the arrays on the vehicle's faces heard of one echo becomes one row.
-
-A face may hear an echo that its neighbour hears too. Detections are averaged per label and caller,
-whether the label is a landmark's or, without labels, just a number for the
-echo (`same_echo`).
-
-Echoes without labels: what the faces detected of one call, as a robot hears it.
-
-Detections of one call, time and direction are one echo, and one row of a scan. Which rows are the
-direct calls of others is found by what these are (`pipistrelle.detection.direct`).
+Several faces may detect one echo. Detections are averaged per label and caller; the label is a
+landmark's or, without labels, the number of the echo: detections of one call, time and direction
+(`same_echo`). In a scan without labels, the direct calls of other callers are found by
+`pipistrelle.detection.direct`.
 """
 
 import math
@@ -84,16 +78,16 @@ from pipistrelle.jit import Whole, kernel
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class FrameMeasurements:
-    """One frame, averaged over the faces."""
+    """The measurements of a frame, averaged over the faces."""
 
     rows: Scan
-    """One row per label and caller, both rising, as the oracle labels detections."""
+    """Sorted by label, then caller, with the oracle's labels."""
     clutter: int
     """Number of detections without a label."""
     unlabelled: Scan | None = None
-    """The same frame as a robot hears it, a row per echo and no label; None if not asked for."""
+    """The same frame without labels, a measurement per echo; None if not requested."""
     causes: Int[np.ndarray, " e"] = field(default_factory=lambda: NO_CALLERS)
-    """Label of the landmark that caused each of those rows, by the oracle, or UNLABELLED."""
+    """True label of each unlabelled measurement's landmark, or UNLABELLED."""
     between: bool = False
     """Whether the call came between two calls of the vehicle."""
 
@@ -107,21 +101,20 @@ def average_faces(
     speed_of_sound: float,
     callers: Int[np.ndarray, " c"] = NO_CALLERS,
 ) -> FrameMeasurements:
-    r"""Average the strongest detections of the faces, for each label and caller.
+    r"""Average the strongest detection of each face, for each label and caller.
 
     Bearings are averaged as directions, ``plain`` or ``weighted`` by the inverse variance at the
-    array's angle, :math:`\cos^2\theta`. The range, of the vehicle's own call alone, is c/2 times
-    the mean delay; the excess path, of another's, c times what the mean delay has over that of its
-    direct call. What comes while the direct call still lasts has none: it was heard with it. The
-    standard deviations are what the signal tells, and what no level removes (first line). The
-    slope of a bearing by the speed of sound is the mean of the faces' own (second line; a face
-    hears :math:`\sin\theta` as c times a phase):
+    array's angle, :math:`\cos^2\theta`. The range, only of the vehicle's own call, is c/2 times the
+    mean delay; the excess path, of another caller's, is c times the mean delay after its direct
+    call, or NaN while the direct call lasts. Standard deviations combine the signal's with a floor
+    that no level removes (first line). The slope of a bearing in the speed of sound is the mean of
+    the faces' (second line; a face measures :math:`\sin\theta` as c times a phase):
 
     .. math:: \sigma^2 &= \sigma_{signal}^2 + \sigma_{floor}^2 \\
               d\phi / d \ln c &= \sum w \tan\theta / \sum w
 
     `time` [s]; `detections`: (d) rows; `label`: of each detection, or UNLABELLED; `speed_of_sound`
-    [m/s]; `callers`: labels of the callers as landmarks, where they are known.
+    [m/s]; `callers`: labels of the callers as landmarks, if known.
 
     Bradley & Abaid, Sec. II-D.
 
@@ -145,10 +138,10 @@ def average_faces(
 def same_echo(
     detections: Detections, *, delay_gate: float, bearing_gate: float
 ) -> Int[np.ndarray, " d"]:
-    """Number the echoes: detections of one call by different faces, at one time from one direction.
+    """Number the echoes: detections of one call by different faces, at one time and direction.
 
-    The strongest detection begins, and takes of every other face the strongest that agrees with it
-    and is not taken.
+    Each echo begins with the strongest remaining detection, and takes the strongest matching
+    detection of every other face.
 
     `detections`: (d) rows; `delay_gate` [s]; `bearing_gate` [rad]: largest differences within an
     echo. Returns numbers from 0, the strongest echo first.
@@ -169,7 +162,7 @@ _NO_DIRECT = DirectCalls(np.empty(0, np.int64), np.empty(0), np.empty(0), 0.0)
 
 @kernel
 def _distinct(label: Int[np.ndarray, " d"]) -> tuple[Int[np.ndarray, " n"], Whole]:
-    """Return the sorted distinct labels, and the number of detections without one."""
+    """Return the sorted distinct labels, and the number of detections without a label."""
     labels, count, clutter = np.empty_like(label), 0, 0
     for d in range(label.size):
         if label[d] == UNLABELLED:
@@ -196,10 +189,7 @@ def _average(
     weighted: bool,
     speed_of_sound: float,
 ) -> tuple[Int[np.ndarray, " m"], Int[np.ndarray, " m"], Float[np.ndarray, "8 m"]]:
-    """Average direction and delay of each label and caller over its strongest rows per face.
-
-    Returns label, caller and numbers of each pair that occurs.
-    """
+    """Average each label's and caller's strongest detections; return label, caller and numbers."""
     found, direct = Columns(*detections), DirectCalls(*calls)
     faces = callers = 0
     for d in range(label.size):
@@ -246,7 +236,7 @@ def _write_way(
     delay: tuple[float, float],
     speed_of_sound: float,
 ) -> None:
-    """Write the range of the vehicle's own call by its delay, the excess path of another's."""
+    """Write the range from the delay of the vehicle's own call, else the excess path."""
     late, spread = delay
     if own:
         metres = 0.5 * speed_of_sound
@@ -265,7 +255,7 @@ def _take_strongest(
     found: Columns,
     strongest: Int[np.ndarray, " f"],
 ) -> None:
-    """Write the index of each face's strongest detection of a label and a caller; -1 for none."""
+    """Write the index of each face's strongest detection of a label and a caller, or -1."""
     strongest[:] = -1
     for d in range(label.size):
         if label[d] == wanted and found.caller[d] == caller:
@@ -276,10 +266,7 @@ def _take_strongest(
 
 @kernel
 def _after(direct: DirectCalls, caller: Whole, delay: float, std: float) -> tuple[float, float]:
-    """Return the delay of a sound after the caller's direct call [s], and its standard deviation.
-
-    NaN where the direct call is not known, or still lasts.
-    """
+    """Return an echo's delay after its caller's direct call [s], and its deviation; else NaN."""
     if caller >= direct.delay.size or not delay - direct.delay[caller] >= direct.pulse:
         return math.nan, math.nan
     return delay - direct.delay[caller], math.hypot(std, direct.delay_std[caller])
@@ -289,7 +276,7 @@ def _after(direct: DirectCalls, caller: Whole, delay: float, std: float) -> tupl
 def _number(
     order: Int[np.ndarray, " d"], found: Columns, delay_gate: float, bearing_gate: float
 ) -> Int[np.ndarray, " d"]:
-    """Number the echoes, greedily, in an order of the detections."""
+    """Number the echoes greedily, in a given order of the detections."""
     number, count = np.full(order.size, UNLABELLED, dtype=np.int64), 0
     for first in order:
         if number[first] != UNLABELLED:
@@ -309,7 +296,7 @@ def _number(
 
 
 def with_edge_floor(detections: Detections, config: Config) -> Detections:
-    """Return detections whose direct calls begin as surely as they do (`EDGE_FLOOR`)."""
+    """Add `EDGE_FLOOR` to the standard deviation of the direct calls' beginning."""
     direct = detections.direct
     if direct is None or config.detection.overlaps != "resolve":
         return detections
@@ -321,11 +308,11 @@ def with_edge_floor(detections: Detections, config: Config) -> Detections:
 def unlabelled_scan(
     time: float, detections: Detections, config: Config, missable: Bool[np.ndarray, " c"]
 ) -> tuple[Scan, Int[np.ndarray, " d"]]:
-    """Average a frame's detections over the faces, by echo: one call, one time, one direction.
+    """Average a frame's detections by echo into a scan without labels.
 
-    `missable`: callers whose direct call may not be heard, for they have a beam or a clock of their
-    own: the first of their tone is then an echo, so without labels they have no excess paths.
-    Returns the scan, and the number of the echo, its row, of each detection.
+    `missable`: callers with a beam or an independent clock, whose direct call may be missed; the
+    first of their tone may be an echo, so without labels they have no excess paths. Returns the
+    scan, and each detection's echo, a row of the scan.
     """
     gates, direct = config.matching, detections.direct
     echo = same_echo(
@@ -349,7 +336,7 @@ def unlabelled_scan(
 
 
 def _with_unsure_calls(scan: Scan) -> Scan:
-    """Return a scan whose direct calls have bearings as unsure as they are (`DIRECT_FLOOR`)."""
+    """Add `DIRECT_FLOOR` to the bearing standard deviation of direct calls."""
     rows, numbers = scan.direct[scan.direct >= 0], scan.numbers.copy()
     numbers[BEARING_STD, rows] = np.hypot(numbers[BEARING_STD, rows], DIRECT_FLOOR)
     return replace(scan, numbers=numbers)
@@ -357,39 +344,38 @@ def _with_unsure_calls(scan: Scan) -> Scan:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Groups:
-    """Thresholds and tables of microphones anywhere, group by group."""
+    """Detectors of microphones anywhere, for each group."""
 
     members: tuple[Int[np.ndarray, " k"], ...]
-    """The microphones of each."""
+    """Microphones of each group."""
     finders: tuple[Detector | Circle, ...]
-    """The finder of each group; of a line on a face it is a `Detector`."""
+    """Detector of each group: a `Detector` for a line on a face, else a `Circle`."""
     centre: Float[np.ndarray, "f 2"]
     """Phase centre of each line; the origin for other groups [m]."""
     speed_of_sound: float
-    """Speed of sound [m/s]."""
     least_snr: float
-    """Power ratio of one output of gain 0 dB that some group is expected to hear."""
+    """Least signal-to-noise ratio of an output of gain 0 dB for a detection, as a power ratio."""
     from_start: bool
-    """Whether outputs keep the phase of the record's start, not that of a call at their lag."""
+    """Whether outputs keep the phase of the record's start, not of a call at their lag."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Mixed:
-    """Thresholds and tables of calls of which some are no tones."""
+    """Detectors of calls that are not all tones."""
 
     tones: "FrontEnd"
-    """Finder of the tones; its caller 0 is the vehicle, be it a tone or not."""
+    """Detector of the tones; its caller 0 is the vehicle, even if that sends no tone."""
     narrow: Int[np.ndarray, " n"]
-    """Which callers these are."""
+    """Callers of the tones, and the vehicle."""
     silent: bool
-    """Whether the vehicle sends no tone."""
+    """Whether the vehicle's call is not a tone."""
     wide: tuple[tuple[int, int, Wide], ...]
-    """Finders of the other calls: caller, group, finder."""
+    """Detectors of the other calls: caller, group, detector."""
     layout: Layout | Scattered
     talk: Float[np.ndarray, "c c"]
-    """Share of a call's power (second) that the filter of another (first) answers; 0 of its own."""
+    """Share of a call's power (column) in the filter of another (row); 0 on the diagonal."""
     least_snr: float
-    """Power ratio of one output of gain 0 dB that some finder is expected to hear."""
+    """Least signal-to-noise ratio of an output of gain 0 dB for a detection, as a power ratio."""
 
 
 FrontEnd = Detector | Groups | Mixed
@@ -402,12 +388,11 @@ def front_end(
     where: str = "receiver.array",
     calls: Sequence[Call] = (),
 ) -> FrontEnd:
-    """Settle what finds calls of some tones [Hz] in the outputs of a layout.
+    """Build the detector of calls with given tones [Hz] in the outputs of a layout.
 
-    `where` the layout is from is said in refusals; `calls`: where they are no tones, or off the
-    raster, what is sent, in samples of ``receiver.sample_rate``. Raises InputError as `detector`
-    does, for microphones too far apart, and for detection settings that lines on faces alone can
-    meet.
+    `where`: origin of the layout, for errors; `calls`: needed if some are not tones, or tones are
+    not whole bins, at the rate ``receiver.sample_rate``. Raises InputError as `detector` does, if
+    microphones are too far apart, and for detection settings that require lines on faces.
 
     >>> from pipistrelle.arrays.array_file import microphones_of
     >>> from pipistrelle.arrays.layout import scattered
@@ -459,10 +444,10 @@ def find_calls(
     pulse: int,
     around: Callable[[], Complex[np.ndarray, "l f c e"]] | None = None,
 ) -> Detections:
-    """Find bearings and delays of everything that stands out of the noise, as `detect` does.
+    """Detect bearings and delays of all calls that exceed the noise, as in `detect`.
 
-    `around`: returns the outputs also at lags where a call is only partly in the record, as many
-    more at each end (`BandFilters.around`); without it, sound that the record cuts is not known.
+    `around`: returns the outputs also at lags at which a call is only partly in the record, equally
+    many at each end (`BandFilters.around`); without it, such calls are not considered.
     """
     lags = Lags(start, interval, pulse)
     if isinstance(end, Detector):
@@ -484,10 +469,10 @@ def call_in(
     interval: float,
     pulse: int,
 ) -> Detections:
-    """Select the detections of one call of a caller with its own clock, and its direct call.
+    """Select the detections of one call of a caller with an independent clock, and its direct call.
 
-    It is all of the caller's tone in a stretch of the frame [s]; the other arguments are as those
-    of `find_calls`.
+    They are all detections of its tone in a `stretch` of the frame [s]; the other arguments are as
+    in `find_calls`.
     """
     begin, until = stretch
     inside = (begin <= found.delay) & (found.delay < until)
@@ -499,7 +484,7 @@ def call_in(
 
 
 def _leaking(config: Config, tones: Sequence[Call]) -> Config:
-    """Return settings by which a tone counts where others do not leak as much, off the raster."""
+    """Raise the leakage threshold to the tones' cross talk, if that is higher."""
     if len(tones) < 2:
         return config
     talk = cross_talk(tones, config.receiver.sample_rate)
@@ -517,7 +502,7 @@ def _mixed(
     where: str,
     calls: Sequence[Call],
 ) -> Mixed:
-    """Settle what finds calls of which some are no tones."""
+    """Build the detectors of calls that are not all tones."""
     is_tone = np.array([isinstance(call, ToneBurst) for call in calls])
     narrow = np.unique(np.append(0, np.flatnonzero(is_tone)))
     talk = cross_talk(calls, config.receiver.sample_rate)
@@ -544,7 +529,7 @@ def _mixed(
 
 
 def _tones_of(matched: Complex[np.ndarray, "l f c e"], end: Mixed) -> Complex[np.ndarray, "..."]:
-    """Return the outputs of the tones, and silence of a vehicle that sends none."""
+    """Select the tones' matched-filter outputs; zero the vehicle's if it sends no tone."""
     outputs = np.ascontiguousarray(matched[:, :, end.narrow])
     if end.silent:
         outputs[:, :, 0] = 0.0
@@ -557,7 +542,7 @@ def _of_mixed(
     lags: Lags,
     around: Callable[[], Complex[np.ndarray, "l f c e"]] | None,
 ) -> Detections:
-    """Find the calls of tones and others; those that the record cuts only hide fainter ones."""
+    """Detect tones and other calls; calls only partly in the record merely mask fainter ones."""
     parts, whole = [], []
     if len(end.narrow) > end.silent:
         found = find_calls(_tones_of(matched, end), end.tones, **lags._asdict())
@@ -594,12 +579,12 @@ def _of_members(
     caller: int,
     members: Int[np.ndarray, " k"],
 ) -> Complex[np.ndarray, "l k"]:
-    """Return a caller's outputs of the microphones of a group."""
+    """Return a caller's outputs at the microphones of a group."""
     return np.ascontiguousarray(outputs()[:, row, caller, members])
 
 
 def _cross_talk_in(found: Detections, end: Mixed, lags: Lags) -> Bool[np.ndarray, " m"]:
-    """Tell which detections may be what a louder call of another leaves in their filter."""
+    """Return a mask of the detections that may be leakage of a louder call of another caller."""
     near = np.abs(found.delay[:, np.newaxis] - found.delay) <= lags.pulse * lags.interval
     share = end.talk[found.caller[:, np.newaxis], found.caller]
     left = np.where(near, MARGIN * share * found.power, 0.0)
@@ -609,7 +594,7 @@ def _cross_talk_in(found: Detections, end: Mixed, lags: Lags) -> Bool[np.ndarray
 def _direct_of(
     matched: Complex[np.ndarray, "l f c e"], end: FrontEnd, found: Detections, lags: Lags
 ) -> DirectCalls:
-    """Find the direct calls among detections; of a call that is no tone its peak tells when."""
+    """Find the direct calls among detections; the time of a wideband call is its peak's."""
     if isinstance(end, Detector):
         return direct_of_faces(matched, found, lags)
     if isinstance(end, Groups):
@@ -632,7 +617,7 @@ def _direct_of(
 
 
 def _refuse_lines_own(config: Config, where: str) -> None:
-    """Refuse settings that only line arrays on faces know."""
+    """Raise if a setting is used that requires line arrays on faces."""
     for key, usual in (("snapshots", "maxima"), ("overlaps", "merge")):
         if (found := getattr(config.detection, key)) != usual:
             raise InputError(
@@ -642,7 +627,7 @@ def _refuse_lines_own(config: Config, where: str) -> None:
 
 
 def _refuse_far_apart(place: Float[np.ndarray, "k 2"], wavelength: float, where: str) -> None:
-    """Refuse a microphone whose nearest neighbour is too many waves away."""
+    """Raise if a microphone is too many wavelengths from its nearest neighbour."""
     apart = np.linalg.norm(place[:, np.newaxis] - place, axis=-1)
     np.fill_diagonal(apart, np.inf)
     if (gap := float(apart.min(axis=1).max())) > MAX_SPACING * wavelength:
@@ -655,11 +640,7 @@ def _refuse_far_apart(place: Float[np.ndarray, "k 2"], wavelength: float, where:
 def _outputs(
     matched: Complex[np.ndarray, "l 1 c e"], end: Groups, g: int, lags: Lags
 ) -> Complex[np.ndarray, "l c k"]:
-    """Return the outputs of a group.
-
-    A circle takes the phase of a call that starts at their lag; where a tone makes whole turns from
-    lag to lag, it is that of the record's start.
-    """
+    """Return a group's outputs; for a circle, with the phase of a call that starts at their lag."""
     outputs, finder = matched[:, 0, :, end.members[g]].transpose(1, 2, 0), end.finders[g]
     if end.from_start and isinstance(finder, Circle):
         turns = finder.tones * lags.interval
@@ -672,7 +653,7 @@ def _outputs(
 def _of_group(
     matched: Complex[np.ndarray, "l 1 c e"], end: Groups, g: int, lags: Lags
 ) -> Detections:
-    """Find the calls that one group hears."""
+    """Detect the calls at one group of microphones."""
     outputs, finder = _outputs(matched, end, g, lags), end.finders[g]
     if isinstance(finder, Circle):
         caller, (delay, bearing, power, bearing_std, delay_std, angle) = find_around(
@@ -698,7 +679,7 @@ def _of_group(
 def _ahead(
     end: Groups, g: int, bearing: Float[np.ndarray, "*m"] | float
 ) -> Float[np.ndarray, "*m"]:
-    """Return how much earlier than the vehicle's centre a line hears sound from a bearing [s]."""
+    """Return the lead of a line over the vehicle's centre for sound from a bearing [s]."""
     x, y = end.centre[g] / end.speed_of_sound
     return x * np.cos(bearing) + y * np.sin(bearing)
 
@@ -706,7 +687,7 @@ def _ahead(
 def _direct_of_groups(
     matched: Complex[np.ndarray, "l 1 c e"], end: Groups, found: Detections, lags: Lags
 ) -> DirectCalls:
-    """Find the direct call of every caller but the vehicle, and its edge, as `direct_calls`."""
+    """Find the direct call of every other caller, and its beginning, as in `direct_calls`."""
     start, interval, pulse = lags
     tones, length = matched.shape[2], pulse * interval
     detection, when = np.full(tones, -1), np.full((2, tones), np.nan)
@@ -735,7 +716,7 @@ def _edge(
     lags: Lags,
     at: tuple[int, int, float],
 ) -> tuple[float, float]:
-    """Return the lag at which a group hears the first call of a tone begin, and its deviation."""
+    """Return the first lag of a tone's first call in a group, and its standard deviation."""
     outputs, finder = _outputs(matched, end, g, lags), end.finders[g]
     if isinstance(finder, Circle):
         return edge_around(outputs, finder, lags, at)

@@ -1,33 +1,33 @@
-r"""The full circle: calls that microphones anywhere hear, found by delay and sum.
+r"""Full-circle detection: calls at microphones in any positions, by delay-and-sum beams.
 
-Microphone m, at p_m, hears a wave from the direction :math:`\phi` earlier than the vehicle's
-centre, by :math:`a_m = p_m \cdot u(\phi) / c`. Its matched output y, over lags t, is delayed by
-that, and all are summed,
+Microphone m, at p_m, receives a wave from the direction :math:`\phi` earlier than the vehicle's
+centre, by :math:`a_m = p_m \cdot u(\phi) / c`. The beam is the sum of the delayed matched outputs y
+over lags t,
 
 .. math:: z(\phi, t) = \sum_m w_m e^{-2\pi i f a_m} y_m(t - a_m), \qquad
           w_m = g_m \Big/ \sqrt{\textstyle\sum g^2} ,
 
-so that the call's whole band adds up, however wide the array is. Between two lags the envelope is
-linear: that of a tone's matched output, a triangle, is, but for its tip.
+so that the call's whole band adds up, however wide the array is. The envelope is interpolated
+linearly between lags: that of a tone's matched output is a triangle.
 
 **Loudness** of a lag is the largest :math:`|z|^2` over the circle. In noise of unit variance z is
-complex normal at every direction, and the largest of such a process exceeds h by chance, per lag,
+complex normal at every direction, and the maximum of such a process exceeds h, per lag, with
+probability
 
 .. math:: P \le e^{-h} \left(1 + \sqrt{\frac{h}{\pi}} \int \sqrt{\kappa}\, d\phi \right), \qquad
           \kappa(\phi) = \sum_m w_m^2 \left(\psi_m' - \bar\psi'\right)^2, \qquad
           \psi_m' = \frac{2\pi f}{c}\, p_m \cdot u'(\phi) ,
 
-the mean number of times that it rises through h on the way round: what stands beside
-:math:`e^{-h}` is the number of independent looks. No more than the energy of all microphones can it
-be either, which of N is Gamma(N). The threshold is where the smaller of the two is the false-alarm
-rate. :math:`\kappa` is the array's aperture, too: the Cramér-Rao bound of the bearing is
+from the mean number of upcrossings of h around the circle: the factor of :math:`e^{-h}` is the
+number of independent looks. It can also not exceed the energy of all N microphones, which is
+Gamma(N). The threshold is where the smaller of the two is the false-alarm rate. :math:`\kappa` is
+also the array's aperture: the Cramér-Rao bound of the bearing is
 
 .. math:: \sigma_\phi^2 = \frac{1}{2 p \kappa} .
 
-**What an array cannot tell.** Where other lobes of the scan are nearly as loud as the loudest, of a
-line of microphones that from the other side, or those of microphones more than half a wave apart,
-the call may have come from there. With a flat prior the odds are those of the likelihoods, and the
-deviation that a row states is that about the loudest,
+**Ambiguous bearings.** If other lobes of the scan are nearly as loud as the loudest, as the mirror
+image for a line of microphones, or for spacings above half a wave, the call may have come from
+there. With a flat prior the odds are the likelihood ratios, and the stated variance is
 
 .. math:: \sigma^2 = \sigma_\phi^2 + \frac{\sum_k o_k (\phi_k - \phi)^2}{1 + \sum_k o_k}, \qquad
           o_k = e^{-(|z|^2 - |z_k|^2) / \eta} ,
@@ -62,37 +62,34 @@ from pipistrelle.geometry import wrap_angle
 from pipistrelle.jit import Whole, kernel, no_alloc
 
 BEAM_STEP = 0.4
-"""Distance of two beams, as the root mean square phase between them over the microphones [rad]: a
-call halfway between them is 4 % less loud."""
+"""Root mean square phase between two beams over the microphones [rad]: 4 % loss halfway."""
 STRIDES = 14
-"""Lags in a call of which the loudness is scanned, at most."""
+"""Most lags in a call at which the loudness is scanned."""
 CLIMBS = 4
-"""Steps towards the top of a lobe, each by a parabola, a quarter as wide as the one before."""
+"""Steps of the climb to the top of a lobe, each by a parabola, a quarter as wide as the last."""
 PARTS = 8
-"""Parts of a lag in which the start of a call is sought."""
+"""Divisions of a lag in the search for the start of a call."""
 FINEST = 1e-4
-"""Smallest step with which it is sought, in lags."""
+"""Smallest step of the search, in lags."""
 RARE = 40.0
-"""Lobes fainter than the loudest by so many times the noise are not asked: odds of 1 to 1e17."""
+"""Lobes this many noise powers below the loudest are ignored: odds of 1 to 1e17."""
 
 
 class Circle(NamedTuple):
-    """A group of microphones that hear all around, its threshold and its scan."""
+    """The detector of calls in a group of omnidirectional microphones."""
 
     threshold: float
     """Least loudness of a call at a lag and tone, in units of the noise of one output."""
     leakage: float
-    """Least loudness, as a share of that of another tone nearby."""
+    """Least loudness relative to another tone's at nearby lags."""
     loudest_noise: float
-    """See `certainty.loudest_noise`."""
+    """See `noise.loudest_noise`."""
     beams: int
-    """Directions that are scanned."""
+    """Number of directions that are scanned."""
     speed_of_sound: float
-    """Speed of sound [m/s]."""
     tones: Float[np.ndarray, " c"]
-    """Tones [Hz]."""
     position: Float[np.ndarray, "k 2"]
-    """In the vehicle's frame [m]."""
+    """Positions in the vehicle's frame [m]."""
     weight: Float[np.ndarray, " k"]
     """Weight of each output; the squares of all sum to 1."""
 
@@ -100,7 +97,7 @@ class Circle(NamedTuple):
 def circle_of(
     config: Config, layout: Scattered, group: int, tones: Float[np.ndarray, " c"]
 ) -> Circle:
-    """Settle threshold and scan of a group of microphones that hear all around."""
+    """Build the detector of a group of omnidirectional microphones."""
     (position, gain), c = layout.places(group), config.assumed_sound_speed
     weight = gain / np.linalg.norm(gain)
     bearing = np.linspace(-np.pi, np.pi, 3600, endpoint=False)
@@ -119,7 +116,7 @@ def circle_of(
 
 
 def loudest_by_chance(chance: float, looks: float, microphones: int) -> float:
-    r"""Return the loudness that noise exceeds, somewhere on the circle, with some chance.
+    r"""Return the loudness that noise exceeds, somewhere on the circle, with a given probability.
 
     `looks` is :math:`\int \sqrt{\kappa} d\phi` over the circle.
 
@@ -141,10 +138,10 @@ def loudest_by_chance(chance: float, looks: float, microphones: int) -> float:
 def find_around(
     matched: Complex[np.ndarray, "l c k"], circle: Circle, lags: Lags
 ) -> tuple[Int[np.ndarray, " m"], Float[np.ndarray, "6 m"]]:
-    """Find the calls that a group hears, one in each snapshot.
+    """Detect the calls at a group of microphones, at most one in each snapshot.
 
     Returns the caller of each; delay at the vehicle's centre [s], bearing [rad], power, the
-    standard deviations of bearing and delay, and the arctangent of the bearing's slope by the
+    standard deviations of bearing and delay, and the arctangent of the bearing's slope in the
     logarithm of the speed of sound.
     """
     margin = margin_of(circle.position, circle.speed_of_sound * lags.interval)
@@ -157,10 +154,7 @@ def edge_around(
     lags: Lags,
     at: tuple[Whole, Whole, float],
 ) -> tuple[float, float]:
-    """Return the lag at which the first call of a tone begins, as `direct.front_edge` does.
-
-    Sought in the beam to a bearing; `at`: lag, tone and bearing of the detection.
-    """
+    """Return `direct.front_edge` of a beam, for a detection `at` lag, tone and bearing."""
     b, p, bearing = at
     stride, margin = (
         max(lags.pulse // STRIDES, 1),
@@ -175,15 +169,12 @@ def edge_around(
 
 
 def margin_of(position: Float[np.ndarray, "k 2"], lag: float) -> int:
-    """Return the lags by which the farthest microphone hears earlier or later than the centre.
-
-    `lag`: way of sound from one to the next [m].
-    """
+    """Return the largest lead or delay of a microphone in lags; `lag`: sound path per lag [m]."""
     return math.ceil(np.linalg.norm(position, axis=1).max() / lag) + 2
 
 
 def _padded(matched: Complex[np.ndarray, "l c k"], margin: int) -> Complex[np.ndarray, "_ c k"]:
-    """Return outputs with silence before and after."""
+    """Pad outputs with silence before and after."""
     silence = np.zeros((margin, *matched.shape[1:]), dtype=np.complex128)
     return np.concatenate((silence, matched, silence), dtype=np.complex128)
 
@@ -197,10 +188,7 @@ def _output(
     circle: Circle,
     lag: Lags,
 ) -> tuple[complex, float, float]:
-    """Return the beam to a bearing at a lag, or between two, and the energy that it sums.
-
-    And the variance of its noise, which is least halfway between two lags.
-    """
+    """Return the beam to a bearing at a fractional lag, its energy, and its noise variance."""
     ahead, left = math.cos(bearing), math.sin(bearing)
     turn = 2.0 * math.pi * circle.tones[p]
     total, energy, noise = 0.0j, 0.0, 0.0
@@ -224,7 +212,7 @@ def _power(
     circle: Circle,
     lag: Lags,
 ) -> float:
-    """Return the power of the beam to a bearing at a lag, in units of its noise."""
+    """Return the power of the beam to a bearing at a fractional lag, in units of its noise."""
     z, _, noise = _output(matched, b, p, bearing, circle, lag)
     return (z.real * z.real + z.imag * z.imag) / noise
 
@@ -239,7 +227,7 @@ def _beam(
     lag: Lags,
     beam: Complex[np.ndarray, " r"],
 ) -> None:
-    """Write the beam to a bearing, lag by lag from the first on, turned to the phase of that."""
+    """Write the beam to a bearing at consecutive lags, with the phase of the first."""
     turn = 2.0 * math.pi * circle.tones[p] * lag.interval
     for k in range(beam.size):
         z, _, noise = _output(matched, float(first + k), p, bearing, circle, lag)
@@ -256,10 +244,10 @@ def _start(
     lag: Lags,
     within: tuple[Whole, Whole],
 ) -> float:
-    """Return the likeliest lag, to a fraction, at which the call starts in a beam, near lag b.
+    """Return the start of the call in a beam, near lag b, as a fractional lag.
 
-    It is the loudest in units of the noise (`onset` solves the same for outputs at one lag).
-    `within`: the first lag and the last.
+    It is the loudest in units of the noise (`matched.arrival_lag` for outputs at whole lags).
+    `within`: the first and last lag.
     """
     reach, best, loudest = reach_of(lag.pulse), float(b), -1.0
     for near in range(max(b - reach, within[0]), min(b + reach, within[1]) + 1):
@@ -282,20 +270,20 @@ def _start(
 
 
 class _Beams(NamedTuple):
-    """The beams of a tone: which lags each takes of each microphone, and times what."""
+    """The beams of a tone: lags and factors of each microphone's outputs."""
 
     back: Int[np.ndarray, "n k"]
-    """Lags from that of the centre to the first of the two between which a microphone hears."""
+    """Offset from the centre's lag to the first of the two that are interpolated."""
     first: Complex[np.ndarray, "n k"]
     then: Complex[np.ndarray, "n k"]
-    """`first` and `then`: what the outputs at that lag and the next are multiplied by."""
+    """`first` and `then`: factors of the outputs at that lag and the next."""
 
 
 @kernel
 def _find(
     matched: Complex[np.ndarray, "l c k"], margin: Whole, circle: tuple, lag: Lags
 ) -> tuple[Int[np.ndarray, " m"], Float[np.ndarray, "6 m"]]:
-    """Find the call of every snapshot; `matched` has silent margins."""
+    """Detect the call of every snapshot; `matched` has silent margins."""
     group = Circle(*circle)
     interval, pulse, tones = lag.interval, lag.pulse, matched.shape[1]
     stride, count = max(pulse // STRIDES, 1), 0
@@ -315,7 +303,7 @@ def _find(
             continue
         p, b = test % tones, margin + begin * stride
         late = float(b)
-        for _ in range(2):  # once more at the very time
+        for _ in range(2):  # again at the refined time
             _powers(matched, b, p, beams[p], power)
             best = _lobes(matched, late, p, power, group, lag, lobes)
             late = _start(matched, b, p, lobes[0, best[0]], group, lag, within)
@@ -338,7 +326,7 @@ def _write_row(
     lag: Lags,
     row: Float[np.ndarray, "6"],
 ) -> None:
-    """Write all of a detection but its delay; `best`: the loudest of so many lobes."""
+    """Write the numbers of a detection, except its delay; `best`: loudest lobe, number of lobes."""
     loudest, count = best
     bearing, top = lobes[0, loudest], lobes[1, loudest]
     _, energy, least = _output(matched, b, p, bearing, circle, lag)
@@ -360,10 +348,10 @@ def _write_row(
 
 @no_alloc
 def _geometry(bearing: float, circle: Circle) -> tuple[float, float, float]:
-    """Return what the places of the microphones make of a bearing.
+    """Return the geometry of the microphones as seen from a bearing.
 
-    Their variance across it [m^2]; by how much the bearing turns with the logarithm of the speed of
-    sound; and how far across it their centre is from the vehicle's [m].
+    The variance of their positions across it [m^2]; the slope of the bearing in the logarithm of
+    the speed of sound; and the offset of their centre across it from the vehicle's [m].
     """
     cosine, sine = math.cos(bearing), math.sin(bearing)
     x = y = xx = xy = 0.0
@@ -387,10 +375,7 @@ def _scan(
     threshold: float,
     loudness: Float[np.ndarray, "s c"],
 ) -> None:
-    """Write the loudness of a tone at every stride's lag.
-
-    Where not even the energy of all microphones reaches the threshold nothing is scanned: 0.
-    """
+    """Write the loudness of a tone at every stride's lag; 0 where even the energy is too low."""
     square, power = _largest_near(matched, p, margin), np.empty(len(beams.back))
     for s in range(len(loudness)):
         b, energy = margin + s * stride, 0.0
@@ -429,12 +414,7 @@ def _lobes(
     lag: Lags,
     lobes: Float[np.ndarray, "2 n"],
 ) -> tuple[Whole, Whole]:
-    """Write bearing and power of the lobes that may be the call's; return the loudest's number.
-
-    And how many there are.
-
-    Those are asked whose beams are not much fainter than the loudest beam.
-    """
+    """Write bearing and power of the candidate lobes; return the loudest's index and the count."""
     n, count, loudest = power.size, 0, 0
     i = int(power.argmax())
     _, energy, _ = _output(matched, b, p, _bearing_of(i, circle), circle, lag)
@@ -478,10 +458,10 @@ def _beams_of(p: Whole, circle: Circle, interval: float) -> _Beams:
 def _delayed(
     early: float, b: float, turn: float, interval: float
 ) -> tuple[Whole, float, complex, complex]:
-    """Return where a microphone that hears so early [s] has what the centre has at a lag.
+    """Return the interpolation of a microphone's output that leads the centre by `early` [s].
 
-    The first of two lags and the part of the way to the next, and the phases that turn the outputs
-    there, of a tone that turns so fast [rad/s], to that of the centre.
+    The first of two lags and the fraction of the way to the next, and the phases that turn the
+    outputs there, of a tone of `turn` [rad/s], to the centre's.
     """
     at = b - early / interval
     k = math.floor(at)
@@ -494,7 +474,7 @@ def _delayed(
 def _largest_near(
     matched: Complex[np.ndarray, "l c k"], p: Whole, margin: Whole
 ) -> Float[np.ndarray, "l k"]:
-    """Return the most that a microphone's output has within a margin of each lag, squared."""
+    """Return the largest squared output of each microphone within a margin of each lag."""
     lags, _, microphones = matched.shape
     square = np.zeros((lags, microphones))
     for m in range(microphones):
@@ -508,7 +488,7 @@ def _largest_near(
 
 @no_alloc
 def moved(before: float, here: float, after: float) -> float:
-    """Return how many steps away a parabola through three powers peaks, one at most."""
+    """Return the offset of a parabola's peak from the middle of three powers, one step at most."""
     bend = 2.0 * here - before - after
     move = 0.5 * (after - before) / bend if bend > 0.0 else math.copysign(1.0, after - before)
     return min(max(move, -1.0), 1.0)
@@ -523,7 +503,7 @@ def _climb(
     circle: Circle,
     lag: Lags,
 ) -> tuple[float, float]:
-    """Return the bearing of the top of a lobe near a beam, and the power there."""
+    """Climb to the top of a lobe near a beam; return its bearing and power."""
     step = 2.0 * math.pi / circle.beams
     for _ in range(CLIMBS):
         before = _power(matched, b, p, bearing - step, circle, lag)

@@ -1,6 +1,7 @@
-"""Matched filter: what a call would leave of each lag's samples, in units of the noise.
+"""Matched filters: for tones by block sums, for any call by convolution, and times of arrival.
 
-Time of arrival: where, to a fraction of a lag, a call starts in a steered beam.
+Outputs are in units of the noise. A time of arrival is the start of a call in a steered beam, to a
+fraction of a lag.
 """
 
 import math
@@ -18,9 +19,9 @@ from pipistrelle.jit import Whole, kernel, no_alloc
 def steering_phases(
     u: float, place: Float[np.ndarray, " e"], phases: Complex[np.ndarray, " e"]
 ) -> None:
-    """Write what turns each element's output to that of the first, for a wave of phase u a spacing.
+    """Write the phase of each element that steers a beam, for phase u per spacing.
 
-    `place`: of the elements, in spacings; empty for equally spaced ones.
+    `place`: positions of the elements, in spacings; empty if equally spaced.
     """
     turn, phase = complex(math.cos(u), -math.sin(u)), 1.0 + 0.0j
     for e in range(phases.size):
@@ -40,7 +41,7 @@ def steer(
     phases: Complex[np.ndarray, " e"],
     beam: Complex[np.ndarray, " r"],
 ) -> None:
-    """Write the output of a beamformer of these phases, so many lags from low on."""
+    """Write the output of a beam with given phases, for `lags` lags from `low`."""
     for k in range(lags):
         beam[k] = 0.0
     for e in range(matched.shape[3]):
@@ -50,11 +51,11 @@ def steer(
 
 @kernel
 def _best_fraction(z0: complex, z1: complex, pulse: Whole) -> tuple[float, float]:
-    """Return the likeliest start of the call between two lags, a fraction, and its fit.
+    """Return the most likely start of a call between two lags, as a fraction, and its score.
 
     A call that starts the fraction q into block 0 weighs the blocks 1 - q, 1, ..., 1, q; its
-    likelihood grows with abs((1 - q) z0 + q z1)^2 / (pulse - 2 q + 2 q^2), whose stationary
-    points are the roots of a quadratic.
+    likelihood grows with abs((1 - q) z0 + q z1)^2 / (pulse - 2 q + 2 q^2), whose stationary points
+    are the roots of a quadratic.
     """
     a = z0.real * z0.real + z0.imag * z0.imag
     h = z0.real * z1.real + z0.imag * z1.imag
@@ -79,7 +80,7 @@ def _best_fraction(z0: complex, z1: complex, pulse: Whole) -> tuple[float, float
 
 @kernel
 def reach_of(pulse: Whole) -> Whole:
-    """Return how many lags around a snapshot's the call may start."""
+    """Return the largest distance from a snapshot's lag to the start of its call, in lags."""
     return max(pulse // 7, 1)
 
 
@@ -93,9 +94,9 @@ def arrival_lag(
     pulse: Whole,
     beam: Complex[np.ndarray, " r"],
 ) -> float:
-    """Return the lag, to a fraction, at which the call starts in a beam, near lag b.
+    """Return the start of the call in a beam, near lag b, as a fractional lag.
 
-    ``beam`` is room for the beam: the lags within reach and one to either side.
+    ``beam``: work array for the lags within reach and one to either side.
     """
     reach, last = reach_of(pulse), matched.shape[0] - 1
     low, high = max(b - reach, 0), min(b + reach, last)
@@ -115,13 +116,13 @@ def arrival_lag(
 
 
 class Workspace:
-    """Arrays that every frame uses anew: fresh memory costs more than the arithmetic on it."""
+    """Arrays that frames reuse, as allocation costs more than the arithmetic."""
 
     def __init__(self) -> None:
         self._flat: dict[str, np.ndarray] = {}
 
     def array(self, name: str, shape: tuple[int, ...]) -> Complex[np.ndarray, "..."]:
-        """Return the array of a name in a shape; its content is undefined."""
+        """Return the array of a name in a given shape; its content is undefined."""
         size = math.prod(shape)
         if name not in self._flat or self._flat[name].size < size:
             self._flat[name] = np.empty(size + size // 4, dtype=np.complex128)
@@ -136,11 +137,11 @@ def filter_blocks(
     noise_std: float,
     out: Complex[np.ndarray, "l f c e"] | None = None,
 ) -> Complex[np.ndarray, "l f c e"]:
-    """Filter block sums by a boxcar as long as the call: the matched filter.
+    """Apply the matched filter of a tone to block sums: a boxcar of the call's length.
 
     `pulse`: blocks per call; `block`: samples per block; `noise_std`: of one complex sample; `out`:
-    written and returned instead of a new array. Lag i is a call that starts with block i;
-    noise has unit variance.
+    written and returned instead of a new array. Lag i is a call that starts with block i; noise has
+    unit variance.
     """
     lags = max(blocks.shape[0] - pulse + 1, 0)
     matched = np.empty((lags, *blocks.shape[1:]), dtype=np.complex128) if out is None else out
@@ -162,23 +163,11 @@ def filter_samples(
     rate: float,
     noise_std: float,
 ) -> Complex[np.ndarray, "l f c e"]:
-    """Filter samples by each call, by fast convolution: the matched filter.
+    """Apply the matched filter of each call to samples, by fast convolution.
 
-    Parameters
-    ----------
-    samples : (samples, faces, elements) complex
-        Real ones, as a recording has them, are taken as such.
-    calls : sequence of c Call
-        Equally long.
-    rate : [Hz]
-    noise_std : float
-        Of one complex sample.
-
-    Returns
-    -------
-    (samples - length + 1, faces, calls, elements) complex
-        With the length of a call in samples. Lag i is a call that starts with sample i; noise has
-        unit variance. As precise as the samples.
+    `samples` may be real, as in a recording; `calls` are equally long; `rate` [Hz]; `noise_std`: of
+    one complex sample. Lag i is a call that starts with sample i; noise has unit variance. The
+    precision is that of the samples.
     """
     from scipy.signal import oaconvolve
 
@@ -194,10 +183,10 @@ def filter_samples(
 
 
 class BandFilters:
-    """Filters real samples by each call: a tone by sums, any other in its band.
+    """Matched filters of real samples for several calls: tones by sums, other calls in their band.
 
-    `rate` [Hz]; lags are `step` samples apart, and the longest call has `length`. Of a tone the
-    output keeps the phase of the recording's start, as that of block sums does.
+    Sample rate `rate` [Hz]; lags are `step` samples long, and the longest call has `length`
+    samples. The output of a tone keeps the phase of the recording's start, like block sums.
     """
 
     def __init__(self, calls: Sequence[Call], rate: float) -> None:
@@ -214,7 +203,7 @@ class BandFilters:
         """Return the outputs; lag i is a call that starts with sample i times `step`.
 
         `noise_std`: of one complex sample, so that real ones have half of it. Noise has unit
-        variance. Of few samples there is no output.
+        variance. If there are fewer samples than a call, the output is empty.
         """
         from scipy.fft import next_fast_len, rfft
 
@@ -237,10 +226,10 @@ class BandFilters:
     def around(
         self, samples: Float[np.ndarray, "t f e"], noise_std: float = 1.0
     ) -> Complex[np.ndarray, "l f c e"]:
-        """Return the outputs also at lags where a call is only partly among the samples.
+        """Return the outputs, with lags for calls that are only partly among the samples.
 
-        These lags precede and follow the others, as many at each end as a call is long: the samples
-        are filtered as if silence surrounded them.
+        These lags precede and follow the others, as many at each end as a call is long, as if
+        silence surrounded the samples.
         """
         more = self.step * -(-self.length // self.step)
         silence = np.zeros((more, *samples.shape[1:]), samples.dtype)
@@ -249,7 +238,7 @@ class BandFilters:
     def _summed(
         self, samples: Float[np.ndarray, "t f e"], tone: float
     ) -> Complex[np.ndarray, "l f e"]:
-        """Return the outputs of a tone [Hz], of unit noise."""
+        """Return the outputs of a tone [Hz], at unit noise."""
         blocks = len(samples) // self.step
         some = samples[: blocks * self.step].reshape(blocks, self.step, -1)
         wave = 2.0 * np.exp(-2j * np.pi * tone / self.rate * np.arange(self.step))
@@ -266,7 +255,7 @@ class BandFilters:
         bins: Int[np.ndarray, " b"],
         sent: Complex[np.ndarray, " b"],
     ) -> Complex[np.ndarray, "l f e"]:
-        """Return the outputs of another call from the transform of `count` samples."""
+        """Return the outputs of a call that is no tone, from the transform of `count` samples."""
         from scipy.fft import ifft
 
         fewer = np.zeros((count // self.step, *heard.shape[1:]), heard.dtype)
@@ -276,7 +265,7 @@ class BandFilters:
     def _in_bands(
         self, count: int
     ) -> list[tuple[Int[np.ndarray, " b"], Complex[np.ndarray, " b"]]]:
-        """Return the bins of each call's band in the transform of `count` samples, and weights."""
+        """Return the bins of each call's band in a transform of `count` samples, and weights."""
         found = []
         for call in self.calls:
             band, length = band_of(call, self.rate), count / self.rate
@@ -291,7 +280,7 @@ class BandFilters:
 def _boxcar(
     rows: Float[np.ndarray, "b i"], width: Whole, scale: float, sums: Float[np.ndarray, "l i"]
 ) -> None:
-    """Write the running sums of width rows, scaled."""
+    """Write the running sums of `width` rows, scaled."""
     columns = rows.shape[1]
     total = np.zeros(columns)
     for b in range(min(width - 1, rows.shape[0])):

@@ -1,31 +1,27 @@
-r"""Measurement noise: the standard deviations of a scan's rows, as an estimator is given them.
+r"""Measurement noise: standard deviations from the signal, thresholds of snapshots, constant noise.
 
-It is stated of the rows that a filter is handed, after those of one landmark were merged.
-
-Certainty: how sure a detection is of its bearing and delay, as the signal itself tells.
-
-**Noise** is what a snapshot holds beside the wave that the beam is steered to: the receiver's own,
-of unit variance, or, where more is left than that explains in all but a thousandth of snapshots,
-what is left, :math:`\eta = (E - P) / (N - 1)`. Echoes that overlap are each other's noise: most
-errors above 20 dB are of that kind. With the power p of the steered beam in units of that noise,
+**Noise** is the part of a snapshot that the steered beam's wave does not explain: the receiver's,
+of unit variance, or, if the residual is larger than that explains in all but a thousandth of
+snapshots, the residual, :math:`\eta = (E - P) / (N - 1)`. Overlapping echoes are noise to each
+other: they cause most errors above 20 dB. With the power p of the steered beam in units of it,
 
 .. math:: \sigma_\theta = \sqrt{\frac{6}{p\,(N^2 - 1)} \left(1 + \frac{1}{p}\right)}
               \Big/ \left( \frac{2\pi d}{\lambda} \cos\theta \right), \qquad
           p = P / \eta - 1 ,
 
-the variance that the largest beam of a line array has (its first term is the Cramer-Rao bound,
-`pipistrelle.arrays.beamforming.bearing_bound`). The call of M lags has two edges, of which a lag
-holds parts: the first term of
+the variance of the largest beam of a line array (its first term is the Cramer-Rao bound,
+`pipistrelle.arrays.beamforming.bearing_bound`). The call of M lags has two edges, each within a
+lag, with the first term of
 
 .. math:: \sigma_\tau^2 = \frac{M}{4 p} + \frac{26}{16} \left(\frac{M}{p}\right)^2
 
-in lags. The second is what the jumps at the edges make: the loudest point of a random walk that
-falls off to both sides, whose variance is 26 in its own units.
+in lags. The second is caused by the jumps at the edges: the loudest point of a random walk with
+drift to both sides has a variance of 26 in its units.
 
 Sources: Rife & Boorstyn, IEEE Transactions on Information Theory 20 (1974), for the first;
 Ibragimov & Has'minskii, Statistical Estimation (1981), Sec. VII.2, for the 26.
 
-Loudness: at which lags of a face's tone a snapshot is taken.
+An estimator receives standard deviations after measurements of one landmark have been merged.
 """
 
 import math
@@ -47,32 +43,29 @@ from pipistrelle.detection.scans import (
 from pipistrelle.jit import Whole, kernel, no_alloc
 
 NOISE_QUANTILE = 0.999
-"""Share of snapshots whose noise is no louder than what is taken for noise alone."""
+"""Share of snapshots with receiver noise only whose residual is below the threshold."""
 MIN_POWER_OVER_NOISE = 0.1
-"""Least power over the noise for which a deviation is stated."""
+"""Least power over the noise for which a standard deviation is stated."""
 BEARING_FLOOR = (0.002, 0.009)
-"""Error [rad] of a bearing that no level removes, by the vehicle's own call and by another's: what
-echoes that overlap do to each other and leave no trace beside the beam. With these the errors in
-the paper's worlds have the variances that are stated; another's echoes come at all times, and
-overlap more."""
+"""Irreducible bearing error [rad], by the vehicle's own call and by another's: overlapping echoes
+without a trace in the residual. With these floors, the errors in the paper's worlds have the
+stated variances; another's echoes come at all times, and overlap more."""
 RANGE_FLOOR = 0.01
-"""Error [m] of a range that no level removes, likewise."""
+"""Irreducible range error [m], from the same cause."""
 EXCESS_PATH_FLOOR = 0.006
-"""Error [m] of an excess path that no level removes, likewise."""
+"""Irreducible excess-path error [m], from the same cause."""
 DIRECT_FLOOR = 0.04
-"""Error [rad] of the bearing of a caller's direct call: while it lasts, echoes begin of what stands
-near the line from the caller."""
+"""Bearing error of a caller's direct call [rad]: echoes of landmarks near the line from the caller
+begin while it lasts."""
 
 EDGE_FLOOR = 0.015
-"""Error [m] of where a caller's direct call begins that no level removes: what stands near the line
-adds to its first edge. It counts where overlaps are resolved, whose rows are sure enough to show
-it; it is the same for all rows of a frame."""
+"""Irreducible error of a direct call's beginning [m], by landmarks near the line; equal for all
+rows of a frame. Used if overlaps are resolved, as other errors are then small enough for it to
+matter."""
 
 
 def loudest_noise(elements: int) -> float:
-    """Return the 0.999 quantile of the residual power of a steered beam in noise.
-
-    In units of the noise's variance.
+    """Return the 0.999 quantile of the residual power of a steered beam in noise, in its variances.
 
     >>> round(loudest_noise(10), 2)
     2.35
@@ -97,8 +90,8 @@ def over_noise(power: float, energy: float, elements: Whole, loudest: float) -> 
 def bearing_std(power: float, slope: float, spread: float) -> float:
     """Return the standard deviation of a bearing [rad].
 
-    `slope`: phase between neighbours per radian; `spread`: twelve times the mean square of the
-    elements' places, in spacings, about their mean: N^2 - 1 of equally spaced ones.
+    `slope`: phase between neighbours per radian; `spread`: twelve times the variance of the
+    elements' positions, in spacings: N^2 - 1 if equally spaced.
 
     >>> round(bearing_std(100.0, math.pi, 99.0), 4)
     0.0079
@@ -108,7 +101,7 @@ def bearing_std(power: float, slope: float, spread: float) -> float:
 
 @kernel
 def delay_std(power: float, pulse: Whole) -> float:
-    """Return the standard deviation of a delay, in lags; the call has so many.
+    """Return the standard deviation of a delay, in lags; `pulse`: lags in a call.
 
     >>> round(delay_std(100.0, 14), 3)
     0.259
@@ -142,7 +135,7 @@ def energy_of(parts: Float[np.ndarray, " i"], elements: Whole) -> Float[np.ndarr
 def candidates(
     energy: Float[np.ndarray, " t"], threshold: float, row: Whole
 ) -> Int[np.ndarray, " k"]:
-    """Find the tests over the threshold that beat both their neighbours a row away.
+    """Find the energies above the threshold that are local maxima in time.
 
     Every test is written and few are kept: a branch on each could not be predicted.
     """
@@ -163,9 +156,9 @@ def candidates(
 def _is_loudest(
     energy: Float[np.ndarray, " t"], test: Whole, row: Whole, reach: Whole, floor: float
 ) -> bool:
-    """Tell whether a lag is the loudest within a reach, or until the energy falls low enough.
+    """Return whether a lag is the loudest within a reach, or until the energy falls to a floor.
 
-    A row of tests is a lag's: its neighbour in time is a row away, its other tones next to it.
+    A row of tests is a lag: the neighbour in time is a row away, the other tones are adjacent.
     """
     level, size = energy[test], energy.size
     for away in range(row, (reach + 1) * row, row):
@@ -190,7 +183,7 @@ def is_leakage(
     pulse: Whole,
     leakage: float,
 ) -> bool | np.bool_:
-    """Tell whether the energy of a tone is explained by leakage from another tone nearby."""
+    """Return whether the energy of a tone is explained by leakage from another tone nearby."""
     own, strongest = test % tones, 0.0
     for p in range(tones):
         if p != own:
@@ -205,7 +198,7 @@ def is_leakage(
 def _run_of(
     energy: Float[np.ndarray, " t"], test: Whole, row: Whole, floor: float
 ) -> tuple[Whole, Whole]:
-    """Return the first lag, and the one after the last, of a test's run above a level."""
+    """Return the half-open range of lags of a test's run above a level."""
     first = last = test
     while first >= row and energy[first - row] > floor:
         first -= row
@@ -225,9 +218,9 @@ def snapshot(
     threshold: float,
     leakage: float,
 ) -> tuple[Whole, Whole]:
-    """Return the first lag, and the one after the last, of a test's snapshot; equal if none.
+    """Return the half-open range of lags of a test's snapshot; empty if it has none.
 
-    A run may hold other echoes beside what leaks into it: each of its peaks is asked, at its lag.
+    The leakage test of a run is left to its peaks, as a run may hold other echoes besides leakage.
     """
     if runs:
         if _is_loudest(energy, test, row, energy.size, threshold):
@@ -240,15 +233,13 @@ def snapshot(
 
 
 STDS = BEARING_STD, RANGE_STD, EXCESS_PATH_STD
-"""Where the standard deviations stand among the numbers."""
+"""Rows of the standard deviations in `Scan.numbers`."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ConstantNoise:
     """The same standard deviations for all rows (Bradley & Abaid, Table I).
 
-    Examples
-    --------
     >>> from pipistrelle.detection.scans import make_scan
     >>> scan = make_scan(0.5, np.array([3, 8]), np.zeros(2), bearing_std=np.array([0.02, np.nan]))
     >>> ConstantNoise(range_std=0.2, bearing_std=0.15, excess_path_std=0.4)(scan).bearing_std
@@ -260,16 +251,16 @@ class ConstantNoise:
     excess_path_std: float
     """`range_std`, `bearing_std` and `excess_path_std` [m], [rad], [m]."""
     instead: bool = False
-    """Whether an estimator is given them in place of what the signal says, too."""
+    """Whether they replace the signal's standard deviations for an estimator."""
 
     def __call__(self, scan: Scan) -> Scan:
-        """Give rows the standard deviations that they do not have."""
+        """Fill in the missing standard deviations."""
         stds = self.bearing_std, self.range_std, self.excess_path_std
         numbers = _filled(np.ascontiguousarray(scan.numbers), *stds)
         return replace(scan, numbers=numbers)
 
     def hidden(self, heard: Scan, stated: Scan) -> Scan:
-        """Return a scan as an association stated it, without what the signal said of its noise."""
+        """Remove the signal's standard deviations from a scan that was associated with them."""
         if not self.instead:
             return stated
         same = (heard.numbers == stated.numbers) | np.isnan(stated.numbers)
@@ -294,7 +285,7 @@ def _filled(
 
 
 def unstated(scan: Scan) -> Scan:
-    """Return a scan without its standard deviations.
+    """Set a scan's standard deviations to NaN.
 
     >>> from pipistrelle.detection.scans import make_scan
     >>> unstated(make_scan(0.5, np.array([3]), np.zeros(1), bearing_std=0.1)).bearing_std
@@ -306,21 +297,9 @@ def unstated(scan: Scan) -> Scan:
 def without_hidden(scan: Scan, settings: FilterConfig, *, timing: bool, known: bool = True) -> Scan:
     """Return a scan without the columns that the settings hide from an estimator.
 
-    Parameters
-    ----------
-    scan : Scan
-    settings : FilterConfig
-        With "constant" noise standard deviations are hidden, and the slopes of bearings unless the
-        speed of sound is to be calibrated.
-    timing : bool
-        False: excess paths are hidden.
-    known : bool
-        Whether labels are; else an association sees all standard deviations, and hides them from
-        the estimator (`ConstantNoise.hidden`).
-
-    Returns
-    -------
-    Scan
+    With "constant" noise and `known` labels, standard deviations are hidden; with unknown labels
+    the association uses them, and hides them later (`ConstantNoise.hidden`). Slopes of bearings are
+    hidden unless the speed of sound is calibrated, excess paths unless `timing`.
     """
     hidden = () if "speed_of_sound" in settings.calibrate else (SLOPE,)
     hidden += STDS if known and settings.noise == "constant" else ()
@@ -328,16 +307,7 @@ def without_hidden(scan: Scan, settings: FilterConfig, *, timing: bool, known: b
 
 
 def noise_of(settings: FilterConfig) -> ConstantNoise:
-    """Return the noise model that the settings name.
-
-    Parameters
-    ----------
-    settings : FilterConfig
-
-    Returns
-    -------
-    ConstantNoise
-    """
+    """Return the model of constant measurement noise from the settings."""
     return ConstantNoise(
         range_std=settings.range_std,
         bearing_std=settings.bearing_std,

@@ -1,48 +1,48 @@
-r"""Overlaps: echoes that arrive together, told apart by the phases across one face.
+r"""Overlapping echoes: resolved by maximum likelihood from the phases across a face.
 
 Echoes that overlap in time are summed at each of a face's N elements. A snapshot of the matched
-filter's outputs that holds K of them is
+filter's outputs with K echoes is
 
 .. math:: x = A(u)\, s + n, \qquad A(u) = [a(u_1) \dots a(u_K)], \qquad a_e(u) = e^{i e u}, \qquad
           u = \frac{2\pi f d}{c} \sin\theta ,
 
-with the amplitudes s, which nothing is assumed of, and noise n of unit variance. One beam that is
-scanned sees lobes some :math:`2\pi / N` wide in u: of two echoes nearer than that it shows one peak
-between them, of others each where the other's lobe pulls it.
+with arbitrary amplitudes s, and noise n of unit variance. A scanned beam has lobes some
+:math:`2\pi / N` wide in u: two closer echoes show one peak between them, and others are displaced
+by each other's lobes.
 
-**Directions.** The likeliest are those whose waves leave least of the snapshot,
+**Directions.** The most likely minimise the residual,
 
 .. math:: \hat u = \arg\min_u \lVert P^\perp_A x \rVert^2, \qquad
           P^\perp_A = I - A (A^H A)^{-1} A^H ,
 
-deterministic maximum likelihood. Echoes of one call are coherent, which does not matter here, and
-is why methods that ask for the rank of a covariance (MUSIC, ESPRIT) fail in one snapshot. The
-minimum is found by *alternating projection*: each source in turn is put where, beside the others,
-it explains most,
+deterministic maximum likelihood. Echoes of one call are coherent, which does not matter here, but
+is why methods that need the rank of a covariance (MUSIC, ESPRIT) fail in one snapshot. The minimum
+is found by *alternating projection*: each source in turn is put where it explains most, given the
+others,
 
 .. math:: \hat u_k = \arg\max_u \frac{|a(u)^H P^\perp_{A_k} x|^2}{\lVert P^\perp_{A_k} a(u)\rVert^2}
 
-over a grid, :math:`A_k` being the others' waves; then all are moved by Gauss and Newton's steps
+over a grid, :math:`A_k` being the others' waves; then all are moved by Gauss-Newton steps
 :math:`J^{-1} g`, with :math:`D = [a'(u_1) s_1 \dots a'(u_K) s_K]` and
 
 .. math:: J = \operatorname{Re}(D^H P^\perp_A D), \qquad g = \operatorname{Re}(D^H P^\perp_A x) .
 
-**How sure they are.** Twice J is Fisher's information of the directions, with amplitudes unknown,
-so that the Cramér-Rao bound is :math:`\operatorname{cov}(\hat u) \ge \tfrac12 J^{-1}`. For one
-source it is that of `certainty`; near another it grows as their distance falls.
+**Standard deviations.** Twice J is Fisher's information of the directions, with amplitudes unknown,
+so the Cramér-Rao bound is :math:`\operatorname{cov}(\hat u) \ge \tfrac12 J^{-1}`. For one source it
+is that of `noise`; near another it grows as their distance falls.
 
-**How many there are.** After the right number the residual is noise without what was fitted, two
-numbers for each amplitude and one for each direction: :math:`2 \lVert P^\perp_A x \rVert^2` has
-the law of :math:`\chi^2` with :math:`2N - 3K` degrees of freedom. From one source on, another is
-added until no more is left than noise leaves in all but a thousandth of snapshots
-(`certainty.NOISE_QUANTILE`), or `MOST` are found, or the bound of one exceeds `UNSURE`: two that
-noise does not tell apart stay one. So of single echoes one in a thousand is parted, and of faint
-ones fewer. What then is left beyond noise is noise to the deviations.
+**Number of sources.** With the right number, the residual is noise less the fitted parameters, two
+for each amplitude and one for each direction: :math:`2 \lVert P^\perp_A x \rVert^2` is
+:math:`\chi^2` distributed with :math:`2N - 3K` degrees of freedom. Sources are added until the
+residual is no larger than noise leaves in all but a thousandth of snapshots
+(`noise.NOISE_QUANTILE`), or there are `MOST`, or the bound of one exceeds `UNSURE`. So one in a
+thousand single echoes is split, and fewer faint ones. Any excess residual counts as noise.
 
-**Amplitude and time.** An echo's amplitude is what a beam to it with nulls at the others says,
+**Amplitude and time.** An echo's amplitude is the output of a beam to it with nulls at the others,
 :math:`w = P^\perp_{A_k} a(u_k)`, :math:`s_k = w^H x / \lVert w \rVert^2`. In that beam the others
-are silent at every lag, so that the echo's own time of arrival is found there (`onset`), half a
-call around. An echo that two snapshots hold is told once, by the surer (`surest`).
+are silent at every lag, so the echo's time of arrival is found there (`matched.arrival_lag`),
+within half a call. An echo found in two snapshots is kept once, with the smaller standard deviation
+(`surest`).
 
 Sources: Ziskind & Wax, IEEE Transactions on Acoustics, Speech and Signal Processing 36 (1988), for
 alternating projection; Golub & Pereyra, SIAM Journal on Numerical Analysis 10 (1973), and Viberg,
@@ -63,31 +63,31 @@ from pipistrelle.detection.noise import MIN_POWER_OVER_NOISE, NOISE_QUANTILE
 from pipistrelle.jit import Whole, kernel, no_alloc
 
 MOST = 3
-"""Most sources in a snapshot: of four, ten elements tell too little."""
+"""Most sources in a snapshot: for four, ten elements have too little information."""
 NEAREST = 0.01
-"""Least share of a wave beside the others for which a grid's direction is tried."""
+"""Least share of a wave outside the others' space for a direction of the grid to be tried."""
 ROUNDS = 3
 """Rounds of alternating projection."""
 STEPS = 8
-"""Steps of Gauss and Newton."""
+"""Gauss-Newton steps."""
 LONGEST_STEP = 0.2
-"""Longest of these, in u [rad]: a third of a lobe."""
+"""Longest step in u [rad]: a third of a lobe."""
 SHORTEST_SHARE = 1e-3
-"""Share of a step below which it is not taken back further."""
+"""Smallest fraction of a step that is tried."""
 SETTLED = 1e-3
-"""Energy, in units of the noise's, by which a step must lower the residual for another one."""
+"""Least decrease of the residual for a further step, in units of the noise."""
 UNSURE = 0.2
-"""Largest deviation of u with which sources count as told apart [rad]."""
+"""Largest standard deviation of u for sources to count as resolved [rad]."""
 SAME_TIME = 0.25
 """Largest difference of one echo's times of arrival in two snapshots, in calls."""
 SAME_SINE = 0.1
-"""The same of the sines of its angle."""
+"""Largest difference of the sines of one echo's angle in two snapshots."""
 
 
 def most_left(elements: int) -> Float[np.ndarray, " k"]:
-    """Return the energy that noise leaves of 1, 2, ... sources in all but a thousandth of cases.
+    """Return the residual energy of 1, 2, ... sources that noise exceeds with probability 0.001.
 
-    In units of the noise of one output; for fewer than `MOST` where the elements tell no more.
+    In units of the noise of one output; fewer than `MOST` entries if the elements are too few.
 
     >>> most_left(10).round(1)
     array([20.4, 18.1, 15.6])
@@ -99,34 +99,34 @@ def most_left(elements: int) -> Float[np.ndarray, " k"]:
 
 
 class Sources(NamedTuple):
-    """Sources in a snapshot, and room to find them; the next snapshot overwrites it."""
+    """Sources in a snapshot, and work arrays; the next snapshot overwrites them."""
 
     u: Float[np.ndarray, " k"]
     """Phase between neighbours of each [rad]."""
     inverse: Float[np.ndarray, "k k"]
-    """Of J: half of it is the Cramér-Rao bound of u, at unit noise."""
+    """Inverse of J: half of it is the Cramér-Rao bound of u, at unit noise."""
     beam: Complex[np.ndarray, "k e"]
-    """To each with nulls at the others, as `onset.steer` takes it: ``w / |w|``, conjugate."""
+    """Beam to each with nulls at the others, as for `matched.steer`: conjugate of ``w / |w|``."""
     gain: Float[np.ndarray, " k"]
-    """Which share of its power the beam to each takes, ``|w|^2 / N``."""
+    """Relative power of each source in its beam, ``|w|^2 / N``."""
     basis: Complex[np.ndarray, "k e"]
-    """Of the waves' space, orthonormal."""
+    """Orthonormal basis of the waves' space."""
     slope: Complex[np.ndarray, "k e"]
-    """D, beside the waves."""
+    """D, outside the waves' space."""
     left: Complex[np.ndarray, " e"]
     """Residual."""
     wave: Complex[np.ndarray, " e"]
-    """That of a direction which is tried."""
+    """Wave of a direction that is tried."""
     score: Float[np.ndarray, " k"]
     """g"""
     fewer: Float[np.ndarray, " k"]
-    """u as it was with one source less."""
+    """u before the last source was added."""
     step: Float[np.ndarray, " k"]
 
 
 @kernel
 def room_for(most: Whole, elements: Whole) -> Sources:
-    """Return room for so many sources."""
+    """Allocate the arrays for up to `most` sources."""
     return Sources(
         u=np.empty(most),
         inverse=np.empty((most, most)),
@@ -153,13 +153,13 @@ def _product(a: Complex[np.ndarray, " e"], b: Complex[np.ndarray, " e"]) -> comp
 
 @no_alloc
 def _power(z: complex) -> float:
-    """Return the square of an amplitude."""
+    """Return the squared modulus."""
     return z.real * z.real + z.imag * z.imag
 
 
 @no_alloc
 def _leave(x: Complex[np.ndarray, " e"], basis: Complex[np.ndarray, "k e"], count: Whole) -> None:
-    """Take from x what lies in the space of the first vectors of a basis."""
+    """Remove from x its projection on the first vectors of a basis."""
     for k in range(count):
         along = _product(basis[k], x)
         for e in range(x.size):
@@ -168,7 +168,7 @@ def _leave(x: Complex[np.ndarray, " e"], basis: Complex[np.ndarray, "k e"], coun
 
 @no_alloc
 def _span(found: Sources, count: Whole, without: Whole, place: Float[np.ndarray, " p"]) -> Whole:
-    """Write an orthonormal basis of the sources' waves but for one's; return its size."""
+    """Write an orthonormal basis of the waves of all sources except one; return its size."""
     size = 0
     for k in range(count):
         if k != without:
@@ -189,7 +189,7 @@ def _best_beside(
     scan: Float[np.ndarray, " n"],
     place: Float[np.ndarray, " p"],
 ) -> float:
-    """Return the direction of a grid that explains most of x beside a basis of that size."""
+    """Return the grid direction that explains most of x outside the space of a basis."""
     best, direction = -1.0, 0.0
     for e in range(x.size):
         found.left[e] = x[e]
@@ -209,7 +209,7 @@ def _best_beside(
 def _aim(
     x: Complex[np.ndarray, " e"], found: Sources, count: Whole, place: Float[np.ndarray, " p"]
 ) -> float:
-    """Write beams, gains, residual, and J and g in their places; return the residual's energy."""
+    """Write beams, gains, residual, J and g; return the residual's energy."""
     for k in range(count):
         size, beam = _span(found, count, k, place), found.beam[k]
         steering_phases(-found.u[k], place, beam)
@@ -238,7 +238,7 @@ def _aim(
 
 @no_alloc
 def _invert(matrix: Float[np.ndarray, "k k"], size: Whole) -> None:
-    """Replace the corner of that size of a positive definite matrix by its inverse."""
+    """Invert the leading submatrix of a positive definite matrix in place."""
     for k in range(size):
         pivot = 1.0 / matrix[k, k]
         matrix[k, k] = 1.0
@@ -263,10 +263,7 @@ def _shift(found: Sources, count: Whole, share: float) -> None:
 def _settle(
     x: Complex[np.ndarray, " e"], found: Sources, count: Whole, place: Float[np.ndarray, " p"]
 ) -> float:
-    """Move the sources to the minimum that is near; return the energy of the residual there.
-
-    A step that leads too far is taken back by three quarters, and again.
-    """
+    """Move the sources to a local minimum by damped Gauss-Newton steps; return the residual."""
     energy = _aim(x, found, count, place)
     for _ in range(STEPS):
         _invert(found.inverse, count)
@@ -298,10 +295,10 @@ def resolve(
     most_left: Float[np.ndarray, " k"],
     found: Sources,
 ) -> tuple[Whole, float]:
-    """Find as many sources as explain a snapshot; return their number and the residual's energy.
+    """Find the fewest sources that explain a snapshot; return their number and the residual.
 
-    ``scan``: directions that are tried first; ``place``: of the elements, in spacings; empty for
-    equally spaced ones.
+    ``scan``: grid of directions; ``place``: positions of the elements, in spacings; empty if
+    equally spaced.
     """
     energy = math.inf
     for count in range(1, most_left.size + 1):
@@ -329,7 +326,7 @@ def resolve(
 
 @no_alloc
 def _are_apart(found: Sources, count: Whole) -> bool:
-    """Tell whether each direction is known, in unit noise, to a third of a lobe."""
+    """Return whether all directions have a standard deviation of at most `UNSURE` in unit noise."""
     apart = 0
     for k in range(count):
         apart += 0.5 * found.inverse[k, k] <= UNSURE * UNSURE
@@ -338,10 +335,7 @@ def _are_apart(found: Sources, count: Whole) -> bool:
 
 @no_alloc
 def deviation(x: Complex[np.ndarray, " e"], found: Sources, k: Whole, noise: float) -> float:
-    """Return the standard deviation of a source's u [rad], in noise of a power.
-
-    As for one beam (`certainty.bearing_std`) faint sources are less sure than the bound.
-    """
+    """Return the standard deviation of a source's u [rad], for a noise power."""
     heard = 0.0j
     for e in range(x.size):
         heard += x[e] * found.beam[k, e]
@@ -353,9 +347,9 @@ def deviation(x: Complex[np.ndarray, " e"], found: Sources, k: Whole, noise: flo
 def surest(
     whole: Int[np.ndarray, "3 m"], numbers: Float[np.ndarray, "5 m"], apart: float
 ) -> Bool[np.ndarray, " m"]:
-    """Tell which rows are the surest of their echo, which several snapshots may hold.
+    """Return a mask of the rows with the smallest deviation of their echo among several snapshots.
 
-    ``whole`` are face, caller and snapshot; ``numbers`` begin with delay, sine of the angle, power
+    ``whole``: face, caller and snapshot; ``numbers``: begin with delay, sine of the angle, power
     and deviation of the bearing; ``apart``: largest difference of an echo's delays [s].
     """
     best = np.ones(whole.shape[1], dtype=np.bool_)

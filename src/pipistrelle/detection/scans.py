@@ -1,9 +1,7 @@
-"""Scans: what one frame measured, a row per measurement, as associations and filters see it.
+"""Scans: the measurements of a frame as arrays, and their merging by landmark.
 
-Merging: what the callers' tones say of one landmark becomes one measurement.
-
-A sensing strategy takes the rows of some callers, and of the rows of one landmark is made one: the
-same is done when an association has said which rows are of one landmark.
+A sensing strategy selects the measurements of some callers; measurements of one landmark, by
+different callers or after association, are merged into one.
 """
 
 import math
@@ -18,8 +16,8 @@ from pipistrelle.jit import Whole, kernel
 from pipistrelle.refusals import shown
 
 WIDEST = math.pi / 2.0 / math.sqrt(12.0)
-"""Deviation of a bearing that is anywhere in a quarter turn [rad]. A less sure bearing is of no
-use: the mean of the places where its landmark may be is a tenth nearer than the range."""
+"""Standard deviation of a bearing that is uniform over a quarter turn [rad]. A larger one is
+useless: the mean of the landmark's possible positions is a tenth nearer than the range."""
 UNLABELLED = -1
 """Label of a measurement whose landmark is not known."""
 OWN = 0
@@ -42,68 +40,68 @@ COLUMNS = (
 """Names of a scan's columns."""
 NUMBERS = len(COLUMNS) - 2
 BEARING, RANGE, EXCESS_PATH, BEARING_STD, RANGE_STD, EXCESS_PATH_STD, LEVEL, SLOPE = range(NUMBERS)
-"""Where each stands among the numbers: label and caller stand apart."""
+"""Row of each column in `Scan.numbers`; label and caller have their own arrays."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Scan:
     """Measurements at one time.
 
-    What is measured is one array, a row of it for each column, so that kernels are handed one;
-    each column has a name, too. Standard deviations are stated by `pipistrelle.detection.noise`.
+    `numbers` is a single array with a row for each column, for kernels; properties name the
+    columns. `pipistrelle.detection.noise` states standard deviations.
     """
 
     time: float
-    """Time [s]."""
+    """[s]."""
     landmark: Int[np.ndarray, " m"]
-    """Recorded label; UNLABELLED where none was recorded."""
+    """Recorded label, or UNLABELLED."""
     caller: Int[np.ndarray, " m"]
-    """OWN, or the number of another caller. Of several, the first with an excess path, else the
+    """OWN, or the number of another caller: of several, the first with an excess path, else the
     first."""
     numbers: Float[np.ndarray, "8 m"]
     """The other columns, in the order of `COLUMNS`."""
     callers: Int[np.ndarray, " c"] = field(default_factory=lambda: NO_CALLERS)
-    """Label of each caller as a landmark, by its number; UNLABELLED for the vehicle and where it is
-    not known, as for numbers beyond the array."""
+    """Label of each caller as a landmark, by its number; UNLABELLED for the vehicle, and if
+    unknown, as for numbers beyond the array."""
     moving: Int[np.ndarray, " v"] = field(default_factory=lambda: NO_CALLERS)
     """Labels of the callers that move; in a scan without labels, their numbers."""
     direct: Int[np.ndarray, " d"] = field(default_factory=lambda: NO_CALLERS)
-    """Row of each caller's direct call, by the caller's number, in a scan without labels; -1 where
-    none was heard. The row's label becomes that of the caller (`merging.labelled`)."""
+    """Row of each caller's direct call, by the caller's number, in a scan without labels; -1 if
+    there is none. The row's label becomes the caller's (`labelled`)."""
 
     @property
     def bearing(self) -> Float[np.ndarray, " m"]:
-        """From the heading, counter-clockwise [rad]; NaN where a row is only an excess path."""
+        """Bearing from the heading, counter-clockwise [rad]; NaN for a mere excess path."""
         return self.numbers[BEARING]
 
     @property
     def range(self) -> Float[np.ndarray, " m"]:
-        """To the landmark [m]; NaN where passive."""
+        """Range to the landmark [m]; NaN if passive."""
         return self.numbers[RANGE]
 
     @property
     def excess_path(self) -> Float[np.ndarray, " m"]:
-        """How much longer than the direct way that over the landmark is [m], or NaN."""
+        """Length of the path over the landmark less the direct path [m], or NaN."""
         return self.numbers[EXCESS_PATH]
 
     @property
     def bearing_std(self) -> Float[np.ndarray, " m"]:
-        """Standard deviation of the bearing [rad]; NaN where it is not stated."""
+        """Standard deviation of the bearing [rad]; NaN if not stated."""
         return self.numbers[BEARING_STD]
 
     @property
     def range_std(self) -> Float[np.ndarray, " m"]:
-        """Standard deviation of the range [m]; NaN where it is not stated."""
+        """Standard deviation of the range [m]; NaN if not stated."""
         return self.numbers[RANGE_STD]
 
     @property
     def excess_path_std(self) -> Float[np.ndarray, " m"]:
-        """Standard deviation of the excess path [m]; NaN where it is not stated."""
+        """Standard deviation of the excess path [m]; NaN if not stated."""
         return self.numbers[EXCESS_PATH_STD]
 
     @property
     def level_db(self) -> Float[np.ndarray, " m"]:
-        """Of the strongest detection behind a row, over a steered beam's noise [dB], or NaN."""
+        """Level of the strongest detection over a steered beam's noise [dB], or NaN."""
         return self.numbers[LEVEL]
 
     @property
@@ -118,27 +116,12 @@ def make_scan(
     bearing: Float[np.ndarray, " m"],
     **columns: np.ndarray | float,
 ) -> Scan:
-    """Make a scan of some of its columns.
+    """Make a scan from some of its columns.
 
-    Parameters
-    ----------
-    time : [s]
-    landmark : (m)
-    bearing : (m) [rad]
-    columns : (m), or one number for all rows
-        Any of the others. What is not given, says nothing: NaN, and the vehicle's own call.
+    `time` [s]; `bearing` [rad]; `columns`: any others, as arrays or one number for all rows.
+    Missing columns are NaN, and the caller is the vehicle. Raises InputError for unknown columns,
+    and columns of different lengths or not of numbers.
 
-    Returns
-    -------
-    Scan
-
-    Raises
-    ------
-    InputError
-        For a column that no scan has, or columns of several lengths, or of no numbers.
-
-    Examples
-    --------
     >>> scan = make_scan(0.5, np.array([3, 8]), np.array([0.2, 1.0]), bearing_std=0.15)
     >>> scan.range, scan.bearing_std
     (array([nan, nan]), array([0.15, 0.15]))
@@ -148,24 +131,10 @@ def make_scan(
 
 
 def with_columns(scan: Scan, **columns: np.ndarray | float) -> Scan:
-    """Return a scan with some of its columns replaced.
+    """Return a scan with some of its columns replaced, by arrays or one number for all rows.
 
-    Parameters
-    ----------
-    scan : Scan
-    columns : (m), or one number for all rows
+    Raises InputError as `make_scan` does.
 
-    Returns
-    -------
-    Scan
-
-    Raises
-    ------
-    InputError
-        As `make_scan`.
-
-    Examples
-    --------
     >>> scan = make_scan(0.5, np.array([3, 8]), np.array([0.2, 1.0]))
     >>> with_columns(scan, range=2.0, bearing=-scan.bearing).bearing
     array([-0.2, -1. ])
@@ -176,7 +145,7 @@ def with_columns(scan: Scan, **columns: np.ndarray | float) -> Scan:
 
 
 def _made_of(time: float, shape: tuple[int, ...], given: dict[str, np.ndarray | float]) -> Scan:
-    """Make a scan of columns; a column that is not given has its default."""
+    """Make a scan from columns; missing columns have their defaults."""
     if unknown := sorted(given.keys() - set(COLUMNS)):
         raise InputError(f"scan: no such column {unknown[0]}; expected one of {', '.join(COLUMNS)}")
     shapes = {name: _shape(name, value) for name, value in given.items()}
@@ -197,7 +166,7 @@ def _made_of(time: float, shape: tuple[int, ...], given: dict[str, np.ndarray | 
 
 
 def _shape(name: str, values: np.ndarray | float) -> tuple[int, ...]:
-    """Return the shape of a column; refuse rows of unlike lengths."""
+    """Return the shape of a column; raise if its rows have different lengths."""
     try:
         return np.shape(values)
     except ValueError:
@@ -207,7 +176,7 @@ def _shape(name: str, values: np.ndarray | float) -> tuple[int, ...]:
 
 
 def rows_of(scan: Scan, rows: Bool[np.ndarray, " m"] | Int[np.ndarray, " k"]) -> Scan:
-    """Take some rows of a scan.
+    """Select rows of a scan.
 
     >>> scan = make_scan(0.5, np.array([3, 8]), np.array([0.2, 1.0]))
     >>> rows_of(scan, scan.bearing > 0.5).landmark
@@ -225,7 +194,7 @@ def rows_of(scan: Scan, rows: Bool[np.ndarray, " m"] | Int[np.ndarray, " k"]) ->
 def _moved(
     direct: Int[np.ndarray, " c"], size: int, rows: Bool[np.ndarray, " m"] | Int[np.ndarray, " k"]
 ) -> Int[np.ndarray, " c"]:
-    """Return where the direct calls are after some of `size` rows were taken; -1: left out."""
+    """Return the rows of the direct calls after a selection among `size` rows; -1 if removed."""
     if direct.size == 0:
         return direct
     kept, place = np.arange(size)[rows], np.full(size + 1, -1)
@@ -234,9 +203,9 @@ def _moved(
 
 
 def without_labels(scan: Scan, callers: Int[np.ndarray, " c"]) -> Scan:
-    """Return a scan without labels that knows which rows are direct calls (`Scan.direct`).
+    """Remove the labels of a scan, and record the rows of the direct calls in `Scan.direct`.
 
-    `callers`: the label that the direct call of each caller has, by its number; UNLABELLED of none.
+    `callers`: the label of each caller's direct call, by its number, or UNLABELLED.
 
     >>> scan = make_scan(0.5, np.array([4, 9]), np.array([0.2, 1.0]), caller=1)
     >>> hidden = without_labels(scan, np.array([-1, 9]))
@@ -253,7 +222,7 @@ def without_labels(scan: Scan, callers: Int[np.ndarray, " c"]) -> Scan:
 
 
 def with_callers(scan: Scan, callers: Int[np.ndarray, " c"]) -> Scan:
-    """Return a scan without labels in which each caller has one, or UNLABELLED, by its number.
+    """Set the labels of the callers in a scan without labels, by their numbers, or UNLABELLED.
 
     >>> scan = make_scan(0.5, np.full(2, -1), np.zeros(2), caller=1)
     >>> heard = replace(scan, direct=np.array([-1, 0, 1]), moving=np.array([1, 2]))
@@ -266,9 +235,9 @@ def with_callers(scan: Scan, callers: Int[np.ndarray, " c"]) -> Scan:
 
 
 def without_excess_paths(scan: Scan, *numbers: int) -> Scan:
-    """Return a scan without excess paths and without rows that hold nothing else.
+    """Remove excess paths, and rows that contain nothing else, from a scan.
 
-    `numbers`: what becomes unknown besides.
+    `numbers`: further columns to set to NaN.
 
     >>> from pipistrelle.detection.scans import make_scan
     >>> rows = np.array([8, 8]), np.array([0.4, np.nan])
@@ -283,7 +252,7 @@ def without_excess_paths(scan: Scan, *numbers: int) -> Scan:
 
 
 def without(scan: Scan, *numbers: int) -> Scan:
-    """Return a scan with some of its numbers unknown.
+    """Set some of a scan's numbers to NaN.
 
     >>> scan = make_scan(0.5, np.array([3]), np.zeros(1), range=2.0, range_std=0.1)
     >>> without(scan, RANGE_STD).range_std
@@ -296,27 +265,15 @@ def without(scan: Scan, *numbers: int) -> Scan:
 
 
 LISTENS_TO = {"active": (True, False), "fused": (True, True), "passive": (False, True)}
-"""Whether a strategy takes what the vehicle's own call, and what the others' calls bring back."""
+"""Whether a strategy uses the echoes of the vehicle's own call, and of the others' calls."""
 
 
 def scan_of(rows: Scan, strategy: Strategy) -> Scan:
     """Select the measurements of a frame that a sensing strategy uses.
 
-    Active takes what the vehicle's own call brings back, passive what those of others do, fused
-    both: of the rows of one landmark it makes one (`fused`).
+    Active uses the echoes of the vehicle's own call, passive the calls of others and their echoes,
+    fused both. Measurements of one landmark are merged.
 
-    Parameters
-    ----------
-    rows : Scan
-        All that was heard in a frame.
-    strategy : "active", "fused" or "passive"
-
-    Returns
-    -------
-    Scan
-
-    Examples
-    --------
     >>> from pipistrelle.detection.scans import make_scan
     >>> rows = make_scan(0.5, np.array([2, 2, 5]), np.array([0.2, 0.4, 1.0]),
     ...                  caller=np.array([0, 1, 1]), range=np.array([4.0, np.nan, np.nan]))
@@ -326,24 +283,23 @@ def scan_of(rows: Scan, strategy: Strategy) -> Scan:
     [2]
     """
     own, others = LISTENS_TO[strategy]
-    if rows.direct.size:  # rows without labels: nothing is merged
+    if rows.direct.size:  # unlabelled rows are not merged
         return rows_of(rows, np.where(rows.caller == OWN, own, others))
     return _fused(rows, rows.landmark, own=own, others=others, labels_only=False)
 
 
 def labelled(scan: Scan, label: Int[np.ndarray, " m"]) -> Scan:
-    r"""Label a scan's rows: one row for each landmark remains; rows without a label are dropped.
+    r"""Label a scan's rows, and merge them by landmark; rows without a label are dropped.
 
-    The bearing of several is their mean, weighted by the inverse variances where all are stated,
+    The bearing is the mean, weighted by the inverse variances if all are stated,
 
     .. math:: \bar\phi = \sum_i \phi_i \sigma_i^{-2} \Big/ \sum_i \sigma_i^{-2}, \qquad
               \bar\sigma^{-2} = \sum_i \sigma_i^{-2} ,
 
-    and else the plain mean, whose deviation is not stated. Range and excess path are the first
-    among the rows; further excess paths become rows without a bearing, at the end. The label of a
-    caller's direct call (`Scan.direct`) becomes that of the caller.
-
-    A scan that is labelled and merged already is returned as it is.
+    else the plain mean without a standard deviation. Range and excess path are the first of a
+    landmark's rows; further excess paths become rows without a bearing, at the end. The label of a
+    caller's direct call (`Scan.direct`) becomes the caller's. A scan that is already labelled and
+    merged is returned unchanged.
 
     >>> from pipistrelle.detection.scans import make_scan
     >>> scan = make_scan(0.5, np.full(3, UNLABELLED), np.array([0.2, 0.4, 1.0]), bearing_std=0.1)
@@ -355,21 +311,21 @@ def labelled(scan: Scan, label: Int[np.ndarray, " m"]) -> Scan:
         return scan
     label = _checked(scan, np.asarray(label))
     if scan.direct.size:
-        scan = with_callers(scan, np.append(label, UNLABELLED)[scan.direct])  # -1: not heard
+        scan = with_callers(scan, np.append(label, UNLABELLED)[scan.direct])  # -1: not detected
     return _fused(scan, label, own=True, others=True, labels_only=True)
 
 
 def _fused(
     scan: Scan, label: Int[np.ndarray, " m"], *, own: bool, others: bool, labels_only: bool
 ) -> Scan:
-    """Select the rows of some callers and merge those of each label into one."""
+    """Select the rows of some callers and merge rows of equal labels."""
     numbers = np.ascontiguousarray(scan.numbers)
     landmark, caller, numbers = _fuse(label, scan.caller, numbers, own, others, labels_only)
     return replace(scan, landmark=landmark, caller=caller, numbers=numbers)
 
 
 def _checked(scan: Scan, label: np.ndarray) -> Int[np.ndarray, " m"]:
-    """Check the labels of a scan's rows."""
+    """Return the labels of a scan's rows as integers; raise if they are invalid."""
     whole = label.dtype.kind in "iu" or not label.size
     if label.shape != scan.landmark.shape or not whole or label.min(initial=0) < UNLABELLED:
         raise InputError(
@@ -382,7 +338,7 @@ def _checked(scan: Scan, label: np.ndarray) -> Int[np.ndarray, " m"]:
 
 @kernel
 def settled(label: Int[np.ndarray, " m"], bearing: Float[np.ndarray, " m"]) -> bool:
-    """Tell whether every row has a label, and those with a bearing stand first, one a label."""
+    """Return whether a scan is labelled and merged, with rows without a bearing at the end."""
     for m in range(label.size):
         bare = math.isnan(bearing[m])
         if label[m] == UNLABELLED or (m > 0 and math.isnan(bearing[m - 1]) and not bare):
@@ -402,10 +358,10 @@ def _fuse(
     others: bool,
     labels_only: bool,
 ) -> tuple[Int[np.ndarray, " k"], Int[np.ndarray, " k"], Float[np.ndarray, "8 k"]]:
-    """Select the rows of some callers and merge those of each landmark into one.
+    """Select the rows of some callers and merge the rows of each landmark.
 
-    Rows without a label stay as they are, or are left out. Excess paths after a landmark's first
-    are rows of their own, at the end.
+    Rows without a label are kept unmerged, or left out. Further excess paths of a landmark become
+    rows at the end.
     """
     most = label.size
     landmark, caller = np.empty(most, np.int64), np.empty(most, np.int64)
@@ -452,11 +408,7 @@ def _average(
     merged: Int[np.ndarray, " m"],
     sums: Float[np.ndarray, "5 m"],
 ) -> None:
-    """Turn the first bearing of each row to the mean of all that were merged.
-
-    ``sums``: how far they are from it, plainly and weighted; their slopes likewise; their weight.
-    Room may be left.
-    """
+    """Replace each row's first bearing by the mean of its merged bearings; `sums` are relative."""
     turn, weighted, slope, weighted_slope, weight = sums
     for k in range(numbers.shape[1]):
         if merged[k] > 1:

@@ -1,21 +1,21 @@
-r"""Matched outputs -> detections: snapshots, tones present, beamscan, time of arrival.
+r"""Detections from matched-filter outputs of line arrays: snapshots, beam scan, time of arrival.
 
-The matched filter's outputs y_e, normalised to unit noise variance, are tested per face and tone
-by their energy :math:`E = \sum_e |y_e|^2`, which is Gamma(N) distributed in noise. A *snapshot*
-is a lag whose energy passes the test and is the largest within half a call to either side, or, by
-the setting ``snapshots = "runs"``, a whole contiguous run of lags that pass. A tone counts at a lag
-only if its energy is not explained by the leakage of another, stronger one: the edges of a
-rectangular call leak -33 dB into the next tone. The ten outputs of a snapshot are scanned with a
-conventional beam, whose power, summed over a run's lags, needs only the sums over element pairs,
+The matched filter's outputs y_e, normalised to unit noise variance, are tested per face and tone by
+their energy :math:`E = \sum_e |y_e|^2`, which is Gamma(N) distributed in noise. A *snapshot* is a
+lag whose energy passes the test and is the largest within half a call to either side, or, with
+``snapshots = "runs"``, a contiguous run of lags that pass. A tone counts at a lag only if its
+energy is not explained by the leakage of a stronger tone: the edges of a rectangular call leak -33
+dB into the next tone. A snapshot is scanned with a conventional beam, whose power, summed over a
+run's lags, needs only the sums over element pairs,
 
 .. math:: P(u) = r_0 + 2 \operatorname{Re} \sum_{l=1}^{N-1} r_l e^{-i l u}, \qquad
           u = \frac{2\pi f d}{c} \sin\theta .
 
-Each peak near the strongest's height is refined by a parabola, the beamformer is steered to it,
-and the time of arrival is where a triangle, the matched filter's answer to the call, fits best; in
-a run, near the lag at which that beam is loudest. With the setting ``overlaps = "resolve"`` there
-are as many sources as explain the snapshot in place of peaks (`pipistrelle.detection.overlaps`).
-Bradley & Abaid, Sec. II-D; what the paper leaves open is settled in the settings' defaults.
+Each peak near the strongest's height is refined by a parabola, the beam is steered to it, and the
+time of arrival is where a triangle, the matched filter's response to the call, fits best; in a run,
+near the loudest lag of that beam. With ``overlaps = "resolve"``, the sources that explain the
+snapshot take the place of peaks (`pipistrelle.detection.overlaps`). Bradley & Abaid, Sec. II-D; the
+settings' defaults decide whatever the paper leaves open.
 """
 
 import math
@@ -53,19 +53,19 @@ from pipistrelle.geometry import wrap
 from pipistrelle.jit import Whole, kernel, no_alloc
 
 SCAN_STEP = 0.05
-"""Distance of the scan's beams in u [rad]: the parabola's bias stays under 2 % of a beam step."""
+"""Step of the scan's beams in u [rad]: the parabola's bias stays under 2 % of a beam step."""
 
 MAX_SPACING = 100
-"""Most waves between two elements; their bearings are ambiguous long before."""
+"""Most waves between two elements; bearings are ambiguous long before."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Detections:
-    """Calls found in one frame's samples; one row per face, caller, snapshot and peak."""
+    """Calls detected in a frame; one row per face, caller, snapshot and peak."""
 
     face: Int[np.ndarray, " m"]
     caller: Int[np.ndarray, " m"]
-    """Number of the caller whose tone it is: 0 for the vehicle."""
+    """Number of the caller of the tone: 0 for the vehicle."""
     angle: Float[np.ndarray, " m"]
     """Off the face's normal [rad]."""
     bearing: Float[np.ndarray, " m"]
@@ -73,23 +73,22 @@ class Detections:
     delay: Float[np.ndarray, " m"]
     """Since the emission [s]. For another caller's tone only the oracle uses it."""
     power: Float[np.ndarray, " m"]
-    """Of the steered beam, divided by the elements: their number times the SNR of one."""
+    """Power of the steered beam, divided by the number of elements N: N times an element's SNR."""
     bearing_std: Float[np.ndarray, " m"] = field(default_factory=lambda: np.empty(0))
     delay_std: Float[np.ndarray, " m"] = field(default_factory=lambda: np.empty(0))
-    """`bearing_std` and `delay_std`: how sure the detector is of each (`detection.certainty`);
-    NaN, as by default, where it does not say [rad], [s]."""
+    """`bearing_std` and `delay_std` [rad], [s] (`detection.noise`); by default NaN, not stated."""
     direct: DirectCalls | None = None
-    """When the other callers were heard directly; None where the detector does not say."""
+    """Direct calls of the other callers; None if the detector does not find them."""
 
     def __post_init__(self) -> None:
-        """Say that a detector does not say how sure it is."""
+        """Fill missing standard deviations with NaN."""
         for name in ("bearing_std", "delay_std"):
             if not len(getattr(self, name)):
                 object.__setattr__(self, name, np.full(len(self.power), np.nan))
 
 
 class Columns(NamedTuple):
-    """The columns of `Detections`, as kernels take them."""
+    """The columns of `Detections`, for kernels."""
 
     face: Int[np.ndarray, " m"]
     caller: Int[np.ndarray, " m"]
@@ -113,9 +112,9 @@ class Detector(NamedTuple):
     """Thresholds and tables of the detection stage (`detector`)."""
 
     threshold: float
-    """Of the energy of one face and tone, in units of the noise of one output."""
+    """Least energy of a face and tone, in units of the noise of one output."""
     runs: bool
-    """Whether a run above the threshold is one snapshot, however long it is."""
+    """Whether a run of lags above the threshold is one snapshot."""
     leakage: float
     peak: float
     """`leakage` and `peak` are power ratios."""
@@ -124,45 +123,27 @@ class Detector(NamedTuple):
     loudest_noise: float
     """0.999 quantile of the residual power of noise, in units of the noise of one output."""
     normal: Float[np.ndarray, " f"]
-    """Normal [rad]."""
     wave: Float[np.ndarray, " c"]
     """Phase between neighbours at 90 degrees, 2 pi f d / c, per tone [rad]."""
     scan: Float[np.ndarray, "c n"]
     """Scanned u, per tone [rad]."""
     table: Float[np.ndarray, "c 2 k n"]
-    """Real and imaginary part of exp(-i l u), per tone; l: 1 ... e - 1, or the elements' places."""
+    """Real and imaginary part of exp(-i l u), per tone; l: 1 ... e - 1, or `place`."""
     place: Float[np.ndarray, " e"]
-    """Places of the elements, in spacings; empty for equally spaced ones."""
+    """Positions of the elements, in spacings; empty if equally spaced."""
     spread: float
-    """See `certainty.bearing_std`."""
+    """See `noise.bearing_std`."""
     most_left: Float[np.ndarray, " k"]
-    """Most that 1, 2, ... sources may leave of a snapshot (`overlaps.most_left`); empty where
-    overlaps are not resolved."""
+    """Largest residual of 1, 2, ... sources (`overlaps.most_left`); empty to merge overlaps."""
 
 
 def detector(config: Config, layout: Layout, tones: Float[np.ndarray, " c"]) -> Detector:
-    """Settle the thresholds and tables of the detection stage.
+    """Compute the thresholds and tables of the detection stage.
 
-    Parameters
-    ----------
-    config : Config
-    layout : Layout
-        Two elements or more; of some that are not equally spaced the smallest gap counts as the
-        spacing, and the scan takes longer.
-    tones : (c) [Hz]
-        Of the calls.
+    `layout` has two elements or more; if they are not equally spaced, the smallest gap is the
+    spacing, and the scan takes longer. `tones`: of the calls [Hz]. Raises InputError if the
+    elements are not in rising order, or too far apart.
 
-    Returns
-    -------
-    Detector
-
-    Raises
-    ------
-    InputError
-        When the elements do not rise, or are too far apart.
-
-    Examples
-    --------
     >>> from pipistrelle.arrays.layout import square_of_four
     >>> layout, tones = square_of_four(Config().receiver), np.array([35e3, 30e3])
     >>> round(detector(Config(), layout, tones).threshold, 1)
@@ -200,7 +181,7 @@ def detector(config: Config, layout: Layout, tones: Float[np.ndarray, " c"]) -> 
 
 
 def _spaced(layout: Layout) -> tuple[float, Float[np.ndarray, " e"]]:
-    """Return the spacing of elements [m] and, unless all have it, their places in spacings."""
+    """Return the spacing of elements [m] and, if unequal, their positions in spacings."""
     position = layout.position
     gaps = np.diff(position)
     if position.size < 2 or not gaps.min() > 0.0:
@@ -221,23 +202,10 @@ def detect(
     interval: float,
     pulse: int,
 ) -> Detections:
-    """Find bearings and delays of everything that stands out of the noise.
+    """Detect bearings and delays of all calls that exceed the noise.
 
-    Parameters
-    ----------
-    matched : (lags, faces, tones, elements) complex
-        Of unit noise variance.
-    detector : Detector
-    start : [s]
-        Delay of lag 0.
-    interval : [s]
-        Between two lags.
-    pulse : int
-        Lags per call.
-
-    Returns
-    -------
-    Detections
+    `matched` has unit noise variance; `start`: delay of lag 0 [s]; `interval`: between two lags
+    [s]; `pulse`: lags per call.
     """
     energy = energy_of(matched.reshape(-1).view(matched.real.dtype), matched.shape[3])
     lags = Lags(start, interval, pulse)
@@ -274,17 +242,17 @@ def _direct(
     numbers: Float[np.ndarray, "5 m"],
     lags: Lags,
 ) -> DirectCalls:
-    """Find the direct calls among detections, given as `direct_calls` takes them."""
+    """Find the direct calls among detections, with the arguments of `direct_calls`."""
     found, (began, began_std) = direct_calls(matched, whole, numbers, matched.shape[2], lags)
     pulse = lags.pulse * lags.interval
     return DirectCalls(detection=found, delay=began, delay_std=began_std, pulse=pulse)
 
 
 def detections_at(found: Detections, rows: Bool[np.ndarray, " m"]) -> Detections:
-    """Select some rows; direct calls that are not among them are dropped."""
+    """Select detections by a mask; direct calls outside it are dropped."""
     direct = found.direct
     if direct is not None:
-        kept = np.append(rows, False)  # the last stands for none
+        kept = np.append(rows, False)  # the last is for -1
         number = np.where(kept, np.cumsum(kept) - 1, -1)[direct.detection]
         direct = direct._replace(detection=number)
     columns = {name: getattr(found, name)[rows] for name in Columns._fields}
@@ -292,7 +260,7 @@ def detections_at(found: Detections, rows: Bool[np.ndarray, " m"]) -> Detections
 
 
 def joined(parts: Sequence[Detections]) -> Detections:
-    """Concatenate the detections of one call from several frames; the first has its direct call."""
+    """Concatenate detections of one call from several frames; direct calls are the first's."""
     columns = {name: np.concatenate([getattr(p, name) for p in parts]) for name in Columns._fields}
     return Detections(**columns, direct=parts[0].direct)
 
@@ -306,7 +274,7 @@ def _steered_power(
     table: Float[np.ndarray, "2 e n"],
     power: Float[np.ndarray, " n"],
 ) -> None:
-    """Write what `_scan_power` does, for elements at any places, from their steering vectors."""
+    """Write the power of `_scan_power` for elements in any positions, by steering vectors."""
     for i in range(power.size):
         power[i] = 0.0
         for b in range(lags[0], lags[1]):
@@ -325,10 +293,7 @@ def _scan_power(
     table: Float[np.ndarray, "2 k n"],
     power: Float[np.ndarray, " n"],
 ) -> None:
-    """Write the power of the conventional beam over the scan, from the sums over element pairs.
-
-    That of the lags from the first to before the last is summed.
-    """
+    """Write the power of the beam over the scan, summed over lags, from sums over element pairs."""
     elements, beams = matched.shape[3], power.size
     if table.shape[1] == elements:
         _steered_power(matched, lags, f, p, table, power)
@@ -362,10 +327,7 @@ def _loudest_lag(
     phases: Complex[np.ndarray, " e"],
     beam: Complex[np.ndarray, " r"],
 ) -> tuple[Whole, float]:
-    """Find which lag, from the first to before the last, is loudest in a beam; and its power.
-
-    ``beam`` is room for so many lags.
-    """
+    """Return the loudest lag of a beam in a half-open range of lags, and its power."""
     loudest, highest = lags[0], -1.0
     steer(matched, lags[0], lags[1] - lags[0], f, p, phases, beam)
     for k in range(lags[1] - lags[0]):
@@ -377,10 +339,7 @@ def _loudest_lag(
 
 @no_alloc
 def _peaks(power: Float[np.ndarray, " n"], ratio: float, place: Int[np.ndarray, " n"]) -> Whole:
-    """Write where the power peaks, not far under its highest; return the number of peaks.
-
-    Chosen as the candidates are.
-    """
+    """Write the indices of the power's peaks close to the highest; return their number."""
     count, kept, last = 0, 0, power.size - 1
     for i in range(1, last):
         place[count] = i
@@ -397,7 +356,7 @@ def _peaks(power: Float[np.ndarray, " n"], ratio: float, place: Int[np.ndarray, 
 
 @kernel
 def _grown(columns: Shaped[np.ndarray, "k m"]) -> Shaped[np.ndarray, "k 2*m"]:
-    """Copy of columns with twice the capacity."""
+    """Return a copy of columns with twice the capacity."""
     wide = np.empty((columns.shape[0], 2 * columns.shape[1]), dtype=columns.dtype)
     for k in range(columns.shape[0]):
         for i in range(columns.shape[1]):
@@ -466,10 +425,7 @@ def _find_sources(
     rules: tuple,
     lag: Lags,
 ) -> tuple[Int[np.ndarray, "2 m"], Float[np.ndarray, "5 m"]]:
-    """Find every source of every snapshot (`overlaps`); returns what `_find_peaks` does.
-
-    No echo is louder than its snapshot.
-    """
+    """Find every source of every snapshot (`overlaps`); returns the columns of `_find_peaks`."""
     _, faces, tones, elements = matched.shape
     rule, pulse, row, count = Detector(*rules), lag.pulse, faces * tones, 0
     whole, numbers = np.empty((3, 128), dtype=np.int64), np.empty((5, 128))

@@ -1,48 +1,48 @@
-r"""Wide bands: calls that sweep, found by true delays over the whole band.
+r"""Wideband calls, such as sweeps: detected by beams steered with true delays over the whole band.
 
-What stands between two microphones of an array is, for a sweep, as much a matter of time as of
-phase: over 44 mm, 0.13 ms, the matched output of a band of 25 kHz falls off three times. So beams
-are steered by delays, frequency by frequency. With Y the spectrum of microphone m's matched output
-and :math:`a_m = p_m \cdot u(\phi) / c` what it hears earlier than the group's middle,
+For a sweep, the distance between two microphones changes the envelope's time as well as the phase:
+over 44 mm, 0.13 ms, the matched output of a band of 25 kHz falls off three times. So beams are
+steered by delays, frequency by frequency. With Y the spectrum of microphone m's matched output and
+:math:`a_m = p_m \cdot u(\phi) / c` its lead over the group's middle,
 
 .. math:: Z(\phi, f) = \sum_m w_m e^{-2\pi i f a_m(\phi)} Y_m(f) , \qquad
           w_m = g_m \Big/ \sqrt{\textstyle\sum g^2} ,
 
-and z is its transform back. Near a peak z is interpolated between the outputs, in time and
-direction, whose band a windowed sinc keeps whole.
+and z is its inverse transform. Near a peak, z is interpolated in time and direction by a windowed
+sinc that preserves the band.
 
 **Loudness** of a lag is the largest :math:`|z|^2` over the directions of the scan. In noise of unit
-variance it passes h by chance at one lag, whatever the call, with no more than
+variance it exceeds h at one lag, whatever the call, with a probability of at most
 
 .. math:: P \le e^{-h} \left(1 + \sqrt{\frac{h}{\pi}} \int \sqrt{\kappa}\, d\phi \right), \qquad
           \kappa = \left(\frac{2\pi f_{rms}}{c}\right)^2
                    \sum_m w_m^2 (p_m \cdot u')^2, \qquad f_{rms}^2 = f_c^2 + (\beta / 2\pi)^2 ,
 
-as in `pipistrelle.detection.full_circle`, with the band's own root mean square frequency. That is
-the chance of one lag; lags are half the inverse of the widest band apart (`arrays.bands`), and the
-noise of two of them is as alike as the call's autocorrelation is.
+as in `pipistrelle.detection.full_circle`, with the band's root mean square frequency. Lags are
+spaced by half the inverse of the widest band (`acoustics.call.lag_step`), and the noise of two is
+correlated as the call's autocorrelation.
 
-**One call, one row.** A loud call leaves lobes at other lags: its autocorrelation's, and those of
-beams to elsewhere, which hear some microphones' peaks too early. A peak counts only where it is
-louder than what all louder ones leave there at most, their amplitudes added up: the scan's own
-answer to the call alone, as the set-up computes it, from several directions and of moving sources,
-and 3 dB more.
+**One call, one detection.** A loud call leaves lobes at other lags: of its autocorrelation, and of
+beams to other directions, in which some microphones' peaks come too early. A peak counts only if it
+exceeds the sum of the amplitudes that all louder peaks may leave there, computed in advance as the
+scan's response to the call, from several directions and with Doppler shifts, plus 3 dB.
 
-**Calls that the record cuts**, as the vehicle is deaf while it calls, are peaks at lags before its
-first or after its last. Their skirts reach into it, wider than a whole call's, for the part that is
-heard has less of the band; and a record of outputs that begins or ends amid a peak is a step, which
-a transform's brick-wall band spreads over all lags, round its ends too. So where something loud is
-near an end, outputs are taken as far as a call reaches beyond both, of samples between silence;
-peaks there hide what their cut call leaves at most, and make no rows themselves.
+**Calls only partly in the record**, as the vehicle is deaf while it calls, are peaks at lags before
+its first or after its last. Their skirts reach into the record, wider than a whole call's, as the
+received part has less of the band; and outputs that begin or end amid a peak are a step, which a
+transform spreads over all lags. So if a loud peak is near an end, outputs are computed a call's
+length beyond both ends, of samples padded with silence; peaks there mask the most that their cut
+call may leave, and are not detections themselves.
 
-**How sure.** With the power over the noise p of the beam (`pipistrelle.detection.noise`),
+**Standard deviations.** With the power over the noise p of the beam
+(`pipistrelle.detection.noise`),
 
 .. math:: \sigma_\phi^2 = \frac{1 + 1/p}{2 p \kappa}, \qquad
           \sigma_\tau^2 = \frac{1 + 1/p}{2 p \beta^2} + \left(\delta \, \frac{2 v}{c}\right)^2 / 2 ,
 
-the Cramer-Rao bounds of an unknown phase, and what a sweep takes a Doppler shift for: an echo from
-any direction, to a vehicle of the speed v of the settings. That part is noise to it: no delay is
-corrected. The square of the cosine of a direction is a half in the mean.
+the Cramer-Rao bounds with an unknown phase, and the delay error of a sweep by an unknown Doppler
+shift: the echo may come from any direction, to a vehicle at the speed v of the settings, and the
+mean square cosine of a direction is a half. No delay is corrected for it.
 
 Sources: Van Trees, Optimum Array Processing (2002), Secs. 6.13 and 8.4; Davies, Biometrika 74
 (1987).
@@ -73,55 +73,54 @@ from pipistrelle.geometry import wrap, wrap_angle
 from pipistrelle.jit import Whole, kernel, no_alloc
 
 TAPS, PARTS, BETA = 12, 256, 8.0
-"""Windowed sinc: outputs that it takes, places between two of them, shape of its Kaiser window."""
+"""Windowed sinc: number of taps, positions between two outputs, shape of its Kaiser window."""
 BEAMS_AT_ONCE = 32
-"""Beams whose outputs are in memory."""
+"""Beams whose outputs are in memory at a time."""
 MARGIN = 2.0
-"""How much louder than what a louder call leaves at most a peak must be, as a ratio of powers."""
+"""Least ratio of a peak's power to the most that louder calls leave there."""
 LOBE = 0.7
-"""A lobe this much as loud as the loudest, half a lag off, may be louder at its own time."""
+"""Least power of a lobe, relative to the loudest, that may be the loudest at its own time."""
 PARTS_CUT = 16
-"""Parts of a call that is cut, by how many of which are missing its lobes are looked up."""
+"""Number of missing shares of a call for which its lobes are tabulated."""
 SHIFT = 0.01
-"""Largest Doppler shift of the calls whose lobes the set-up looks at, as a share."""
+"""Largest Doppler shift in the table of lobes, relative."""
 _ANGLES = (0.0, 0.7, 1.3)
-"""Directions that it looks at, off a face's normal or the heading [rad]."""
+"""Directions in the table of lobes, off a face's normal or the heading [rad]."""
 
 
 class Wide(NamedTuple):
-    """A group of microphones that hear a call of a wide band, its threshold and its scan."""
+    """The detector of a wideband call in a group of microphones."""
 
     threshold: float
     """Least loudness of a call at a lag, in units of the noise of one output."""
     loudest_noise: float
-    """See `certainty.loudest_noise`."""
+    """See `noise.loudest_noise`."""
     sine_limit: float
-    """Sine of the largest angle off the normal that counts; 2 of a group that hears all around."""
+    """Sine of the largest angle off the normal that counts; 2 for an omnidirectional group."""
     normal: float
-    """Normal of a line on a face [rad]; NaN of a group that hears all around."""
+    """Normal of a line on a face [rad]; NaN for an omnidirectional group."""
     bearing: Float[np.ndarray, " n"]
     """Directions that are scanned [rad]."""
     position: Float[np.ndarray, "k 2"]
-    """Positions of the microphones, from their middle [m]."""
+    """Positions of the microphones, relative to their middle [m]."""
     middle: Float[np.ndarray, "2"]
-    """Their middle, in the vehicle's frame [m]."""
+    """Middle of the microphones, in the vehicle's frame [m]."""
     weight: Float[np.ndarray, " k"]
     """Weight of each output; the squares of all sum to 1."""
     speed_of_sound: float
-    """Speed of sound [m/s]."""
     band: Band
     doppler_std: float
     """Standard deviation of a delay, by the call's Doppler shift [s]."""
     lobes: Float[np.ndarray, " l"]
-    """Largest share of its power that a call leaves so many lags away."""
+    """Largest share of its power that a call leaves at each distance from its peak, in lags."""
     cut_lobes: Float[np.ndarray, "s l"]
-    """The same of calls of which the record holds only a part; the last row of the shortest."""
+    """The `lobes` of calls only partly in the record, a row for each missing share."""
 
 
 def wide_of(
     config: Config, layout: Layout | Scattered, group: int, calls: Sequence[Call], caller: int
 ) -> Wide:
-    """Settle threshold and scan of one call for a face, or another group."""
+    """Build the detector of a wideband call for a face, or another group."""
     rate, c = config.receiver.sample_rate, config.assumed_sound_speed
     normal, (place, gain) = float(layout.normal[group]), layout.places(group)
     weight = gain / np.linalg.norm(gain)
@@ -164,13 +163,13 @@ def find_wide(
     lags: Lags,
     around: Callable[[], Complex[np.ndarray, "n k"]] | None = None,
 ) -> tuple[Float[np.ndarray, "6 m"], Bool[np.ndarray, " m"]]:
-    """Find the calls that a group hears, one at each time.
+    """Detect the wideband calls at a group, at most one at each time.
 
-    `around`: returns the outputs also at lags where a call is only partly in the record, as many
-    more at each end; they are asked for where something loud is near an end. Returns delay at the
-    vehicle's centre [s], bearing [rad], power, the standard deviations of bearing and delay, and
-    the angle off a face's normal, or for other groups the arctangent of the bearing's slope by the
-    logarithm of the speed of sound; and which calls are wholly in the record.
+    `around`: returns the outputs also at lags at which a call is only partly in the record, equally
+    many at each end; called if a loud peak is near an end. Returns delay at the vehicle's centre
+    [s], bearing [rad], power, the standard deviations of bearing and delay, and the angle off a
+    face's normal, or for other groups the arctangent of the bearing's slope in the logarithm of the
+    speed of sound; and a mask of the calls that are wholly in the record.
     """
     if not len(matched):
         return np.empty((6, 0)), np.empty(0, dtype=bool)
@@ -203,7 +202,7 @@ def find_wide(
 def _loudness(
     matched: Complex[np.ndarray, "l k"], wide: Wide, interval: float
 ) -> Float[np.ndarray, " l"]:
-    """Return the loudest beam's power at each lag."""
+    """Return the power of the loudest beam at each lag."""
     from scipy.fft import fft, ifft, next_fast_len
 
     lags = len(matched)
@@ -223,13 +222,13 @@ def _loudness(
 
 
 def _early(wide: Wide) -> Float[np.ndarray, "n k"]:
-    """Return how much earlier than the middle each microphone hears each beam [s]."""
+    """Return the lead of each microphone over the middle for each beam [s]."""
     toward = np.stack((np.cos(wide.bearing), np.sin(wide.bearing)))
     return (wide.position @ toward).T / wide.speed_of_sound
 
 
 def _lobes_of(call: Call, wide: Wide, step: int, rate: float) -> Float[np.ndarray, " l"]:
-    """Return what a call alone leaves in the scan so many lags from its peak, at most."""
+    """Return the largest share of its power that a call leaves at each lag from its peak."""
     interval, sent = step / rate, replica(call, rate)
     reach = math.ceil(sent.size / step) + 2 * margin_of(
         wide.position, wide.speed_of_sound * interval
@@ -254,11 +253,11 @@ def _lobes_of(call: Call, wide: Wide, step: int, rate: float) -> Float[np.ndarra
 
 
 def _cut_lobes_of(call: Call, wide: Wide, step: int, rate: float) -> Float[np.ndarray, "s l"]:
-    """Return what a call that the record cuts leaves so many lags from its peak, at most.
+    """Return the largest share of power around the peak of a call that is only partly recorded.
 
-    A row for each share of the call that is missing, at its beginning or its end. A beam adds the
-    microphones' outputs, each as far from its peak as the delay of the beam is wrong, two margins
-    at most: it is no louder, beside its peak, than the loudest of them.
+    A row for each share of the call that is missing, at its beginning or its end. A beam sums the
+    microphones' outputs, each displaced by the error of the beam's delay, two margins at most: away
+    from its peak it is no louder than the loudest of them.
     """
     sent = replica(call, rate)
     margin = 2 * margin_of(wide.position, wide.speed_of_sound * step / rate)
@@ -281,7 +280,7 @@ def _cut_lobes_of(call: Call, wide: Wide, step: int, rate: float) -> Float[np.nd
 
 
 def _sinc() -> Float[np.ndarray, "p t"]:
-    """Return the windowed sinc at places between two outputs, a row each."""
+    """Return the windowed sinc at positions between two outputs, a row each."""
     away = np.arange(TAPS) - (TAPS // 2 - 1) - np.arange(PARTS + 1)[:, np.newaxis] / PARTS
     window = np.i0(BETA * np.sqrt(np.clip(1.0 - (away / (TAPS // 2)) ** 2, 0.0, None)))
     return np.sinc(away) * window / np.i0(BETA)
@@ -300,7 +299,7 @@ def _steer(
     step: float,
     beams: Complex[np.ndarray, "b n"],
 ) -> None:
-    """Write the spectra of beams, from one bin of the band to another, a step [Hz] apart."""
+    """Write the spectra of beams, from the first to the last bin, `step` [Hz] wide."""
     count = spectrum.shape[1]
     total = np.empty(last - first + 1, dtype=np.complex128)
     for b in range(early.shape[0]):
@@ -318,11 +317,7 @@ def _steer(
 
 @no_alloc
 def _left(lobes: Float[np.ndarray, " r"], away: Whole) -> float:
-    """Return the share of a call's power so many lags away.
-
-    Beyond the table it falls with the square of the time: so do the ends of a band that ends at
-    once.
-    """
+    """Return the share of a call's power at a distance of lags; extrapolated as 1 / distance^2."""
     last = lobes.size - 1
     return lobes[away] if away <= last else lobes[last] * (last / away) ** 2
 
@@ -335,10 +330,10 @@ def _peaks(
     cut_lobes: Float[np.ndarray, "s q"],
     cut: Whole,
 ) -> Int[np.ndarray, " m"]:
-    """Return the lags, the loudest first, that are louder than what louder ones leave there.
+    """Return the lags of peaks that exceed the leakage of all louder ones, the loudest first.
 
-    At so many lags of either end (`cut`) calls are only partly in the record. Loudness comes from a
-    transform: what a call leaves far away goes on at the other end.
+    At the `cut` lags of either end, calls are only partly in the record. Loudness is periodic, as
+    it comes from a transform.
     """
     peaks, count = np.empty(loudness.size, dtype=np.int64), 0
     for b in range(loudness.size):
@@ -376,7 +371,7 @@ def _output(
     interval: float,
     sinc: Float[np.ndarray, "p t"],
 ) -> tuple[float, float]:
-    """Return the power of the beam to a bearing at a lag, or between two, and what it sums."""
+    """Return the power of the beam to a bearing at a fractional lag, and the energy it sums."""
     ahead, left = math.cos(bearing), math.sin(bearing)
     total, energy = 0.0j, 0.0
     parts = sinc.shape[0] - 1
@@ -407,7 +402,7 @@ def _climb(
     interval: float,
     sinc: Float[np.ndarray, "p t"],
 ) -> tuple[float, float, float]:
-    """Return lag, bearing and power of the top of a peak near a beam."""
+    """Climb to the top of a peak near a beam; return its lag, bearing and power."""
     late = 0.5
     for _ in range(CLIMBS):
         here, _ = _output(slow, at, bearing, beam, interval, sinc)
@@ -434,8 +429,8 @@ def _top(
 ) -> tuple[float, float, float, float]:
     """Return lag, bearing and power of the loudest peak near a lag, and half the step of its beams.
 
-    The lag is not yet that of the peak, and of lobes that are nearly as loud another may be louder
-    there: the top of each is asked.
+    The lag is not yet the peak's, and another of several nearly equal lobes may be the loudest at
+    its own time: the top of each is computed.
     """
     most, beams, best = power[power.argmax()], power.size, (lag, 0.0, -1.0, 0.0)
     for n in range(beams):
@@ -459,7 +454,7 @@ def _rows(
     interval: float,
     sinc: Float[np.ndarray, "p t"],
 ) -> Float[np.ndarray, "6 m"]:
-    """Return the numbers of each peak, its delay since lag 0 [s]; `slow` has silent margins."""
+    """Return the numbers of each peak, its delay from lag 0 [s]; `slow` has silent margins."""
     numbers, beams = np.empty((6, peaks.size)), beam.bearing.size
     power, within = np.empty(beams), (float(margin), float(slow.shape[0] - margin - 1))
     for i in range(peaks.size):
@@ -494,10 +489,7 @@ def _doubles(
     interval: float,
     sinc: Float[np.ndarray, "p t"],
 ) -> float:
-    """Return the mean square of the bearing about the loudest lobe, by the odds of the others.
-
-    As `full_circle` has it; other lobes are asked at the time of the loudest.
-    """
+    """Return the mean square bearing difference to other lobes, weighted by their odds."""
     odds, square, beams = 0.0, 0.0, beam.bearing.size
     last = here = -1.0
     for n in range(beams + 1):
@@ -516,7 +508,7 @@ def _doubles(
 
 @no_alloc
 def _geometry(bearing: float, beam: Wide) -> tuple[float, float]:
-    """Return the places' variance across a bearing [m^2], and how the bearing turns with log c."""
+    """Return the positions' variance across a bearing [m^2], and the bearing's slope in log c."""
     cosine, sine = math.cos(bearing), math.sin(bearing)
     xx = xy = 0.0
     for m in range(beam.weight.size):

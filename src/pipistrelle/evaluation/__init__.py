@@ -1,9 +1,9 @@
-"""Beliefs to numbers: how far from the truth, and whether the filter knows how far.
+"""Accuracy and consistency of estimates: errors, NEES, bounds and comparisons of cases.
 
-`accuracy` measures the errors of path and map, as they are and after the rigid motion that fits
-best; `consistency` asks by the NEES whether they are as large as the filter believes, over one run
-or over many (Bradley & Abaid, Sec. V-A); `bound` is the least that any estimator could be sure of,
-and what NEES a consistent one has.
+`accuracy`: errors of path and map, also after the best rigid alignment; `association`: errors of
+labels, and GOSPA of the map; `consistency`: NEES and ANEES (Bradley & Abaid, Sec. V-A); `bound`:
+the posterior Cramér-Rao bound, and the NEES of a consistent filter; `comparison`: tests over
+worlds; `scores`: the list of all scores.
 """
 
 from lazy_loader import attach

@@ -1,4 +1,4 @@
-"""Accuracy: how far an estimated path and map are from the true ones."""
+"""Accuracy: errors of an estimated path and map, and their rigid alignment with the truth."""
 
 from dataclasses import dataclass
 
@@ -11,13 +11,13 @@ from pipistrelle.geometry import wrap
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class MapEstimate:
-    """A map with one row per landmark, in the order in which the landmarks entered it."""
+    """A map with one row per landmark, in the order of their entry."""
 
     landmark: Int[np.ndarray, " n"]
     mean: Float[np.ndarray, "n 2"]
-    """Mean [m]."""
+    """[m]."""
     covariance: Float[np.ndarray, "n 2 2"]
-    """Covariance [m^2]."""
+    """[m^2]."""
     full: Bool[np.ndarray, " n"]
     """Whether the landmark is fully initialised."""
 
@@ -25,20 +25,8 @@ class MapEstimate:
 def heaviest(landmarks: Landmarks) -> MapEstimate:
     """Represent each landmark by its heaviest hypothesis, the first of equals.
 
-    Parameters
-    ----------
-    landmarks : Landmarks of h hypotheses
-
-    Returns
-    -------
-    MapEstimate of n landmarks
-
-    Notes
-    -----
     Bradley & Abaid, Sec. V-A, "fully and partially initialize".
 
-    Examples
-    --------
     >>> landmarks = Landmarks(
     ...     landmark=np.array([7, 3, 3]),
     ...     mean=np.array([[1.0, 0.0], [2.0, 0.0], [6.0, 0.0]]),
@@ -66,11 +54,10 @@ def scored_landmarks(
     true_landmark: Int[np.ndarray, " n"],
     true_position: Float[np.ndarray, "n 2"],
 ) -> tuple[Float[np.ndarray, "m 2"], Float[np.ndarray, "m 2"]]:
-    """Pair the fully initialised landmarks with their true positions.
+    """Pair the fully initialised landmarks with their true positions, if known.
 
-    A landmark whose true position is not known is left out.
-
-    `true_landmark`: labels, each once; `true_position` [m]. Returns `estimated` [m]; `true` [m].
+    `true_landmark`: labels, each once; `true_position` [m]. Returns estimated and true positions
+    [m].
 
     Bradley & Abaid, the sums of Eq. (27).
 
@@ -98,10 +85,10 @@ def landmark_error(
     true_landmark: Int[np.ndarray, " n"],
     true_position: Float[np.ndarray, "n 2"],
 ) -> Float[np.ndarray, " h"]:
-    """Return the distance of each estimated landmark from the true one of its label.
+    """Return the distance of each estimated landmark from the true landmark of its label.
 
-    `true_landmark`: labels, each once; `true_position` [m]. Returns [m]: NaN where no true landmark
-    has the label.
+    `true_landmark`: labels, each once; `true_position` [m]. Returns [m], NaN without a true
+    landmark.
 
     >>> estimate = MapEstimate(
     ...     landmark=np.array([7, 9]),
@@ -162,27 +149,11 @@ def rmse(error: Float[np.ndarray, " n"]) -> float:
     .. math:: \mathrm{RMSE} = \sqrt{\frac{1}{N} \sum_{i=1}^{N} e_i^2}
        :label: eq-26-27
 
-    Parameters
-    ----------
-    error : (n)
-        Position errors of a path or of a map [m], heading errors [rad]; at least one. An error
-        that is not finite makes the result not finite.
+    `error`: position errors of a path or of a map [m], or heading errors [rad]. Not finite if an
+    error is not finite. Raises ValueError without errors.
 
-    Returns
-    -------
-    In the unit of the errors.
-
-    Raises
-    ------
-    ValueError
-        Without errors.
-
-    Notes
-    -----
     Bradley & Abaid, Eqs. (26) and (27).
 
-    Examples
-    --------
     >>> rmse(np.array([1.0, -7.0]))
     5.0
     """
@@ -194,7 +165,7 @@ def rmse(error: Float[np.ndarray, " n"]) -> float:
 def alignment(
     points: Float[np.ndarray, "n 2"], reference: Float[np.ndarray, "n 2"]
 ) -> Float[np.ndarray, "3"]:
-    r"""Return the rigid motion, without scale, that brings points closest to a reference.
+    r"""Return the rigid motion, without scale, that moves points closest to a reference.
 
     .. math:: \min_{\theta, t} \sum_i \lVert R(\theta) p_i + t - q_i \rVert^2: \quad
               \theta = \operatorname{atan2}\Bigl(\sum_i p'_i \times q'_i,
@@ -202,9 +173,8 @@ def alignment(
 
     with p' and q' the offsets from the means.
 
-    `points` [m]: at least one; the rotation is 0 where the points do not determine it; `reference`
-    [m]. Returns [m, m, rad]: t and theta: the pose that the origin of the points has in the
-    reference.
+    `points`, `reference` [m]: at least one; the rotation is 0 if they do not determine it. Returns
+    t and theta [m, m, rad]: the pose of the points' origin in the reference.
 
     The planar case of Umeyama (1991). In the plane a reflection cannot occur.
 
@@ -225,22 +195,9 @@ def moved(
 
     .. math:: q_i = R(\theta) p_i + t
 
-    Parameters
-    ----------
-    points : (n, 2) [m]
-    motion : (3) [m, m, rad]
-        t and theta, as `alignment` gives them.
+    `points` [m]; `motion`: t and theta [m, m, rad], as from `alignment`. The action of SE(2) on the
+    plane.
 
-    Returns
-    -------
-    (n, 2) [m]
-
-    Notes
-    -----
-    The action of SE(2) on the plane.
-
-    Examples
-    --------
     >>> moved(np.array([[1.0, 0.0]]), np.array([0.0, 2.0, np.pi / 2])).round(9)
     array([[0., 3.]])
     """

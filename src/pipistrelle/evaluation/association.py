@@ -1,8 +1,7 @@
-r"""How well rows were associated, by what truly caused them, and how well the map agrees.
+"""Errors of data association and of the map: label purity, missed and false landmarks, GOSPA.
 
-An association's labels are its own. The landmark that a label stands for is the one that caused
-most of its rows; none, where most were clutter. If the causes of rows are not known, landmarks are
-matched by their positions.
+An association has arbitrary labels. A label represents the landmark that caused most of its rows;
+none, if most were clutter. If the causes of rows are unknown, landmarks are matched by position.
 """
 
 from collections import Counter, defaultdict
@@ -17,17 +16,17 @@ from pipistrelle.estimation.beliefs import Landmarks, placed
 from pipistrelle.evaluation.accuracy import moved
 
 Causes = Sequence[Int[np.ndarray, " m"]]
-"""Of each scan what caused its rows: labels of landmarks, or UNLABELLED."""
+"""The true label of each row, or UNLABELLED, by scan."""
 OFTEN = 3
-"""In how many scans a landmark must be heard to be missed."""
+"""Fewest scans with a landmark for it to count as missed."""
 CUTOFF = 2.0
-"""Distance from which on a landmark counts as missed and another as false [m]."""
+"""Distance from which a landmark counts as missed and another as false [m]."""
 STAY = np.zeros(3)
-"""The motion that moves nothing."""
+"""The motion that leaves points unchanged."""
 
 
 def causes_of(scan: Scan, rows: Scan, cause: Int[np.ndarray, " n"]) -> Int[np.ndarray, " m"]:
-    """Return what caused the rows of a scan, some of the rows of a frame.
+    """Return the true labels of the rows of a scan, a selection of a frame's rows.
 
     >>> from pipistrelle.detection.scans import make_scan, rows_of
     >>> frame = make_scan(0.0, np.full(2, -1), np.array([0.1, 0.4]))
@@ -45,23 +44,23 @@ class Associated:
     """The landmark of each label, from the causes of rows or from positions."""
 
     names: Mapping[int, int]
-    """The landmark that each label stands for, or UNLABELLED."""
+    """The landmark that each label represents, or UNLABELLED."""
     rows: Mapping[int, int]
-    """How many rows have each label; from positions, 1 if the label is the nearest, else 0."""
+    """Number of rows with each label; from positions, 1 if the label is the nearest, else 0."""
     right: float | None
-    """Share of the rows with a label that are of the landmark it stands for."""
+    """Share of the labelled rows that are of the landmark that their label represents."""
     found: float | None
-    """Share of the rows of landmarks that have a label which stands for their landmark."""
+    """Share of the landmarks' rows with a label that represents their landmark."""
     heard: frozenset[int]
-    """Landmarks that were heard in `OFTEN` scans or more; from positions, all."""
+    """Landmarks measured in `OFTEN` scans or more; from positions, all."""
 
 
 def associated(
     labels: Sequence[Int[np.ndarray, " m"]], causes: Causes, moving: Sequence[int] = ()
 ) -> Associated:
-    """Compare labels of all scans' rows with what caused them.
+    """Compare the labels of all scans' rows with the true labels.
 
-    `moving`: callers that move, which are no landmarks.
+    `moving`: callers that move, which are not landmarks.
 
     >>> labels, causes = [np.array([1, 2]), np.array([1, -1])], [np.array([7, 9])] * 2
     >>> of = associated(labels, causes)
@@ -95,14 +94,14 @@ def associated(
 def pairs_of(
     points: Float[np.ndarray, "n 2"], true: Float[np.ndarray, "k 2"], cutoff: float = CUTOFF
 ) -> tuple[Int[np.ndarray, " m"], Int[np.ndarray, " m"], Float[np.ndarray, " m"]]:
-    """Pair points with true ones nearer than a cutoff, so that `gospa` is least.
+    """Pair points with true points nearer than a cutoff, minimising `gospa`.
 
-    Returns the rows of the points, the rows of the true ones, and the squared distances [m^2].
+    Returns the indices of the points, of the true points, and the squared distances [m^2].
 
     >>> pairs_of(np.array([[9.0, 9.0], [0.0, 1.0]]), np.zeros((1, 2)))
     (array([1]), array([0]), array([1.]))
     """
-    from scipy.optimize import linear_sum_assignment  # a quarter of a second, if not needed
+    from scipy.optimize import linear_sum_assignment  # takes a quarter of a second to load
 
     off = points[:, np.newaxis] - true
     squared = np.einsum("nke,nke->nk", off, off)
@@ -118,7 +117,7 @@ def nearest_motion(
     true: Float[np.ndarray, "k 2"],
     motions: Sequence[Float[np.ndarray, "3"]],
 ) -> Float[np.ndarray, "3"]:
-    """Return the rigid motion after which points are nearest to true ones, by `gospa`.
+    """Select the rigid motion that brings points nearest to true points, by `gospa`.
 
     >>> nearest_motion(np.ones((1, 2)), np.full((1, 2), 5.0), [STAY, np.array([4.0, 4.0, 0.0])])
     array([4., 4., 0.])
@@ -132,10 +131,10 @@ def matched(
     true_position: Float[np.ndarray, "k 2"],
     motion: Float[np.ndarray, "3"] = STAY,
 ) -> Associated:
-    """Match the placed landmarks of a map with true ones by their positions.
+    """Match the fully initialised landmarks of a map with true ones by their positions.
 
-    `motion` is applied to the map before. A landmark that has no partner in `pairs_of`, but is
-    nearer than the cutoff to a true landmark, stands for it as well: it is on the map twice.
+    `motion` is applied to the map first. A landmark without a partner in `pairs_of` that is nearer
+    than the cutoff to a true landmark represents it as well: a duplicate.
 
     >>> from pipistrelle.estimation.beliefs import Landmarks
     >>> places = np.array([[1.0, 0.0], [9.0, 0.0], [1.0, 1.0]])
@@ -162,7 +161,7 @@ def matched(
 
 
 def _nearest(point: Float[np.ndarray, "2"], true: Float[np.ndarray, "k 2"]) -> int | None:
-    """Return the number of the true point nearest to a point, within the cutoff; else None."""
+    """Return the index of the nearest true point within the cutoff; None if there is none."""
     away = np.hypot(*(true - point).T)
     near = np.flatnonzero(away < CUTOFF)
     return int(near[np.argmin(away[near])]) if near.size else None
@@ -175,10 +174,7 @@ def out_of_place(
     true_position: Float[np.ndarray, "k 2"],
     motion: Float[np.ndarray, "3"] = STAY,
 ) -> frozenset[int]:
-    """Return the labels of placed landmarks that, after a motion, are near no true landmark.
-
-    Labels that stand for a landmark whose true position is not known are left out.
-    """
+    """Return the labels of initialised landmarks that, after a motion, are not near a true one."""
     full, known = placed(landmarks), {*true_landmark.tolist()}
     labels, points = landmarks.landmark[full].tolist(), moved(landmarks.mean[full], motion)
     return frozenset(
@@ -189,10 +185,10 @@ def out_of_place(
 
 
 def renamed(landmarks: Landmarks, found: Associated) -> Landmarks:
-    """Return a map under the names of what its labels stand for.
+    """Return a map with the labels of the true landmarks.
 
-    Of labels that stand for one landmark the one with most rows has its name. The others, and
-    those that stand for none, have numbers below 0.
+    Of several labels of a landmark, the one with most rows is used. The others, and labels without
+    a landmark, become negative.
     """
     taken: set[int] = set()
     name = {}
@@ -208,22 +204,22 @@ def renamed(landmarks: Landmarks, found: Associated) -> Landmarks:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class MapCounts:
-    """Landmarks of the map against those that are there."""
+    """Numbers of missed, false and duplicate landmarks of a map."""
 
     missed: int
-    """Heard often, and not on the map."""
+    """Measured often, and not on the map."""
     false: int
-    """On the map, and none: caused by clutter, or near no true landmark."""
+    """On the map, but caused by clutter, or near no true landmark."""
     twice: int
-    """On the map under another label, too."""
+    """Already on the map under another label."""
 
 
 def map_counts(
     landmarks: Landmarks, found: Associated, away: Collection[int] = frozenset()
 ) -> MapCounts:
-    """Count missed, false and doubled landmarks among the placed ones of a map.
+    """Count missed, false and duplicate landmarks among the initialised ones of a map.
 
-    `away`: labels of landmarks that are near no true one, which stand for none (`out_of_place`).
+    `away`: labels of landmarks near no true one, which count as false (`out_of_place`).
     """
     labels = landmarks.landmark[placed(landmarks)].tolist()
     named = [UNLABELLED if n in away else found.names.get(n, UNLABELLED) for n in labels]
@@ -237,10 +233,10 @@ def map_counts(
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Gospa:
-    """The metric and its three parts."""
+    """The GOSPA metric and its three parts."""
 
     distance: float
-    """[m]"""
+    """[m]."""
     error: float
     """Root of the sum of squared distances of pairs [m]."""
     missed: int

@@ -1,15 +1,14 @@
-r"""The bound: how surely any estimator can know the vehicle's pose, from what it is given.
+"""The posterior Cramér-Rao bound of the vehicle's pose, and the NEES of a consistent filter.
 
-The posterior Cramér-Rao bound along the true path is the covariance that an extended Kalman filter
-would have with every Jacobian taken at the truth: it hangs on what was heard and on how noisy
-controls and measurements are said to be, and on no estimate. The start is exact, and landmarks are
-not known before they are heard (a flat prior). A caller that moves strays as filters
-believe that it does (`estimation.ekf.caller_motion`), from the way that it truly went. It tells two
-things:
+The bound along the true path is the covariance of an extended Kalman filter with every Jacobian at
+the truth: it depends on which landmarks were measured and on the stated noise of controls and
+measurements, not on any estimate. The start is exact, and landmarks are unknown before their first
+measurement (a flat prior). A moving caller deviates from its true path as in the filters' model
+(`estimation.ekf.filter`). It gives:
 
-- how much of an estimator's error is its own fault;
-- what NEES a consistent filter has that believes its start uncertain while it is exact: less than
-  the number of states, since part of what it allows for never happens.
+- the least error of any estimator on the same data;
+- the NEES of a consistent filter that assumes an uncertain start while the start is exact: less
+  than the number of states, as a part of the assumed error never occurs.
 """
 
 import math
@@ -50,9 +49,9 @@ from pipistrelle.jit import Whole, no_alloc, optimised_once
 IN_ONE_WORLD = (
     "The bound is the least root mean square without bias on a path: in one world luck may beat it."
 )
-"""The sentence that stands wherever a bound is shown beside errors."""
+"""Sentence shown with a bound beside errors."""
 PRIOR_STD = 20.0
-"""Of a landmark before it is heard [m]."""
+"""Standard deviation of a landmark before its first measurement [m]."""
 NO_ROUTES: Mapping[int, np.ndarray] = MappingProxyType({})
 """No caller moves."""
 
@@ -71,30 +70,29 @@ def pose_bound(
 
     .. math:: \bar P = F P F^T + U Q U^T, \qquad P^{-1} = \bar P^{-1} + H^T R^{-1} H
 
-    with F, U and H at the truth: F holds the way that the vehicle truly went in a step, and U the
-    speed and steering or turn that led it, not what was commanded. A whole path with its landmarks
-    may be turned, and nothing that is heard of it changes; with any other F the noise of the path
-    would tell of a heading that nothing tells. So would that of a caller's velocity: of one that
-    goes from b, v to b', v' in a time T,
+    with F, U and H at the truth: F uses the true motion in a step, and U the speed and steering or
+    turn that led to it, not the commanded ones. A rotation of the whole path with its landmarks
+    changes no measurement; with any other F the noise of the path would give false information
+    about the heading. The same applies to a caller's velocity: if it goes from b, v to b', v' in a
+    time T,
 
     .. math:: \delta b' = \delta b + T \delta v + J (b' - b - T v)\, \delta\theta, \qquad
               \delta v' = \delta v + J (v' - v)\, \delta\theta
 
     with J a quarter turn and :math:`\delta\theta` the error of the heading.
 
-    `controls`: as the motion model has them; `time` [s]; `path` [m, m, rad]: true poses, the start
-    first; `landmarks` [m]; `scans`: who was heard when, with a range or an excess path or without,
-    and how surely: of the measurements the standard deviations alone count. Rows of other labels
-    are left out; `routes` [m]: true places of the callers that move; `wander` [m/s]: what is known
-    of their velocities: the standard deviation of each along an axis at the start, and that of how
-    far it strays in a second. Returns [m, rad, squared]: no estimator that is without bias along
-    this path has less. Zero at the start. One that knows what paths are like may be biased along
-    each and have less in the mean: a mean of such bounds over worlds is a measure to hold errors
-    against, no bound of their mean.
+    `controls`: of the motion model; `time` [s]; `path` [m, m, rad]: true poses, the start first;
+    `landmarks` [m]; `scans`: labels, callers and standard deviations are used, but no measured
+    values, only whether there is a range or an excess path; other labels are ignored; `routes` [m]:
+    true positions of the moving callers; `wander` [m/s]: standard deviation of their initial
+    velocity per axis, and of its change in a second. Returns [m, rad, squared], zero at the start:
+    no estimator that is unbiased along this path has less. An estimator with prior knowledge of
+    paths may be biased along each and have less on average: a mean of such bounds over worlds is a
+    reference for errors, not a bound of their mean.
 
     Source: Tichavsky, Muravchik & Nehorai, IEEE Transactions on Signal Processing 46, 1998.
 
-    A standing vehicle that hears nothing stays where it was.
+    A vehicle at rest without measurements keeps its exact start:
 
     >>> motion = Motion(model="unicycle", control_std=(0.1, 0.1), noise_at_rest=False)
     >>> nowhere = np.empty(0, int), np.empty((0, 2))
@@ -113,7 +111,7 @@ def pose_bound(
     caller[~np.isin(caller, labels)] = UNLABELLED
     met = np.column_stack([label[known], np.where(caller == UNLABELLED, label[known], caller)])
     heard, first = np.unique(met, return_index=True)
-    heard = heard[np.argsort(first)]  # whom it hears first stands first, as in a filter's state
+    heard = heard[np.argsort(first)]  # by first measurement, as in a filter's state
     moving, border = heard[np.isin(heard, [*routes])].tolist(), heard[~np.isin(heard, [*routes])]
     slot = {one: number for number, one in enumerate([*border.tolist(), *moving])}
     index = np.append(
@@ -144,7 +142,7 @@ def _states(
     path: Float[np.ndarray, "t 3"],
     routes: Sequence[Float[np.ndarray, "t 2"]],
 ) -> Float[np.ndarray, "t d"]:
-    """Return pose, and place and velocity of each moving caller, that of the step that follows."""
+    """Return the pose, each moving caller's position, and its velocity in the next step."""
     states = [path]
     for route in routes:
         velocity = np.diff(route, axis=0) / np.diff(time)[:, np.newaxis]
@@ -158,10 +156,7 @@ def true_controls(
     time: Float[np.ndarray, " t"],
     path: Float[np.ndarray, "t 3"],
 ) -> Float[np.ndarray, "k c"]:
-    """Return the controls that lead along the true path; a step of zero controls keeps them.
-
-    Of poses the noise does not hang on how far they were apart, and they are as they are.
-    """
+    """Return the controls that lead along the true path; zero controls and poses are unchanged."""
     if motion.model == "poses":
         return controls
     commanded = controls.any(axis=1, keepdims=True)
@@ -169,7 +164,7 @@ def true_controls(
 
 
 def _whose(scan: Scan) -> Int[np.ndarray, " m"]:
-    """Label of the caller of each row's excess path; UNLABELLED for a row without one."""
+    """Return the label of the caller of each row's excess path; UNLABELLED without one."""
     who, timings = np.full(len(scan.landmark), UNLABELLED), timings_of(scan)
     if timings is not None:
         heard = excess_paths(columns_of(scan), timings)
@@ -186,10 +181,7 @@ def _write_transition(
     motion: MotionNumbers,
     walk_std: float,
 ) -> None:
-    """Write F and Q of the true step to k: of the pose, and of moving callers.
-
-    A caller's velocity turns with the heading, as far as it truly changed.
-    """
+    """Write F and Q of the true step to k, for the pose and moving callers."""
     F, Q, (steered, seconds) = work.F, work.Q, control
     write_identity(F)
     Q[:] = 0.0
@@ -219,10 +211,10 @@ def _bound(
     rows: Arrays,
     heard: Int[np.ndarray, "t 3"],
 ) -> Float[np.ndarray, "t 3 3"]:
-    """Eliminate along the true path, as the smoother does along its own; return each pose's bound.
+    """Eliminate along the true path, as the smoother does; return the bound of each pose.
 
-    ``driven``: true controls and their durations; ``heard``: of each step the first row, the one
-    after the last, and how many columns of the border have been heard.
+    ``driven``: true controls and their durations; ``heard``: for each step the first row, the row
+    after the last, and the number of separator columns measured so far.
     """
     (steps, d), n = at.shape, border.size
     places, rows, work = Places(*places), Rows(*rows), work_of(d, n, 0)
@@ -261,8 +253,8 @@ def path_bound(bound: Float[np.ndarray, "t 3 3"]) -> tuple[float, float]:
     .. math:: \sqrt{\tfrac1K \sum_k (B_k)_{xx} + (B_k)_{yy}}, \qquad
               \sqrt{\tfrac1K \sum_k (B_k)_{\theta\theta}}
 
-    `bound` [m, rad, squared]: as `pose_bound` gives it; the start is not counted. Returns
-    `position, heading` [m], [rad]: zero of a path without a step.
+    `bound` [m, rad, squared]: from `pose_bound`; the start is not counted. Returns position [m] and
+    heading [rad]: zero for a path without a step.
 
     >>> path_bound(np.stack([np.zeros((3, 3)), np.diag([9.0, 16.0, 1.0])]))
     (5.0, 1.0)
@@ -278,19 +270,19 @@ def bound_of_drawn_start(
     path: Float[np.ndarray, "t 3"],
     start_covariance: Float[np.ndarray, "3 3"],
 ) -> Float[np.ndarray, "t 3 3"]:
-    r"""Return the bound of the pose where the start is not exact, but drawn.
+    r"""Return the bound of the pose if the start is not exact, but drawn from a distribution.
 
     .. math:: P_k = B_k + G_k P_0 G_k^T, \qquad
               G_k = \begin{pmatrix} 1 & 0 & y_0 - y_k \\ 0 & 1 & x_k - x_0 \\ 0 & 0 & 1
               \end{pmatrix}
 
-    What is heard is relative to the vehicle, so an error of the start is never noticed: it moves
-    and turns the whole path.
+    Measurements are relative to the vehicle, so an error of the start is unobservable: it moves and
+    rotates the whole path.
 
-    `bound` [m, rad, squared]: b, as `pose_bound` gives it; `path` [m, m, rad]: true poses;
-    `start_covariance` [m, rad, squared]: p_0. Returns [m, rad, squared].
+    `bound` [m, rad, squared]: B, from `pose_bound`; `path` [m, m, rad]: true poses;
+    `start_covariance` [m, rad, squared]: P_0. Returns [m, rad, squared].
 
-    A heading that is off by 0.1 rad puts what is 10 m ahead a metre aside.
+    A heading error of 0.1 rad moves a point 10 m ahead by a metre:
 
     >>> path, turned = np.array([[0.0, 0, 0], [10, 0, 0]]), np.diag([0.0, 0.0, 0.01])
     >>> float(bound_of_drawn_start(np.zeros((2, 3, 3)), path, turned)[1, 1, 1])
@@ -309,22 +301,22 @@ def nees_of_exact_start(
 ) -> tuple[Float[np.ndarray, " t"], Float[np.ndarray, " t"]]:
     r"""Return mean and variance of a consistent filter's NEES if its start is in fact exact.
 
-    A filter that allows for an error of the start with P_0 has the covariance P_k of
-    `bound_of_drawn_start` at step k; that of its errors, here, is the B_k of an exact start. So
+    A filter that assumes P_0 for an error of the start has the covariance P_k of
+    `bound_of_drawn_start` at step k; the covariance of its errors is the B_k of an exact start. So
 
     .. math:: E[\epsilon_k] = \operatorname{tr} P_k^{-1} B_k, \qquad
               \operatorname{Var}[\epsilon_k] = 2 \operatorname{tr} (P_k^{-1} B_k)^2,
 
-    not 3 and 6, as where the start is drawn from P_0: the NEES is a sum of squares of normal
-    numbers whose variances are the eigenvalues of :math:`P_k^{-1} B_k`, all below one.
+    not 3 and 6, as for a start drawn from P_0: the NEES is a sum of squares of normal numbers with
+    the eigenvalues of :math:`P_k^{-1} B_k`, all below one, as variances.
 
-    `bound` [m, rad, squared]: b, as `pose_bound` gives it; `path` [m, m, rad]: true poses;
-    `start_covariance` [m, rad, squared]: p_0; zero, and the mean is the rank of B.
+    `bound` [m, rad, squared]: B, from `pose_bound`; `path` [m, m, rad]: true poses;
+    `start_covariance` [m, rad, squared]: P_0; if it is zero, the mean is the rank of B.
 
     Bradley & Abaid, Eq. (23), compare with 3, though their filters begin "matching the vehicle's
     initial state" with a P_0 (Sec. IV).
 
-    As uncertain as the start alone: half of each of three numbers.
+    With a bound equal to P_0: half of each of three numbers.
 
     >>> mean, variance = nees_of_exact_start(np.eye(3)[None], np.zeros((1, 3)), np.eye(3))
     >>> mean, variance

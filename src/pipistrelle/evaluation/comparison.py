@@ -93,7 +93,7 @@ class Finding:
     """`mean` and `std`: of the sample; NaN if it is too small. Of two samples the difference of the
     means, and the standard deviation of a single sample with the same standard error."""
     alone: tuple[float, float]
-    """t interval of this mean by itself."""
+    """t interval of this mean, without correction."""
     family: tuple[float, float]
     """Bonferroni's interval: those of a family hold together."""
     interval: tuple[float, float]
@@ -240,7 +240,7 @@ def _by_key(
 
 
 def judge(statements: Sequence[Statement], confidence: float = 0.95) -> tuple[Finding, ...]:
-    """Judge a family of statements together.
+    """Test a family of statements together.
 
     A statement of absence ("not above", "slightly above") holds only if the family could have
     detected a mean of one standard deviation of the sample: half the width of its widest interval,
@@ -297,7 +297,7 @@ def judge(statements: Sequence[Statement], confidence: float = 0.95) -> tuple[Fi
 
 
 def holm(p: Float[np.ndarray, " m"]) -> Float[np.ndarray, " m"]:
-    r"""Return the Holm-adjusted p values of a family.
+    r"""Return the Holm-adjusted p values of a family, in the given order.
 
     .. math:: \tilde p_{(r)} = \min\bigl(1, \max_{s \le r} (m - s + 1) \, p_{(s)}\bigr)
 
@@ -319,8 +319,6 @@ def pooled_std(first: Float[np.ndarray, " n"], second: Float[np.ndarray, " m"]) 
     r"""Return the pooled standard deviation of two samples of equal weight.
 
     .. math:: \sigma = \sqrt{(s_1^2 + s_2^2) / 2}
-
-    `first`, `second`: at least two numbers each.
 
     >>> pooled_std(np.array([0.0, 2.0]), np.array([5.0, 5.0]))
     1.0
@@ -382,7 +380,7 @@ def _sample_moments(label: str, numbers: Float[np.ndarray, " n"]) -> tuple[int, 
 
 
 def _half_width(moments: tuple[float, float, float], tail: float) -> float:
-    """Return the half-width of the t interval that leaves this much outside on each side."""
+    """Return the half-width of the t interval with a probability of `tail` on each side."""
     from scipy.special import stdtrit
 
     n, _, std = moments
@@ -392,7 +390,7 @@ def _half_width(moments: tuple[float, float, float], tail: float) -> float:
 def _lower_bounds(
     samples: Sequence[tuple[float, float, float]], edges: Sequence[float], alpha: float
 ) -> tuple[Float[np.ndarray, " m"], Float[np.ndarray, " m"]]:
-    """Bound means from below and return Holm-adjusted p values of not being above their edges."""
+    """Return lower bounds of means, and Holm-adjusted p values of not exceeding their edges."""
     from scipy.special import stdtr
 
     p = np.ones(len(samples))
@@ -419,7 +417,7 @@ def _verdict(
     tail: float,
     resolved: bool,
 ) -> tuple[bool | None, float]:
-    """Decide a statement by the p values of its edges, the opposite's edges last."""
+    """Decide a statement from the p values of its edges, the opposite's edges last."""
     _, mean, std = moments
     above, below = p_low <= tail, p_high <= tail
     p = min(1.0, 2.0 * float(min(p_low[0], p_high[0])))

@@ -1,4 +1,4 @@
-"""Consistency: whether a filter's covariance tells how far it is from the truth."""
+"""Consistency of covariance and errors: NEES, ANEES, divergence, stray landmarks."""
 
 import math
 from collections.abc import Sequence
@@ -22,28 +22,14 @@ def nees(
     .. math:: \epsilon_k = (\hat x_k - x_k)^T P_k^{-1} (\hat x_k - x_k)
        :label: eq-23
 
-    Solved by elimination: the sum of the squared residuals over the pivots.
+    `error` (*n, d): estimated minus true state, angles wrapped; `covariance` (*n, d, d): symmetric.
+    Computed by elimination, as the sum of the squared residuals over the pivots. Chi-square with d
+    degrees of freedom if the filter is consistent. Infinite, never NaN, if the covariance is not
+    positive definite to working precision or an entry is not finite: divergence is a result, not an
+    error.
 
-    Parameters
-    ----------
-    error : (*n, d)
-        Estimated minus true state, angles wrapped.
-    covariance : (*n, d, d)
-        Symmetric; in the units of the error, squared.
-
-    Returns
-    -------
-    (*n)
-        Chi-square with d degrees of freedom where the filter is consistent. Infinite, and never
-        NaN, where the covariance is not positive definite to working precision or where an entry
-        is not finite: divergence is a result, not an error.
-
-    Notes
-    -----
     Bradley & Abaid, Eq. (23).
 
-    Examples
-    --------
     >>> nees(np.array([2.0, 1.0]), np.diag([4.0, 0.5]))
     array(3.)
     >>> nees(np.array([2.0, 1.0]), np.diag([4.0, 0.0]))
@@ -56,7 +42,7 @@ def nees(
 def _eliminated(
     error: Float[np.ndarray, "*n d"], covariance: Float[np.ndarray, "*n d d"]
 ) -> tuple[Float[np.ndarray, "*n"], Bool[np.ndarray, "*n"]]:
-    """Solve for the NEES; tell which covariances are positive definite."""
+    """Compute the NEES by elimination, and whether each covariance is positive definite."""
     r = np.array(error, dtype=np.float64)
     P = np.array(covariance, dtype=np.float64)
     d = r.shape[-1]
@@ -75,16 +61,15 @@ def _eliminated(
 
 @np.errstate(over="ignore", invalid="ignore")
 def track_nees(pose: Gaussian, true: Float[np.ndarray, "k 3"]) -> Float[np.ndarray, " k"]:
-    """Return the NEES of each pose of a track; NaN where it is not defined.
+    """Return the NEES of each pose of a track; NaN if it is undefined.
 
-    After an exact start the noise of the first control step, of rank 2, leaves the covariance
-    singular. That is no divergence: the NEES begins where the covariance is positive definite.
+    After an exact start, the noise of the first control step has rank 2 and leaves the covariance
+    singular. This is not divergence: the NEES begins with the first positive definite covariance.
 
-    `pose` [m, m, rad]: where it is ``invariant``, the error is the right-invariant one about the
-    first position; `true` [m, m, rad]: NaN where it is not known. Returns NaN where the truth is
-    not known and before the first positive definite covariance; elsewhere as `nees` says. Infinite
-    also where a covariance is not finite, becomes singular later, or is singular in a track that
-    has none that is positive definite.
+    `pose` [m, m, rad]: with ``invariant``, errors are right-invariant about the first position;
+    `true` [m, m, rad]: NaN if unknown. Returns NaN without truth and before the first positive
+    definite covariance; elsewhere as `nees`. Infinite also if a covariance is not finite, becomes
+    singular later, or no covariance of the track is positive definite.
 
     Bradley & Abaid, Eq. (23).
 
@@ -104,10 +89,10 @@ def track_nees(pose: Gaussian, true: Float[np.ndarray, "k 3"]) -> Float[np.ndarr
 def _right_invariant(
     pose: Gaussian, error: Float[np.ndarray, "k 3"]
 ) -> tuple[Float[np.ndarray, "k 3"], Float[np.ndarray, "k 3 3"]]:
-    r"""Turn linear errors and their covariances into right-invariant ones about the first position.
+    r"""Convert linear errors and covariances to right-invariant ones about the first position.
 
-    With positions from there, :math:`\hat p = R(\xi_\theta) p + V(\xi_\theta) \xi_p`; the error
-    that takes the estimate to the truth, as the filter has it, is the negative one.
+    With positions relative to it, :math:`\hat p = R(\xi_\theta) p + V(\xi_\theta) \xi_p`; the
+    filter's error, from estimate to truth, is the negative.
     """
     shift, turn = pose.mean[:, :2] - pose.mean[0, :2], error[:, 2]
     true_x, true_y = (shift - error[:, :2]).T
@@ -121,26 +106,15 @@ def _right_invariant(
 
 
 def anees(nees: Float[np.ndarray, "n k"]) -> Float[np.ndarray, " k"]:
-    r"""Average NEES over runs, step by step.
+    r"""Average the NEES over runs, step by step.
 
     .. math:: \bar\epsilon_k = \frac{1}{N} \sum_{i=1}^{N} \epsilon_{i_k}
        :label: eq-24
 
-    Parameters
-    ----------
-    nees : (n, k)
-        One row per run; at least one. An infinite NEES makes its step infinite.
+    `nees` (n, k): a row per run, at least one. An infinite NEES makes its step infinite.
 
-    Returns
-    -------
-    (k)
-
-    Notes
-    -----
     Bradley & Abaid, Eq. (24).
 
-    Examples
-    --------
     >>> anees(np.array([[2.0, 3.0], [4.0, 3.0]]))
     array([3., 3.])
     """
@@ -148,32 +122,17 @@ def anees(nees: Float[np.ndarray, "n k"]) -> Float[np.ndarray, " k"]:
 
 
 def anees_bounds(runs: int, confidence: float = 0.95, states: int = 3) -> tuple[float, float]:
-    r"""Return the interval that holds the ANEES of a consistent filter with a given probability.
+    r"""Return the interval that contains the ANEES of a consistent filter with a given probability.
 
     .. math:: \epsilon_1 = \chi^2_{N N_x}(C / 2) / N, \qquad
               \epsilon_2 = \chi^2_{N N_x}(1 - C / 2) / N, \qquad C = 1 - \mathrm{confidence}
        :label: eq-25
 
-    Below it the filter is under-confident, above it over-confident.
+    Below it the filter is under-confident, above it over-confident. `runs`: N independent runs, at
+    least 1; `confidence`: between 0 and 1; `states`: N_x, length of the error. Returns low, high.
 
-    Parameters
-    ----------
-    runs : N, at least 1
-        Independent runs in the average.
-    confidence : between 0 and 1
-    states : N_x, at least 1
-        Length of the error.
-
-    Returns
-    -------
-    low, high
-
-    Notes
-    -----
     Bradley & Abaid, Eq. (25).
 
-    Examples
-    --------
     >>> low, high = anees_bounds(107)
     >>> round(low, 2), round(high, 2)
     (2.55, 3.48)
@@ -190,16 +149,16 @@ def anees_bounds_about(
     runs: int,
     confidence: float = 0.95,
 ) -> tuple[Float[np.ndarray, "*k"], Float[np.ndarray, "*k"]]:
-    r"""Return the interval of a consistent filter's ANEES by mean and variance of its NEES.
+    r"""Return the interval of a consistent filter's ANEES from mean and variance of its NEES.
 
     As after an exact start (`evaluation.bound.nees_of_exact_start`). A weighted sum of chi-squares
-    is taken as the gamma distribution of the same mean m and variance v, which for equal weights it
-    is:
+    is approximated by the gamma distribution of the same mean m and variance v, exact for equal
+    weights:
 
     .. math:: \Gamma\left(\text{shape } \frac{N m^2}{v}, \text{scale } \frac{v}{N m}\right)
 
-    `mean`, `variance`: of one run's NEES; 3 and 6 make `anees_bounds`. Of a mean of 0, nothing is
-    between.
+    `mean`, `variance`: of one run's NEES; 3 and 6 give `anees_bounds`. A mean of 0 gives an empty
+    interval.
 
     Source: Welch, Biometrika 29, 1938; Satterthwaite, Biometrics Bulletin 2, 1946.
 
@@ -207,7 +166,7 @@ def anees_bounds_about(
     >>> low.round(2), high.round(2)
     (array([1.89]), array([2.61]))
     """
-    from scipy.special import gammaincinv  # scipy.stats says the same, and loads for a second
+    from scipy.special import gammaincinv  # scipy.stats gives the same, and loads for a second
 
     tail = (1.0 - confidence) / 2.0
     with np.errstate(divide="ignore", invalid="ignore"):
@@ -217,26 +176,12 @@ def anees_bounds_about(
 
 
 def diverged(nees: Float[np.ndarray, " k"], limit: float) -> bool:
-    r"""Tell whether a run has diverged: any NEES is above the limit or not finite.
+    r"""Return whether a run has diverged: any NEES is above the limit or not finite.
 
     .. math:: \max_k \epsilon_k > \epsilon_{max}
 
-    Parameters
-    ----------
-    nees : (k)
-    limit : float
-        The estimator's, as `estimation.catalogue` has it.
+    `limit`: the estimator's, from `estimation.catalogue`. Bradley & Abaid, Sec. V-A.
 
-    Returns
-    -------
-    bool
-
-    Notes
-    -----
-    Bradley & Abaid, Sec. V-A.
-
-    Examples
-    --------
     >>> diverged(np.array([3.0, 49.0]), 50.0), diverged(np.array([3.0, np.nan]), 50.0)
     (False, True)
     """
@@ -244,36 +189,25 @@ def diverged(nees: Float[np.ndarray, " k"], limit: float) -> bool:
 
 
 CHANCE = 1e-3
-"""Probability that a sound track has a landmark that seems to have strayed."""
+"""Probability of a false report of a stray landmark in a sound track."""
 
 
 def strayed_landmarks(
     track: Track, scans: Sequence[Scan], gate: float, share: float
 ) -> dict[int, tuple[float, float, int]]:
-    r"""Return landmarks of which many successive measurements are far from the final map and path.
+    r"""Return landmarks with many consecutive measurements far from the final map and path.
 
     A bearing, with its range if any, is far if its squared residual exceeds the bound of the gate,
 
     .. math:: d^2 = \nu^T (H_x P_x H_x^T + H_m P_m H_m^T + R)^{-1} \nu
 
-    with the covariances of pose and landmark by themselves. If a share p of sound measurements is,
-    of N measurements n in a row are with a probability below N p^n.
+    with the covariances of pose and landmark taken as independent. If a share p of sound
+    measurements is far, n of N measurements in a row are far with a probability below N p^n.
 
-    Parameters
-    ----------
-    track : Track
-    scans : sequence of Scan
-        With labels and standard deviations.
-    gate : float
-        Share of a predicted distribution that is accepted, below 1.
-    share : float
-        Share of sound measurements that are far: 1 - gate, and more with outliers.
-
-    Returns
-    -------
-    dict of label to (float, float, int)
-        Of the longest such sequence, where chance is below `CHANCE`: the times of its first and its
-        last measurement [s], and how many they are.
+    `scans` have labels and standard deviations; `gate`: probability that a measurement is accepted,
+    below 1; `share`: p, 1 - gate, and more with outliers. Returns, for the longest sequence of each
+    label if less likely than `CHANCE`, the times of its first and last measurement [s] and its
+    length.
     """
     label = np.concatenate([np.empty(0, np.int64), *(scan.landmark for scan in scans)])
     time = np.repeat([scan.time for scan in scans], [scan.landmark.size for scan in scans])
@@ -295,7 +229,7 @@ def strayed_landmarks(
 def _residuals(
     track: Track, label: np.ndarray, time: np.ndarray, scans: Sequence[Scan]
 ) -> tuple[Float[np.ndarray, " m"], np.ndarray]:
-    """Return the squared residual of each row, and of how many numbers it is; 0 off the map."""
+    """Return each measurement's squared residual and its dimension; 0 if not on the map."""
     known = some_of(track.landmarks, placed(track.landmarks))
     order = np.argsort(known.landmark)
     at = np.searchsorted(known.landmark[order], label).clip(0, max(order.size - 1, 0))

@@ -1,8 +1,7 @@
-"""The scores of an estimate: `SCORES` is their only list.
+"""The scores of an estimate: title, unit, digits and places of each.
 
-Terminal tables, comparisons, reports, figures and notebooks read title, unit and digits here, and
-whether they show a score at all. To add a score, compute it (`experiments.results.scores`) and
-give it a line here.
+Tables, comparisons, reports, figures and notebooks read them from `SCORES`. To add a score, compute
+it (`experiments.results.scores`) and add an entry here.
 """
 
 from dataclasses import dataclass
@@ -10,32 +9,32 @@ from typing import Literal
 
 Place = Literal["mission", "missions", "studies", "effects", "levels", "cases", "notebook"]
 """Where a score is shown: the table of `run` and `slam`; `compare` of missions; `compare` of
-studies, as a table and a panel; a report's effects and cases; a report's charts over a variable;
-a report's cases, as a mean alone; the table that a notebook shows of a mission."""
+studies, as a table and a panel; a report's effects and cases; a report's charts over a
+variable; a report's cases, only as a mean; a notebook's table of a mission."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Score:
-    """How a score is called and printed, and where."""
+    """Title, unit and format of a score, and the places that show it."""
 
     title: str
-    """Without its unit, as it also stands in a sentence."""
+    """Without its unit, as in a sentence."""
     unit: str = ""
     """"m", "rad", "landmarks" or nothing."""
     digits: int
     """Decimals of one mission's score."""
     mean_digits: int | None = None
-    """Decimals of a mean over worlds, where those are others."""
+    """Decimals of a mean over worlds; None: `digits`."""
     ratio: bool = False
-    """Two of them are compared by their ratio: a score that is never negative and spans decades."""
+    """Whether it is compared by ratio: never negative, and over decades."""
     bound: str = ""
-    """The score that holds its lower bound."""
+    """The score of its lower bound; empty if it has none."""
     shown: frozenset[Place] = frozenset()
-    """Every score is in ``summary.json``, in a study's tables and in a comparison's files."""
+    """Places that show it; all files contain every score."""
 
 
 def _in(*places: Place) -> frozenset[Place]:
-    """Return a set of places."""
+    """Return a set of display places."""
     return frozenset(places)
 
 
@@ -117,16 +116,14 @@ SCORES = {
     "diverged": Score(title="diverged", digits=0, shown=_in("missions")),
     "wall_s": Score(title="time of the filter", unit="s", digits=2, shown=_in("missions")),
 }  # fmt: skip
-"""Every score by its name in ``summary.json`` and in tables, in the order in which it is shown."""
+"""Every score by its name in ``summary.json`` and in tables, in the order of display."""
 NOT_MEANS = frozenset(("diverged", "gated", "wall_s"))
-"""Scores of which a mean over worlds says nothing of the estimate."""
+"""Scores without a meaningful mean over worlds."""
 
 
 def shown_in(place: Place) -> dict[str, Score]:
     """Return the scores that a place shows.
 
-    Examples
-    --------
     >>> list(shown_in("studies"))[:2]
     ['position_rmse_m', 'heading_rmse_rad']
     """
@@ -136,8 +133,6 @@ def shown_in(place: Place) -> dict[str, Score]:
 def heading(score: Score) -> str:
     """Return a score's title with its unit.
 
-    Examples
-    --------
     >>> heading(SCORES["position_rmse_m"]), heading(SCORES["landmarks_full"])
     ('position RMSE [m]', 'landmarks placed')
     """

@@ -1,6 +1,7 @@
 """Recorded logs: a drive as files, whatever wrote them.
 
-A `recording` is what every format comes to: controls and scans. `text_tables` reads columns of
-numbers, `folder` this project's own folders, `mrclam` those of UTIAS MRCLAM; `readers` finds, of
-all formats, the one of a folder.
+Every format is read into a `recording.Log` of controls and scans: `folder` reads this project's log
+folders and UTIAS MRCLAM sets, `bag`, `bag_messages` and `bag_log` read ROS bags, and
+`live_messages` single ROS messages. `readers` lists the formats; `vehicle` holds the keys of
+``log.toml``, `poses` the motion between poses, `text_tables` the parser of columns of numbers.
 """

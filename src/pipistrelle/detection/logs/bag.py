@@ -1,14 +1,12 @@
-"""ROS bags, opened without ROS: which topics they hold, and the messages of some.
+"""ROS bags without ROS: list the topics of a bag and read messages, with bounded memory.
 
-ROS 1 files (.bag) and those of ROS 2 (.mcap, .db3, and their folders) are read by the package
-rosbags, of the extra ``ros``. `bag_definitions` says by which types messages are decoded. What
-parses a file's bytes may fail in any way, and each failure is refused with the file and topic.
+ROS 1 files (.bag) and ROS 2 files and folders (.mcap, .db3) are read by the package rosbags, of the
+extra ``ros``; `bag_messages` defines the message types. Parsers of a file's bytes may fail in any
+way, and each failure becomes an error that names the file and topic.
 
-What a bag's compressed parts may unpack to: a few bytes can claim to be gigabytes.
-
-rosbags unpacks a chunk or a message whole, however large it becomes, and a compressed file of a
-folder into the temporary folder. While a bag is open, its decompressors stop at a largest size. An
-older rosbags, which has other decompressors, unpacks without a limit.
+A few compressed bytes can claim to be gigabytes. rosbags unpacks a chunk or a message whole, and a
+compressed file of a folder into the temporary folder. While a bag is open, its decompressors stop
+at a largest size. Older versions of rosbags, with other decompressors, unpack without a limit.
 """
 
 import bz2
@@ -29,16 +27,16 @@ from pipistrelle.files import check_ordinary
 from pipistrelle.refusals import meant, refusal, shown
 
 MOST_UNPACKED = 128_000_000
-"""Of a chunk or a message [bytes]; writers make chunks of 1 to 4 MB, of more than one message."""
+"""Largest unpacked chunk or message [bytes]; writers make chunks of 1 to 4 MB."""
 ROOM = 0.5
-"""Share of the free room of the temporary folder that a compressed file may take."""
+"""Share of the temporary folder's free space that a compressed file may take."""
 MOST_FRAMES = 100
-"""Of compressed data that follow one another in a chunk or a message; writers make one."""
+"""Most consecutive frames of compressed data in a chunk or a message; writers make one."""
 
 
 @contextmanager
 def bounded_unpacking() -> Iterator[None]:
-    """Let rosbags unpack so much and no more; its own functions are put back at the end."""
+    """Limit the size that rosbags unpacks, by replacing its decompressors while in the context."""
     try:
         from lz4.frame import LZ4FrameDecompressor
         from rosbags.rosbag1.reader import decompressors as of_first
@@ -70,7 +68,7 @@ def bounded_unpacking() -> Iterator[None]:
 
 
 def _unpacked(make: Callable[[], Any], data: bytes, _: int = 0) -> bytes:
-    """Unpack all frames that follow one another; the size that a chunk claims is compared later."""
+    """Unpack all consecutive frames of compressed data; raise if they exceed `MOST_UNPACKED`."""
     whole, left = b"", data
     for _ in range(MOST_FRAMES):
         frame = make()
@@ -85,18 +83,18 @@ def _unpacked(make: Callable[[], Any], data: bytes, _: int = 0) -> bytes:
 
 
 class _File:
-    """A compressed file that is read while it takes not too much of the room that there is."""
+    """A compressed file that raises if it unpacks to more than a share of the free space."""
 
     def __init__(self, file: Any) -> None:
         self._file = file
         self._left = ROOM * shutil.disk_usage(gettempdir()).free
 
     def __enter__(self) -> "_File":
-        """Lend it."""
+        """Return the file."""
         return self
 
     def __exit__(self, *_: object) -> None:
-        """Close it."""
+        """Close the file."""
         self._file.close()
 
     def read(self, size: int = -1) -> bytes:
@@ -114,9 +112,9 @@ if TYPE_CHECKING:
     from rosbags.interfaces import Connection
 
 BAGS = (".bag", ".mcap", ".db3")
-"""Endings of the names of ROS bags: the first of ROS 1, the others of ROS 2."""
+"""Suffixes of ROS bags: the first of ROS 1, the others of ROS 2."""
 MOST_METADATA = 1_000_000
-"""Of what a folder says of its files [bytes]; more would take minutes to read."""
+"""Largest metadata file of a folder [bytes]; a larger file would take minutes to read."""
 
 
 class Message(NamedTuple):
@@ -124,9 +122,9 @@ class Message(NamedTuple):
 
     topic: str
     number: int
-    """Its place in the topic, from 1 on."""
+    """Number in the topic, from 1."""
     received: float
-    """When it was received, or written [s]."""
+    """Time of reception, or of writing [s]."""
     content: Any
 
 
@@ -136,15 +134,15 @@ class Topic:
 
     name: str
     type: str
-    """The name of its messages' type, with ``/msg/``; of several types, all of them."""
+    """Name of its messages' type, with ``/msg/``; all names, if it has several types."""
     count: int
-    """How many messages it has."""
+    """Number of messages."""
     span: tuple[float, float] | None = None
-    """When the first and the last were received [s], where that was looked at."""
+    """Times of reception of the first and last message [s]; None if they were not read."""
 
 
 class Bag:
-    """A bag that is open."""
+    """An open bag."""
 
     def __init__(self, path: Path, reader: Any) -> None:
         self.path = path
@@ -166,7 +164,7 @@ class Bag:
         }
 
     def seen(self) -> list[Topic]:
-        """List the topics with what is in the bag of each, all messages passed once."""
+        """List the topics with their message counts and times, after a pass over all messages."""
         found: dict[str, tuple[int, int, int]] = {}
         with faults_named(str(self.path)):
             for connection, stamp, _ in self._reader.messages():
@@ -180,7 +178,7 @@ class Bag:
         ]
 
     def messages(self, names: Iterable[str]) -> Iterator[Message]:
-        """Read the messages of some topics as they were received, one at a time."""
+        """Yield the messages of some topics in the order of reception."""
         wanted = [one for name in names for one in self._by_topic.get(name, ())]
         if not wanted:
             return
@@ -203,10 +201,7 @@ class Bag:
             yield Message(topic, count[topic], stamp / 1e9, content)
 
     def _check_whole(self, count: dict[str, int]) -> None:
-        """Refuse a bag in which fewer messages were found than it says.
-
-        rosbags passes over those whose topic a folder's metadata and files describe in unlike ways.
-        """
+        """Raise if fewer messages were found than the bag counts; rosbags skips some."""
         for name, found in count.items():
             said = sum(one.msgcount for one in self._by_topic[name])
             if found < said:
@@ -215,7 +210,7 @@ class Bag:
                 raise refusal(where, f"{found} messages", f"the {said} that the bag counts", fix)
 
     def checked(self, name: str, types: Iterable[str], option: str) -> str:
-        """Return a topic that an option names; refuse one that is not there or of no use."""
+        """Return a topic that an option names; raise if the bag lacks it or its type is wrong."""
         topics, where = self.topics, f"{self.path}, option {option}"
         if name not in topics:
             near = meant(name, topics)
@@ -229,7 +224,7 @@ class Bag:
 
 @contextmanager
 def opened(path: Path) -> Iterator[Bag]:
-    """Open a bag, or refuse what is none.
+    """Open a bag; raise if the path is not a readable bag.
 
     >>> with opened(Path("nowhere.mcap")):
     ...     pass
@@ -259,10 +254,10 @@ def storages(folder: Path) -> list[Path]:
 
 
 def complete_index(storages: Iterable[Any]) -> None:
-    """Let rosbags read all chunks of an MCAP file whose index names fewer messages than it has.
+    """Make rosbags read all chunks of an MCAP file if its index counts too few messages.
 
-    rosbags passes over a chunk in which the index counts no message of a topic; the index of a
-    chunk is optional. It reads a file without chunks in its index record by record.
+    rosbags skips a chunk whose index counts no message of a topic, but that index is optional. If
+    the file's index lacks a chunk, rosbags is made to read the file record by record.
     """
     for storage in storages:
         if not (chunks := getattr(storage, "chunks", None)):
@@ -280,7 +275,7 @@ def complete_index(storages: Iterable[Any]) -> None:
 
 
 def need_rosbags(where: str) -> None:
-    """Refuse what needs rosbags where it is not installed."""
+    """Raise if rosbags is not installed."""
     try:
         import rosbags.rosbag1
         import rosbags.rosbag2  # noqa: F401
@@ -292,7 +287,7 @@ def need_rosbags(where: str) -> None:
 
 
 def _storage(path: Path) -> Path:
-    """Return what is to be opened: the path, or the only file of a folder without metadata."""
+    """Return the path to open: the given path, or the only file of a folder without metadata."""
     if not path.exists():
         found = "a link to no file" if path.is_symlink() else "no such file"
         raise refusal(path, found, "a ROS bag", "check the path")
@@ -315,7 +310,7 @@ def _storage(path: Path) -> Path:
 
 @contextmanager
 def faults_named(where: str) -> Iterator[None]:
-    """Refuse whatever fails in here, which reads what somebody else wrote, and say where."""
+    """Turn any failure in the context into an error that names the place."""
     try:
         yield
     except InputError as error:
@@ -332,7 +327,7 @@ _MEND = "mend it (`ros2 bag reindex`, `mcap recover`, `rosbag reindex`), or reco
 
 
 def _decoder(connection: "Connection") -> Callable[[bytes], Any]:
-    """Return what reads the messages of a connection."""
+    """Return the function that decodes the messages of a connection."""
     from rosbags.interfaces import ConnectionExtRosbag1, MessageDefinitionFormat
 
     first, name = isinstance(connection.ext, ConnectionExtRosbag1), connection.msgtype

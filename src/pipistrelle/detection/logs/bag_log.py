@@ -1,13 +1,10 @@
-"""A log of a ROS bag: rows of odometry and of echoes, made of its messages.
+"""The log of a ROS bag: rows of odometry and of echoes, made from its messages.
 
-Memory holds the rows, never the bag: messages of the chosen topics are read one at a time. What was
-chosen and what was converted is told in the log's `notes`.
+Messages of the chosen topics are read one at a time, so memory holds only the rows. The log's
+`notes` list the choice of topics and the conversions.
 
-Which topics of a bag are the odometry, the echoes and the truth.
-
-Where a sensor is on the vehicle: static transforms of a bag, followed from frame to frame.
-
-A transform takes points of its child's frame to its parent's (tf2_msgs); frames form a tree.
+The poses of sensors on the vehicle come from static transforms. A transform converts points of the
+child's frame to the parent's (tf2_msgs); the frames form a tree.
 """
 
 import math
@@ -45,13 +42,13 @@ TRANSFORMS_TYPE = "tf2_msgs/msg/TFMessage"
 
 
 class Frames:
-    """The frames of a bag, and how they stand to each other."""
+    """The coordinate frames of a bag, linked by static transforms."""
 
     def __init__(self) -> None:
         self._beside: dict[str, dict[str, Pose]] = {}
 
     def add(self, message: Any) -> list[str]:
-        """Learn the transforms of a message; say which are left out as no turns."""
+        """Add the transforms of a message; return a line for each with an invalid rotation."""
         odd = []
         for one in message.transforms:
             parent, child = bare(one.header.frame_id), bare(one.child_frame_id)
@@ -71,7 +68,7 @@ class Frames:
         return bool(self._beside)
 
     def pose(self, frame: str, base: str) -> Pose | None:
-        """Return what takes points of a frame to another; None where nothing ties them."""
+        """Return the transform from a frame to `base`; None if they are not connected."""
         found = {base: planar(0.0, 0.0, 0.0)}
         waiting = [base]
         while waiting and frame not in found:
@@ -84,22 +81,22 @@ class Frames:
 
 
 def bare(frame: str) -> str:
-    """Return a frame's name without the slash that ROS 1 may begin it with."""
+    """Return a frame's name without the leading slash of ROS 1."""
     return frame.removeprefix("/")
 
 
 def after(outer: Pose, inner: Pose) -> Pose:
-    """Return the inner pose followed by the outer one."""
+    """Compose two transforms: the inner is applied first."""
     return outer[0] @ inner[0], outer[0] @ inner[1] + outer[1]
 
 
 def inverse(pose: Pose) -> Pose:
-    """Return the way back."""
+    """Return the inverse transform."""
     return pose[0].T, -pose[0].T @ pose[1]
 
 
 def planar(x: float, y: float, heading: float) -> Pose:
-    """Return a pose in the plane.
+    """Return the transform of a pose in the plane.
 
     >>> planar(1.0, 2.0, 0.0)[1]
     array([1., 2., 0.])
@@ -109,17 +106,17 @@ def planar(x: float, y: float, heading: float) -> Pose:
 
 
 def along_axis(points: Float[np.ndarray, "n 3"], mount: Pose) -> Float[np.ndarray, "n 3"]:
-    """Return points about a sensor's axis in its frame's axes, whose x or z is that axis.
+    """Return points about a sensor's axis, x or z of its frame, in the axes of that frame.
 
-    Profiling sonars have their frame's z along the axis and y to starboard, as ProjectedSonarImage
-    of marine_acoustic_msgs says; others have x ahead. The one that lies flatter is meant.
+    Profiling sonars have z along the axis and y to starboard (ProjectedSonarImage of
+    marine_acoustic_msgs); others have x ahead. The more level of the two is the axis.
     """
     (_, _, x), (_, _, z) = mount[0][:, 0], mount[0][:, 2]
     return points if abs(x) <= abs(z) else points[:, ::-1] * [1.0, -1.0, 1.0]
 
 
 def odometry_of(bag: Bag, settings: BagConfig) -> str:
-    """Return the topic of the odometry: the one that is named, or the only one."""
+    """Return the topic of the odometry: the topic in the settings, or else the only candidate."""
     if settings.odometry is not None:
         return bag.checked(settings.odometry, [ODOMETRY], "--bag.odometry")
     there = _odometries(bag.topics.values(), settings)
@@ -131,7 +128,7 @@ def odometry_of(bag: Bag, settings: BagConfig) -> str:
 
 
 def echoes_of(bag: Bag, settings: BagConfig) -> list[str]:
-    """Return the topics of the echoes: those that are named, or all of a known type."""
+    """Return the topics of the echoes: the topics in the settings, or all of a known type."""
     if settings.echoes:
         names = dict.fromkeys(settings.echoes)
         return [bag.checked(name, ECHOES, "--bag.echoes") for name in names]
@@ -152,12 +149,12 @@ def transforms_of(bag: Bag) -> list[str]:
 
 
 def truth_of(bag: Bag, settings: BagConfig) -> str | None:
-    """Return the topic of the truth, if one is named."""
+    """Return the topic of the true poses, or None if the settings name none."""
     return None if settings.truth is None else bag.checked(settings.truth, POSES, "--truth")
 
 
 def roles(topics: Iterable[Topic], settings: BagConfig) -> dict[str, str]:
-    """Say what each topic would be taken for; empty where for nothing.
+    """Return the role that each topic would have, such as "odometry"; empty for an unused topic.
 
     >>> odometry = Topic(name="/odom", type=ODOMETRY, count=3)
     >>> roles([odometry], BagConfig()), roles([odometry], BagConfig(truth="/odom"))
@@ -188,30 +185,30 @@ def _odometries(topics: Iterable[Topic], settings: BagConfig) -> list[str]:
 
 _TWIST = ("velocity", "angular_rate")
 _UPPER = (0, 1, 5, 7, 11, 35)
-"""Where x, y and the turn about z stand in a covariance of six, its upper triangle row by row."""
+"""Indices of x, y and yaw in a covariance of six variables: its upper triangle, row by row."""
 _UNKNOWN = 100.0
-"""Variance of a velocity from which on nothing is known of it [m^2/s^2], [rad^2/s^2]."""
+"""Variance of a velocity that means unknown [m^2/s^2], [rad^2/s^2]."""
 _STEEP = 0.1
-"""Least level part of an echo's direction that has a bearing."""
+"""Smallest horizontal component of an echo's direction for a bearing to be defined."""
 _LATE = 1e-3
-"""Clocks that differ by more than this are reported [s]."""
+"""Smallest difference between clocks that is reported [s]."""
 BEGUN = 1.0
-"""A clock that has begun with the drive shows less than this at its first pose [s]."""
+"""Latest first pose of a clock that begins with the drive [s]."""
 _ALIKE = 0.2
-"""Share of a topic's messages that may hold one and the same range before a warning asks; a topic
-of fewer than 25 messages is not asked about, as fewer than five of them would do."""
+"""Share of a topic's messages that may hold the same range without a warning; topics of fewer than
+25 messages are not checked."""
 
 
 @dataclass(slots=True)
 class Remarks:
-    """What the user is to know of how a bag was read; see `Log`."""
+    """Notes, warnings and counts of left-out messages for the user; see `Log`."""
 
     notes: list[str] = field(default_factory=list)
     doubts: list[str] = field(default_factory=list)
     ignored: Counter[str] = field(default_factory=Counter)
 
     def leave_out(self, topic: str, reason: str, number: int, words: str) -> None:
-        """Count messages of a topic that are left out, and say so."""
+        """Count messages of a topic that are left out, and add a warning."""
         self.ignored[reason] += number
         self.doubts.append(f"{topic}: {number} left out: {words}")
 
@@ -223,14 +220,14 @@ class TopicPoses:
     path: Path
     topic: str
     rows: list[tuple[float, ...]] = field(default_factory=list)
-    """The number of a message, its time [s], x, y [m], heading [rad] and what follows."""
+    """Number of the message, time [s], x, y [m], heading [rad], then further columns."""
     lag: list[float] = field(default_factory=list)
-    """How much later each was received [s]."""
+    """Delay of each message's reception after its time [s]."""
     odd: list[str] = field(default_factory=list)
-    """What was found in messages whose orientation is none."""
+    """A line for each message with an invalid orientation."""
 
     def add(self, message: Message, settings: BagConfig, read: Callable[..., Any]) -> None:
-        """Take in a message; `read` returns its row."""
+        """Add a message, converted to a row by `read`."""
         try:
             row = read(message, settings)
         except TurnError as error:
@@ -240,7 +237,7 @@ class TopicPoses:
         self.lag.append(message.received - row[0])
 
     def sound(self, remarks: Remarks) -> list[tuple[float, ...]]:
-        """Return the rows without what cannot be used; refuse a topic that is mostly so."""
+        """Return the usable rows; raise if most messages of the topic are invalid."""
         where, count = f"{self.path}, topic {self.topic}", len(self.rows) + len(self.odd)
         if 2 * len(self.odd) > count:
             some = f"{len(self.odd)} of {count} messages are like it"
@@ -257,10 +254,10 @@ class TopicPoses:
 def _kept(
     where: str, topic: str, stamps: list[float], began: float, remarks: Remarks
 ) -> list[bool]:
-    """Return which stamps are of a clock that ran; `began` [s]: when the first pose was.
+    """Return a mask of the stamps from a running clock; `began` [s]: time of the first pose.
 
-    Messages that are sent before a simulation publishes its clock have the stamp 0. Where a clock
-    begins with the drive, at less than a second, 0 is a time.
+    Messages that are sent before a simulation publishes its clock have the stamp 0. If the clock
+    begins with the drive, at less than `BEGUN`, 0 is a valid time.
     """
     kept = [stamp != 0.0 or began <= BEGUN for stamp in stamps]
     if (early := kept.count(False)) == len(stamps) and early:
@@ -278,18 +275,18 @@ class TopicEchoes:
 
     type: str
     time: list[float] = field(default_factory=list)
-    """Those of the messages [s]."""
+    """Time of each message [s]."""
     lag: list[float] = field(default_factory=list)
-    """How much later each was received [s]."""
+    """Delay of each message's reception after its time [s]."""
     number: list[int] = field(default_factory=list)
     frame: list[str] = field(default_factory=list)
     echoes: list[Echoes] = field(default_factory=list)
 
     def add(self, message: Message, settings: BagConfig) -> None:
-        """Take in a message."""
+        """Add the echoes of a message."""
         content = message.content
         time = _time(message, settings)
-        with np.errstate(all="ignore"):  # what is no number is left out, or refused
+        with np.errstate(all="ignore"):  # invalid numbers are left out, or raise later
             echoes = ECHOES[self.type](content, settings.speed_of_sound)
         self.time.append(time)
         self.lag.append(message.received - time)
@@ -298,7 +295,7 @@ class TopicEchoes:
         self.echoes.append(echoes)
 
     def begin(self, path: Path, topic: str, began: float, remarks: Remarks) -> None:
-        """Leave out messages from before the clock began."""
+        """Remove messages from before the clock began."""
         kept = _kept(f"{path}, topic {topic}", topic, self.time, began, remarks)
         columns: tuple[list[Any], ...] = self.time, self.lag, self.number, self.frame, self.echoes
         for rows in columns:
@@ -308,9 +305,9 @@ class TopicEchoes:
 def read_bag(
     path: Path, settings: BagConfig, span: tuple[float, float] = (-math.inf, math.inf)
 ) -> Log:
-    """Read what a vehicle drove and heard; it starts at the first pose of its odometry.
+    """Read the log of a ROS bag: odometry and echoes, from the first pose of the odometry.
 
-    `span` [s]: the log is cut to it.
+    `span` [s]: times to which the log is cut.
     """
     frames, remarks, base, odd = Frames(), Remarks(), "", []
     with opened(path) as bag:
@@ -355,7 +352,7 @@ def read_bag(
 
 
 def _check_tied(path: Path, frames: Frames, odd: list[str], remarks: Remarks) -> None:
-    """Refuse transforms of which none is a turn; say where some are not."""
+    """Raise if all transforms are invalid; add a warning if some are."""
     if odd and not frames:
         raise InputError(f"{path}, topic {TRANSFORMS}, {odd[0]}")
     if odd:
@@ -363,7 +360,7 @@ def _check_tied(path: Path, frames: Frames, odd: list[str], remarks: Remarks) ->
 
 
 def _vehicle(settings: BagConfig) -> dict[str, Any]:
-    """Return what the settings say of the vehicle and its sensors, by the names of a `Log`."""
+    """Return the settings of the vehicle and its sensors as fields of a `Log`."""
     twist = settings.motion == "twist"
     noise = ("velocity", "angular_rate") if twist else ("forward", "sideways", "turn")
     same = "initial_pose_std", "range_std", "bearing_std", "range_bounds"
@@ -376,9 +373,9 @@ def _vehicle(settings: BagConfig) -> dict[str, Any]:
 def read_poses(
     path: Path, settings: BagConfig, remarks: Remarks | None = None
 ) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, "n 3"]] | None:
-    """Read times [s] and poses [m, m, rad] of the truth, the heading unwrapped; None without one.
+    """Read times [s] and poses [m, m, rad] of the truth, heading unwrapped; None without topic.
 
-    Of two poses of one time the later wins. `remarks` get what is to be known of the topic.
+    The later of two poses at one time is used. `remarks` receives notes and warnings.
     """
     with opened(path) as bag:
         if (topic := truth_of(bag, settings)) is None:
@@ -415,7 +412,7 @@ def step_row(message: Message, settings: BagConfig) -> tuple[float, ...]:
 
 
 def _table(where: str, columns: tuple[str, ...], rows: list[Any], stated: int = 0) -> Table:
-    """Return rows as a table, a message's number before each; the last columns may be empty."""
+    """Make a checked table of rows; each row begins with its message's number."""
     if not rows:
         raise refusal(where, "no messages", "some", "name another topic; --topics lists them")
     number, *values = np.array(rows, dtype=float).T
@@ -461,7 +458,7 @@ def odometry_table(
 def mounts_of(
     path: Path, topic: str, rows: TopicEchoes, frames: Frames, base: str, settings: BagConfig
 ) -> dict[str, Pose]:
-    """Return where the sensor is on the vehicle, by the frames of a topic's messages."""
+    """Return the pose of the sensor on the vehicle for each frame of a topic's messages."""
     found: dict[str, Pose] = {}
     for frame, echoes in zip(rows.frame, rows.echoes, strict=True):
         if frame in found:
@@ -482,10 +479,7 @@ def mounts_of(
 
 
 def rows_of(where: str, rows: TopicEchoes, mounts: dict[str, Pose], ignored: Counter[str]) -> Table:
-    """Return the echoes of a topic as bearings and ranges from the vehicle.
-
-    `ignored`: what is left out is counted in it, by reason.
-    """
+    """Convert the echoes of a topic to bearings and ranges; count left-out echoes in `ignored`."""
     check_columns(
         Table(
             path=where,
@@ -531,7 +525,7 @@ def _merged(where: str, parts: list[Table]) -> Table:
 
 
 def _clock(topic: str, lags: list[float], settings: BagConfig) -> list[str]:
-    """Tell by how much headers and reception differ."""
+    """Return a note if times of reception are used, or differ from the headers' by over 1 ms."""
     if settings.stamps == "received":
         return [f"{topic}: times are those at which messages were received"]
     late = float(np.median(lags)) if lags else 0.0
@@ -541,11 +535,11 @@ def _clock(topic: str, lags: list[float], settings: BagConfig) -> list[str]:
 
 
 def _surety(rows: Table) -> dict[str, float]:
-    """Return how unsure a bearing may be to be associated: as the widest beam or cone makes it.
+    """Return the largest bearing standard deviation that association accepts: the widest beam's.
 
-    An association leaves rows out that are less sure than others because they are likelier noise.
-    The deviation of a row in a beam comes of the beam's width, for weak and loud echoes alike, so
-    none that still has a bearing is left out by it; the default holds where all are surer.
+    Association discards measurements with a large standard deviation as likely noise. In a beam it
+    follows from the width, for weak and loud echoes, so no beam may be discarded for it. Empty if
+    the default is larger.
     """
     stds = rows.column["bearing_std"]
     widest = float(stds[stds <= WIDEST].max(initial=0.0))
@@ -553,7 +547,7 @@ def _surety(rows: Table) -> dict[str, float]:
 
 
 def _alike(topic: str, rows: TopicEchoes) -> list[str]:
-    """Ask about a range that more messages have than what lies about would give."""
+    """Return a warning if many messages of a topic hold the same range."""
     ranges = [np.unique(np.linalg.norm(one.point, axis=1).round(6)) for one in rows.echoes]
     value, count = np.unique(np.concatenate([np.empty(0), *ranges]), return_counts=True)
     if len(ranges) * _ALIKE < 1.0 / _ALIKE or count.max(initial=0) <= _ALIKE * len(ranges):
@@ -566,7 +560,7 @@ def _alike(topic: str, rows: TopicEchoes) -> list[str]:
 
 
 def _converted(topic: str, rows: TopicEchoes, mounts: dict[str, Pose], base: str) -> list[str]:
-    """Say what was converted in the echoes of a topic."""
+    """Return notes of the conversions applied to the echoes of a topic."""
     notes = []
     if rows.type == ANGLES:
         notes.append(f"{topic}: its angles are positive to starboard, bearings to the left")

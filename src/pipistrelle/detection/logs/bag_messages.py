@@ -1,17 +1,14 @@
-"""What messages of ROS say: poses and velocities of the vehicle, and echoes of landmarks.
+"""ROS message types: convert poses, velocities and echoes, and check definitions in a bag.
 
 Definitions: `marine_acoustic_msgs` (github.com/apl-ocean-engineering/marine_msgs, BSD 3-Clause) and
-`mrpt_msgs` (github.com/mrpt-ros-pkg/mrpt_msgs, BSD); all others are ROS's own common interfaces.
-Echoes are given as points in the frame of their sensor, x ahead, y to the left.
+`mrpt_msgs` (github.com/mrpt-ros-pkg/mrpt_msgs, BSD); all others are ROS's common interfaces. Echoes
+are points in the frame of their sensor, x ahead, y to the left.
 
-Definitions of ROS messages, as the text in a bag gives them, and the types that decode messages.
-
-rosbags makes Python source of a definition: a text of 30 bytes, ``string[20000000] x``, becomes
-gigabytes of it, and its parsers evaluate arithmetic of any size. The text in a bag is therefore
-read here, in a time that grows with its length, and compared with the known definition. Where
-both describe the same bytes, the known types decode the messages. Where the text has further
-fields, its types do, if they are few. A text that lacks a known field, or gives it another type,
-is refused.
+rosbags generates Python source from a definition: 30 bytes of text, ``string[20000000] x``, become
+gigabytes of source, and its parsers evaluate arithmetic of any size. The text in a bag is therefore
+parsed here, in time linear in its length, and compared with the known definition. If both describe
+the same bytes, the known types decode the messages. If the text has further fields, its types do,
+within limits. A text that lacks a known field, or changes its type, is an error.
 """
 
 import math
@@ -55,12 +52,12 @@ DEFINITIONS = MappingProxyType(
 """Types that rosbags does not know, for bags that do not define them."""
 
 Pose = tuple[Float[np.ndarray, "3 3"], Float[np.ndarray, " 3"]]
-"""Rotation and translation [m] from a frame to another."""
+"""Rotation and translation [m] from one frame to another."""
 _ROUNDING = 0.01
-"""How far the length of a quaternion may be from 1: components of 8 bits, the coarsest of drivers,
-are each off by half of 1/127 and the length by up to 1/127."""
+"""Largest deviation of a quaternion's length from 1: components of 8 bits, the coarsest of
+drivers, are each off by half of 1/127 and the length by up to 1/127."""
 _UNIFORM = 12.0**-0.5
-"""Standard deviation of what lies anywhere within a width, as a share of it."""
+"""Standard deviation of a uniform distribution of width 1."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -68,26 +65,26 @@ class Echoes:
     """The echoes of one message."""
 
     point: Float[np.ndarray, "n 3"]
-    """Seen from the sensor [m]."""
+    """Position relative to the sensor [m]."""
     delay: Float[np.ndarray, " n"]
-    """How much later than the header says each was sent [s]."""
+    """Delay of each echo's emission after the header's time [s]."""
     range_std: Float[np.ndarray, " n"]
-    """[m]; NaN where the message does not say it."""
+    """[m]; NaN if not stated."""
     bearing_std: Float[np.ndarray, " n"]
-    """[rad]; NaN where the message does not say it."""
+    """[rad]; NaN if not stated."""
     landmark: Int[np.ndarray, " n"]
     mount: Pose | None = None
-    """Where the sensor is on the vehicle, if the message says it."""
+    """Pose of the sensor on the vehicle, if the message states it."""
     ignored: Counter[str] = field(default_factory=Counter)
     """Echoes left out, by reason."""
 
 
 class TurnError(InputError):
-    """The orientation of a message is none, or that of a vehicle upside down."""
+    """Invalid orientation in a message: not a unit quaternion, or a vehicle upside down."""
 
 
 def yaw_of(q: Any) -> float:
-    """Return the heading of a quaternion, of length 1 but for rounding [rad]."""
+    """Return the heading of a quaternion [rad]; raise if its length is not 1 up to rounding."""
     x, y, z, w = q.x, q.y, q.z, q.w
     if not abs((length := math.hypot(x, y, z, w)) - 1.0) <= _ROUNDING:
         raise TurnError(
@@ -98,7 +95,7 @@ def yaw_of(q: Any) -> float:
 
 
 def rotation_of(q: Any) -> Float[np.ndarray, "3 3"]:
-    """Return the matrix of a quaternion."""
+    """Return the rotation matrix of a quaternion."""
     yaw_of(q)
     x, y, z, w = np.array([q.x, q.y, q.z, q.w]) / np.sqrt(q.x**2 + q.y**2 + q.z**2 + q.w**2)
     return np.array(
@@ -111,12 +108,12 @@ def rotation_of(q: Any) -> Float[np.ndarray, "3 3"]:
 
 
 def pose_of(place: Any, q: Any) -> Pose:
-    """Return a pose of a place and a quaternion."""
+    """Return the transform of a position and a quaternion."""
     return rotation_of(q), np.array([place.x, place.y, place.z], dtype=float)
 
 
 def _planar(place: Any, q: Any) -> tuple[float, float, float]:
-    """Return x, y and heading of a vehicle that is not upside down."""
+    """Return x, y and heading; raise if the vehicle is upside down."""
     heading = yaw_of(q)
     if q.x * q.x + q.y * q.y > q.z * q.z + q.w * q.w:
         raise TurnError(
@@ -136,11 +133,11 @@ POSES: dict[str, Callable[[Any], tuple[float, float, float]]] = {
         m.transform.translation, m.transform.rotation
     ),
 }
-"""Types that tell where the vehicle is; each gives x, y [m] and heading [rad]."""
+"""Message types of poses; each function returns x, y [m] and heading [rad]."""
 
 
 def _sonar_detections(message: Any, speed_of_sound: float | None) -> Echoes:
-    """Read travel times by angles, ahead and to starboard."""
+    """Convert travel times and beam angles (ahead, to starboard) to echoes."""
     time = np.asarray(message.two_way_travel_times, dtype=float)
     speed = message.ping_info.sound_speed or speed_of_sound
     if not speed:
@@ -154,7 +151,7 @@ def _sonar_detections(message: Any, speed_of_sound: float | None) -> Echoes:
 
 
 def _sonar_ranges(message: Any, _: float | None) -> Echoes:
-    """Read ranges along unit vectors."""
+    """Convert ranges along unit vectors to echoes."""
     distance = np.asarray(message.ranges, dtype=float)
     vectors = [(v.x, v.y, v.z) for v in message.beam_unit_vec]
     if len(vectors) != distance.size:
@@ -169,7 +166,7 @@ def _beams(
     distance: Float[np.ndarray, " n"],
     delays: Any,
 ) -> Echoes:
-    """Return the echoes of beams that are not flagged and heard one: anywhere in their width."""
+    """Return the echoes of beams with a valid range and no flag; uniform over the beam's width."""
     size = distance.size
     flags = np.array([flag.flag for flag in message.flags])
     flagged = _per_beam("flags", flags, size, 0.0) != 0.0
@@ -186,10 +183,10 @@ def _beams(
 
 
 def _range(message: Any, _: float | None) -> Echoes:
-    """Read a range in a cone: a bearing straight ahead, uniform over its width.
+    """Convert a range in a cone to an echo straight ahead, its bearing uniform over the width.
 
-    Nothing is heard at infinity, nearer than the nearest range, and, as Gazebo and many drivers
-    write it, at the farthest range itself, which single precision may round down by a last place.
+    There is no echo at infinity, below the minimum range, or, as Gazebo and many drivers write it,
+    at the maximum range, which single precision may round down by a last place.
     """
     distance, near, far = float(message.range), float(message.min_range), float(message.max_range)
     below = float(np.nextafter(np.float32(far), np.float32(0.0)))
@@ -204,7 +201,7 @@ def _range(message: Any, _: float | None) -> Echoes:
 
 
 def _range_bearing(message: Any, _: float | None) -> Echoes:
-    """Read ranges and angles with labels, by a sensor whose place the message says."""
+    """Convert labelled ranges and angles to echoes; the message states the sensor's pose."""
     rows = [(one.range, one.yaw, one.pitch, one.id) for one in message.sensed_data]
     distance, yaw, pitch, label = np.array(rows, dtype=float).reshape(-1, 4).T
     if not (distance > 0.0).all():
@@ -232,7 +229,7 @@ ECHOES: dict[str, Callable[[Any, float | None], Echoes]] = {
     "sensor_msgs/msg/Range": _range,
     "mrpt_msgs/msg/ObservationRangeBearing": _range_bearing,
 }
-"""Types that tell echoes; each is read with the speed of sound that a ping without one has."""
+"""Message types of echoes; a function takes the speed of sound for a ping without one."""
 ANGLES = f"{_PINGS}SonarDetections"
 """The type whose angles are about its sensor's axis, positive to starboard."""
 CONES = "sensor_msgs/msg/Range"
@@ -241,7 +238,7 @@ CONES = "sensor_msgs/msg/Range"
 def _per_beam(
     name: str, values: Any, size: int, default: float = np.nan
 ) -> Float[np.ndarray, " n"]:
-    """Return a number for each beam: of one for all, of each, or the default where none is said."""
+    """Expand to a number for each beam: `values` of all or of each, or the default if empty."""
     numbers = np.asarray(values, dtype=float)
     if numbers.size not in (0, 1, size):
         raise InputError(f"found {numbers.size} {name}, expected one for each of {size} beams")
@@ -251,7 +248,7 @@ def _per_beam(
 
 
 def _echoes(point: Float[np.ndarray, "n 3"], **said: Any) -> Echoes:
-    """Return echoes; refuse places that are no numbers, and fill in what is not said."""
+    """Make echoes, with defaults for missing fields; raise if a point or delay is not finite."""
     nothing = np.full(len(point), np.nan)
     given: dict[str, Any] = {
         "delay": np.zeros(len(point)),
@@ -268,13 +265,13 @@ def _echoes(point: Float[np.ndarray, "n 3"], **said: Any) -> Echoes:
 LONGEST = 200_000
 """Longest text of a definition [characters]; ROS's longest have some 20,000, mostly comments."""
 MOST_PARTS = 300
-"""Most fields that a message may have, elements of its arrays of records and texts included. An
-`Odometry` has 29, and rosbags compiles 300 within a second."""
+"""Most fields of a message type, with elements of arrays of records and texts. An `Odometry` has
+29, and rosbags compiles 300 within a second."""
 DEEPEST = 20
-"""Most records within one another; ROS's own have 5."""
+"""Deepest nesting of records; ROS's types have 5."""
 
 Fields = list[tuple[str, Any]]
-"""Names and types of fields; a type is described as rosbags does: kind, and name or element."""
+"""Names and types of fields, a type as in rosbags: kind, and name or element."""
 BASE, NAME, ARRAY, SEQUENCE = 1, 2, 3, 4
 """Kinds of types: a number or text, a record, an array of fixed length, a list."""
 _NUMBERS = r"bool|byte|char|float(?:32|64)|u?int(?:8|16|32|64)"
@@ -311,9 +308,10 @@ _IDL_NUMBERS = {
 
 
 def types_of(name: str, text: str, *, idl: bool, first: bool) -> Any:
-    """Return the types (rosbags' store) that decode messages of one type.
+    """Return the rosbags type store that decodes messages of a type.
 
-    `text`: the definition in the bag, perhaps empty; `idl`: in which language; `first`: of ROS 1.
+    `text`: the definition in the bag, or empty; `idl`: whether it is IDL; `first`: whether of ROS
+    1.
     """
     known = _known(first, latest=False)
     if name not in known.fielddefs:
@@ -334,7 +332,7 @@ def types_of(name: str, text: str, *, idl: bool, first: bool) -> Any:
 
 @cache
 def _known(first: bool, *, latest: bool) -> Any:
-    """Return the types that rosbags and we know, of ROS 1 or of one of the versions of ROS 2."""
+    """Return the types that rosbags and this package define, for ROS 1 or a version of ROS 2."""
     from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
     second = Stores.LATEST if latest else Stores.ROS2_HUMBLE
@@ -347,7 +345,7 @@ def _known(first: bool, *, latest: bool) -> Any:
 def _compared(
     name: str, told: Mapping[str, Fields], known: Mapping[str, Any]
 ) -> tuple[bool, tuple[str, str] | None]:
-    """Return whether two types are the same bytes, and what is there in place of a known field."""
+    """Return whether two types have the same bytes, and the first mismatch of a known field."""
     there, fields = dict(told[name]), known[name][1]
     same, fault = [one for one, _ in told[name]] == [one for one, _ in fields], None
     for part, kind in fields:
@@ -361,7 +359,7 @@ def _compared(
 
 
 def _bytes_of(kind: Any) -> Any:
-    """Return a type without what its bytes do not depend on, the bounds of texts and lists."""
+    """Return a type without the bounds of texts and lists, which do not affect its bytes."""
     if kind is None or kind[0] == NAME:
         return kind if kind is None else (NAME, kind[1])
     if kind[0] == BASE:
@@ -370,7 +368,7 @@ def _bytes_of(kind: Any) -> Any:
 
 
 def _words(kind: Any) -> str:
-    """Write a type."""
+    """Format the type of a message field, for an error."""
     if kind is None:
         return "nothing"
     if kind[0] in (BASE, NAME):
@@ -379,13 +377,13 @@ def _words(kind: Any) -> str:
 
 
 def _record(kind: Any) -> str | None:
-    """Return the name of the record that a field is, or is made of."""
+    """Return the name of the record type of a field or of its elements; None if there is none."""
     one = kind if kind[0] in (BASE, NAME) else kind[1][0]
     return one[1] if one[0] == NAME else None
 
 
 def _registered(name: str, types: Mapping[str, Fields]) -> Any:
-    """Return a store of a type and of all that it is made of; refuse a large one."""
+    """Return a type store of a type and its parts; raise if it is too large."""
     from rosbags.typesys import Stores, get_typestore
 
     sizes: dict[str, int] = {}
@@ -400,7 +398,7 @@ def _registered(name: str, types: Mapping[str, Fields]) -> Any:
 def _parts(
     name: str, types: Mapping[str, Fields], sizes: dict[str, int], within: tuple[str, ...]
 ) -> int:
-    """Return how many fields a type has, those of its fields included."""
+    """Count the fields of a type, including fields of its records; raise if nested too deep."""
     where = f"the definition of {(*within, name)[0]}"
     if name in within or len(within) == DEEPEST:
         found = f"{name} within itself" if name in within else f"more than {DEEPEST} records"
@@ -420,7 +418,7 @@ def _parts(
 
 
 def read_definition(name: str, text: str, *, idl: bool = False) -> dict[str, Fields]:
-    r"""Read the definitions of a type and of the records in it, by the names of types.
+    r"""Parse the text definition of a type and of the records in it, by the names of types.
 
     >>> read_definition("a_msgs/msg/Pair", "float64 x  # ahead\nfloat64[2] y\n")
     {'a_msgs/msg/Pair': [('x', (1, ('float64', 0))), ('y', (3, ((1, ('float64', 0)), 2)))]}
@@ -465,7 +463,7 @@ def _full(name: str, owner: str = "") -> str:
 
 
 def _of_msg(text: str, owner: str) -> Fields:
-    """Read the fields of a type in ROS's own language, one on a line."""
+    """Parse the fields of a type in ROS's own language, each on a line."""
     fields = []
     for line in text.split("\n"):
         if not line.strip() or line.lstrip().startswith("#"):
@@ -484,7 +482,7 @@ def _of_msg(text: str, owner: str) -> Fields:
 
 
 def _of_idl(text: str) -> dict[str, Fields]:
-    """Read the records of IDL, as far as ROS writes it: modules, constants, typedefs, structs."""
+    """Parse the records of IDL as ROS writes it: modules, constants, typedefs, structs."""
     tokens = [
         found[0]
         for found in _TOKEN.finditer(text)
@@ -494,7 +492,7 @@ def _of_idl(text: str) -> dict[str, Fields]:
 
 
 class _Idl:
-    """The records of a list of tokens."""
+    """Parser of the records in a list of IDL tokens."""
 
     def __init__(self, tokens: list[str]) -> None:
         self.records: dict[str, Fields] = {}
@@ -536,7 +534,7 @@ class _Idl:
         self._expect(";")
 
     def _declared(self) -> tuple[str, Any]:
-        """Read a type and a name, perhaps with the length of an array."""
+        """Parse a type and a name, perhaps with the length of an array."""
         kind, name = self._kind(), self._next()
         if not re.fullmatch(r"[A-Za-z]\w*", name, re.ASCII):
             raise InputError(f"found {shown(name)} in IDL, expected a name")
@@ -558,7 +556,7 @@ class _Idl:
         return kind
 
     def _kind(self) -> Any:
-        """Read a type."""
+        """Parse the type of a field."""
         word = self._next()
         while self._left and f"{word} {self._left[-1]}" in (*_IDL_NUMBERS, "unsigned long"):
             word = f"{word} {self._next()}"

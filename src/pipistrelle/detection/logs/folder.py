@@ -1,16 +1,12 @@
-"""Log folders, the format of this project: plain text, read and written, the truth unseen.
+"""Log folders: read and write this project's format, and read UTIAS MRCLAM data sets.
 
-Whatever is wrong with a file is refused by line or key. `recording` says how rows become steps and
-measurements scans.
+A log folder is plain text: ``log.toml``, ``odometry.csv`` and ``measurements.csv``; the truth is
+never read here. Errors name the line or key. `recording` makes steps and scans of the rows.
 
-A robot's log of the UTIAS multi-robot cooperative localization and mapping data sets (MRCLAM).
-
-Leung, Halpern, Barfoot and Liu, "The UTIAS multi-robot cooperative localization and mapping
-dataset", IJRR 30(8), 2011: five robots with a camera among fifteen barcoded posts. A folder is
-read as it is; its noise, which the sets do not state, is chosen here. The spread of the start is
-the paper's (Table I). Ranges lie between 0.9 m and 8.6 m; the bounds for rays are the paper's too.
-
-A log whose rows are written as they are heard, scan by scan, beside odometry that is there.
+MRCLAM (Leung, Halpern, Barfoot and Liu, "The UTIAS multi-robot cooperative localization and mapping
+dataset", IJRR 30(8), 2011): five robots with a camera among fifteen barcoded posts, at ranges from
+0.9 m to 8.6 m. The sets do not state their noise, so it is chosen here; the standard deviation of
+the initial pose (Table I) and the range bounds of rays are the paper's.
 """
 
 import math
@@ -58,13 +54,11 @@ _UNKNOWN_MAX = 0.05
 
 
 def read_mrclam(folder: Path, robot: int, span: tuple[float, float] = (-math.inf, math.inf)) -> Log:
-    """Read what one robot drove and saw; the labels of landmarks are their subjects, 6 to 20.
+    """Read the log of one robot of a MRCLAM set; landmark labels are the subjects 6 to 20.
 
-    Odometry is merged into steps of 0.1 s. Rows that show another robot (subjects 1 to 5) or a
-    barcode that no subject wears are dropped and counted.
-
-    `span` [s]: the log is cut to it: where the truth begins and ends. Returns it
-    starts at the origin: these files do not say where the robot stood.
+    Odometry is merged into steps of 0.1 s. Measurements of another robot (subjects 1 to 5) or of a
+    barcode without a subject are dropped and counted. The log is cut to `span` [s], the times of
+    the truth. The initial pose is the origin, as these files do not contain it.
 
     Format and robots: Leung et al., IJRR 30(8), 2011.
     """
@@ -90,7 +84,7 @@ def read_mrclam(folder: Path, robot: int, span: tuple[float, float] = (-math.inf
 
 
 def _seen_landmarks(folder: Path, robot: int) -> tuple[Table, dict[str, int]]:
-    """Return the measurements of landmarks, labelled by their subjects, and the rows dropped."""
+    """Return the measurements of landmarks, labelled by subject, and the dropped rows by reason."""
     columns = ("time", "barcode", "range", "bearing")
     table = read_table(folder / f"Robot{robot}_Measurement.dat", columns, separator=None)
     subject = _subjects(folder / "Barcodes.dat", table.column["barcode"])
@@ -111,7 +105,7 @@ def _seen_landmarks(folder: Path, robot: int) -> tuple[Table, dict[str, int]]:
 
 
 def _subjects(path: Path, barcode: Int[np.ndarray, " n"]) -> Int[np.ndarray, " n"]:
-    """Return the subjects that wear the barcodes, 0 for an unknown one."""
+    """Return the subject number of each barcode; 0 if the set does not list it."""
     table = read_table(path, ("subject", "barcode"), separator=None)
     check_unique(table, "barcode")
     subject = dict(zip(table.column["barcode"].tolist(), table.column["subject"], strict=True))
@@ -143,24 +137,11 @@ def read_log(folder: Path) -> Log:
     r"""Read a log folder: ``log.toml``, ``odometry.csv`` and ``measurements.csv``.
 
     With a ``step``, the rows of odometry are merged into steps of that length (the last may be
-    shorter), each with the time-weighted mean of its controls, of poses with the motion from its
-    start to its end. Times are compared to 1e-6 s then, and exactly otherwise.
+    shorter), each with the time-weighted mean of its controls; for poses, with the motion from its
+    start to its end. Times are then compared to 1e-6 s, otherwise exactly.
 
-    Parameters
-    ----------
-    folder : Path
+    Raises InputError with the file and the line or key.
 
-    Returns
-    -------
-    Log
-
-    Raises
-    ------
-    InputError
-        With the file and the line or key, what was found, what was expected and the fix.
-
-    Examples
-    --------
     >>> from tempfile import TemporaryDirectory
     >>> settings = '''
     ... format = 1
@@ -209,7 +190,7 @@ def read_log(folder: Path) -> Log:
 
 
 def read_odometry(folder: Path, motion: str) -> Table:
-    """Read ``odometry.csv`` of a log of a motion model."""
+    """Read ``odometry.csv`` with the columns of a motion model."""
     optional = MOTION_COVARIANCE if motion == "poses" else ()
     columns = ("time", *ODOMETRY[motion])
     odometry = read_table(folder / "odometry.csv", columns, optional=optional)
@@ -219,7 +200,7 @@ def read_odometry(folder: Path, motion: str) -> Table:
 
 
 def _check_steering(odometry: Table) -> None:
-    """Refuse what no car's front wheels do."""
+    """Raise if a steering angle is larger than `STEEPEST`."""
     steering = odometry.column["steering"]
     wrong = np.abs(steering) > STEEPEST
     if wrong.any():
@@ -230,26 +211,15 @@ def _check_steering(odometry: Table) -> None:
 
 
 def write_log(folder: Path, log: Log) -> None:
-    """Write a log folder that `read_log` reads back exactly, motions of poses up to rounding.
+    """Write a log folder; `read_log` reads it back exactly, motions of poses up to rounding.
 
-    Steps become rows, at the precision of the numbers; poses begin at the origin. Scans that share
-    a step are spread over it in their order; empty scans leave no row. How surely it was measured
-    is written row by row, if any row states it. An earlier log that we wrote is replaced, its truth
-    removed (`pipistrelle.files`); ``log.toml`` comes last.
+    Steps become rows; poses begin at the origin. Scans that share a step are spread over it in
+    their order; empty scans have no row. Standard deviations are columns if any measurement states
+    them. An earlier log that this function wrote is replaced and its truth removed
+    (`pipistrelle.files`); ``log.toml`` is written last.
 
-    Parameters
-    ----------
-    folder : Path
-        Made if need be.
-    log : Log
+    Raises InputError if a file cannot be written, or a file there was not written by this package.
 
-    Raises
-    ------
-    InputError
-        Where a file cannot be written, or one in its place is not as we wrote it.
-
-    Examples
-    --------
     >>> from tempfile import TemporaryDirectory
     >>> log = Log(
     ...     name="short", time=np.array([0.0, 0.1]), controls=np.array([[1.0, 0.2]]),
@@ -268,7 +238,7 @@ def write_log(folder: Path, log: Log) -> None:
 
 
 def log_files(log: Log) -> dict[str, str]:
-    """Return the files of a log's folder; ``log.toml`` is the last."""
+    """Return the text of each file of a log folder, by file name; ``log.toml`` is last."""
     settings: dict[str, Any] = {"format": 1} | {name: getattr(log, name) for name in SHARED}
     settings["callers"] = [asdict(caller) for caller in log.callers]
     stds = zip(NOISY[log.motion], log.control_std, strict=True)
@@ -290,7 +260,7 @@ def log_files(log: Log) -> dict[str, str]:
 
 
 def log_readme(driven: Iterable[str], measured: Iterable[str], motion: str) -> str:
-    """Return what a log's folder says of its files, by the columns of its tables."""
+    """Return the text of a log folder's ``README.md``, from the columns of its tables."""
     measured = tuple(measured)
     columns = {"odometry": ",".join(driven), "measurements": ",".join(measured)}
     held = _FOLLOWED if motion == "poses" else _HELD
@@ -299,7 +269,7 @@ def log_readme(driven: Iterable[str], measured: Iterable[str], motion: str) -> s
 
 
 def as_logged(scan: Scan, name: str) -> np.ndarray:
-    """Return a column of a scan as a log's rows have it: a direct call has an excess path of 0."""
+    """Return a column of a scan as written in a log: the excess path of a direct call is 0."""
     values = getattr(scan, name)
     if name == "excess_path" and scan.direct.size:
         values = values.copy()
@@ -319,11 +289,7 @@ def _odometry_columns(log: Log) -> dict[str, np.ndarray]:
 
 
 def _measurement_columns(log: Log) -> dict[str, np.ndarray]:
-    """Return the columns of ``measurements.csv``; scans lie spread over their step, in order.
-
-    Of how surely it was measured there are those of which any row says something; how loud it was
-    stands in logs without labels.
-    """
+    """Return the columns of ``measurements.csv``; scans of one step are spread evenly over it."""
     used = np.array([scan.time for scan in log.scans])
     index = np.searchsorted(log.time, used)
     start = log.time[np.maximum(index - 1, 0)]
@@ -345,25 +311,14 @@ def _measurement_columns(log: Log) -> dict[str, np.ndarray]:
 
 
 class RowsHeard:
-    """A log of scans without labels.
+    """A log of unlabelled scans, written scan by scan next to existing odometry.
 
-    Parameters
-    ----------
-    folder : Path
-        Holds ``odometry.csv``, and a ``recording.toml`` that was read.
-    about : dict
-        Its table ``log``: keys of ``log.toml``.
-    callers : list of dict
-        As ``log.toml`` lists them.
-
-    Raises
-    ------
-    InputError
-        Where the table or the odometry are not as those of a log.
+    `folder` contains ``odometry.csv`` and ``recording.toml``; `about` is the table ``log`` of the
+    latter, and `callers` have the keys of ``log.toml``. Raises InputError if a table is invalid.
     """
 
     columns = ("time", *MEASUREMENT[1:], *STATED, CALLER)
-    """Of ``measurements.csv``."""
+    """Columns of ``measurements.csv``."""
 
     def __init__(self, folder: Path, about: dict[str, Any], callers: list[dict[str, Any]]) -> None:
         table = about | {"format": 1, "callers": callers}
@@ -376,13 +331,13 @@ class RowsHeard:
         column = begin | {"bearing": np.zeros(1)} | nothing
         one = Table(path=self._odometry, line=np.ones(1, dtype=np.int64), column=column)
         step, told = self._vehicle.step, self._vehicle.told()
-        log = assemble(odometry, one, step=step, name="", former_names=(), **told)  # may refuse
+        log = assemble(odometry, one, step=step, name="", former_names=(), **told)  # may raise
         self.time = log.time
         self.rows = self.inside = 0
-        """Rows that were heard, and those of them that the odometry's times hold."""
+        """Rows written, and rows within the time span of the odometry."""
 
     def text(self, scan: Scan) -> str:
-        """Return the rows of a scan, as ``measurements.csv`` has them, without the header."""
+        """Return the rows of a scan as lines of ``measurements.csv``, without the header."""
         time = np.full(len(scan.bearing), scan.time)
         column = [as_logged(scan, name) for name in self.columns[1:-1]]
         self.rows += time.size
@@ -391,7 +346,7 @@ class RowsHeard:
         return text.split("\n", 1)[1]
 
     def files(self) -> dict[str, str]:
-        """Return the log's other files; refuse a log of which no row can be used."""
+        """Return the log's other files; raise if no row is within the odometry's time span."""
         if not self.inside:
             begin, end = self.time[[0, -1]].tolist()
             found = f"{self.rows} echoes, none between {begin!r} s and {end!r} s"

@@ -1,7 +1,6 @@
-"""Messages of ROS one at a time, as they come on a robot: what `Slam` is told of each.
+"""Live ROS messages: converted one at a time to the arguments of `Slam.move` and `Slam.hear`.
 
-A bag's messages are read by the same functions (`bag_log`), so angles, frames and stamps are
-converted in one place.
+The functions of `bag_log` convert angles, frames and stamps, as for a bag.
 """
 
 from collections import Counter
@@ -33,25 +32,25 @@ _HERE = Path("ROS")
 
 
 class Step(NamedTuple):
-    """What a vehicle did between two messages of its odometry."""
+    """The motion of the vehicle between two messages of its odometry."""
 
     controls: Float[np.ndarray, "1 c"]
-    """As `Slam.move` takes them."""
+    """As in `Slam.move`."""
     end: float
-    """[s]."""
+    """Time at which the step ends [s]."""
 
 
 class Heard(NamedTuple):
-    """The rows of a scan."""
+    """The time and columns of a scan in a ROS message."""
 
     time: float
     """[s]."""
     columns: dict[str, Float[np.ndarray, " m"]]
-    """As `Slam.hear` takes them."""
+    """As in `Slam.hear`."""
 
 
 def motion_of(model: str) -> Literal["poses", "twist"]:
-    """Return what odometry's messages are to a vehicle of a motion model: `BagConfig.motion`.
+    """Return how odometry messages are used for a motion model, as in `BagConfig.motion`.
 
     >>> motion_of("bicycle")
     Traceback (most recent call last):
@@ -75,7 +74,7 @@ def stamp_and_pose(message: Any) -> tuple[float, tuple[float, float, float]]:
 
 
 def clock_began(before: Any, now: Any) -> bool:
-    """Return whether the clock began between two messages, the first of which has the stamp 0."""
+    """Return whether the clock began between two messages: the first has the stamp 0."""
     times = [one.header.stamp.sec + one.header.stamp.nanosec / 1e9 for one in (before, now)]
     return times[0] == 0.0 and times[1] > BEGUN
 
@@ -83,7 +82,7 @@ def clock_began(before: Any, now: Any) -> bool:
 def step_between(before: Any, now: Any, settings: BagConfig) -> Step:
     """Return the step from one ``nav_msgs/Odometry`` to the next.
 
-    The way between their poses, or the velocities of the first (`settings.motion`).
+    With `settings.motion` "poses" the motion between their poses, else the velocities of the first.
     """
     with faults_named("ROS, odometry"):
         messages = [Message("odometry", n, 0.0, one) for n, one in enumerate((before, now), 1)]
@@ -99,9 +98,9 @@ def step_between(before: Any, now: Any, settings: BagConfig) -> Step:
 
 
 def learn_transforms(frames: Frames, message: Any) -> None:
-    """Learn the transforms of a ``tf2_msgs/TFMessage`` that do not change.
+    """Add the static transforms of a ``tf2_msgs/TFMessage`` to the known frames.
 
-    A transform that is no turn is refused when the others are learnt.
+    Raises if a rotation is invalid, after the other transforms have been added.
     """
     with faults_named(f"ROS, {TRANSFORMS}"):
         if odd := frames.add(message):
@@ -111,10 +110,10 @@ def learn_transforms(frames: Frames, message: Any) -> None:
 def scans_in(
     kind: str, message: Any, base: str, frames: Frames, settings: BagConfig
 ) -> list[Heard]:
-    """Return the scans of a message of echoes, in order of time; beams may have delays.
+    """Return the scans in a message of echoes, in order of time; beams may have delays.
 
-    `kind`: its type's name, with ``/msg/``; `base`: the vehicle's frame; `frames`: where sensors
-    are, by static transforms. Rows have no labels where none of the message's has.
+    `kind`: the name of its type, with ``/msg/``; `base`: the vehicle's frame; `frames`: static
+    transforms to the sensors. Rows have no labels if the whole message has none.
     """
     rows = TopicEchoes(kind)
     with faults_named(f"ROS, {kind}"):

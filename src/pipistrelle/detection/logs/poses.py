@@ -1,16 +1,16 @@
-r"""Poses as odometry: from where the vehicle stood to how it moved in each step.
+r"""Poses as odometry: the motion of the vehicle between poses, and its covariance.
 
-A recorder's frame begins anywhere and drifts away. What it is right about is the way from one pose
-to the next, in the vehicle's axes at the first of them:
+The frame of odometry has an arbitrary origin and drifts, so only the motion between poses is used,
+in the vehicle's axes at the first of them:
 
 .. math:: (d_x, d_y) = R(\theta_k)^T (p_{k+1} - p_k), \quad d_\theta = \theta_{k+1} - \theta_k
 
-Ways follow one another, so rows merge into steps without loss. A step that ends between two rows
-ends on the curve of constant velocity between them: forwards, sideways and turning at once.
+Motions are composed, so rows merge into steps without loss. A step that ends between two rows ends
+on the curve of constant forward, sideways and angular velocity between them.
 
-How sure it is of a way, a row may say: the covariance of what led to it from the row before. That
-of a step is what its ways add up to, an error of heading turning all that is still to come; a way
-that is cut gives each part its share by time.
+A row may state the covariance of the motion from the row before. The covariance of a step is the
+sum of its motions', each carried to the start of the step, as an error of heading turns all later
+motion; a motion that is cut has its covariance divided in proportion to time.
 """
 
 import numpy as np
@@ -24,23 +24,22 @@ from pipistrelle.refusals import refusal
 POSE = ("x", "y", "heading")
 """Columns of a row of poses, besides its time."""
 MOTION_COVARIANCE = ("motion_xx", "motion_xy", "motion_xh", "motion_yy", "motion_yh", "motion_hh")
-"""And those that may follow: of the motion since the row before, in the vehicle's axes there."""
+"""Optional columns: covariance of the motion since the row before, in the vehicle's axes there."""
 
 _RESOLUTION = 1e-6  # [s], within which a step ends with a row
-_INDEFINITE = 1e-6  # how far below 0 an eigenvalue may be by the rounding of a file's numbers
+_INDEFINITE = 1e-6  # largest negative eigenvalue, relative, by rounding of a file's numbers
 _FULL = ([0, 0, 0, 1, 1, 2], [0, 1, 2, 1, 2, 2])
-_JUMP_RATIO = 10.0  # times what is usual
-_MIN_JUMP = (0.5, 0.5)  # [m], [rad]: less in one step is no jump
+_JUMP_RATIO = 10.0  # ratio to the usual speed
+_MIN_JUMP = (0.5, 0.5)  # [m], [rad]: smallest motion in a step that is a jump
 
 
 def motions_between(odometry: Table, time: Float[np.ndarray, " t"]) -> Float[np.ndarray, "t-1 c"]:
-    r"""Return the vehicle's motions from each time to the next, interpolated from poses.
+    """Return the vehicle's motions from each time to the next, interpolated from poses.
 
-    `odometry` has the columns ``time``, ``x``, ``y`` and ``heading``, perhaps with the columns of
-    `MOTION_COVARIANCE`. Of rows of one time the last says where the vehicle is; `time` [s]: rising,
-    from the first row's time or later to the last row's or sooner. Returns forward, sideways [m]
-    and turn [rad] in [-pi, pi), then the covariance, NaN where it is not said for all of a step.
-    Zero to the bit where the vehicle stands.
+    `odometry` has the columns ``time``, ``x``, ``y``, ``heading``, perhaps `MOTION_COVARIANCE`; the
+    last of rows at one time is used. `time` [s] increases, within the times of the rows. Returns
+    forward, sideways [m] and turn [rad] in [-pi, pi), then the covariance, NaN if a part of the
+    step does not state it. Exactly zero if the vehicle is at rest.
 
     >>> from pathlib import Path
     >>> rows = {"time": np.array([0.0, 1.0]), "x": np.array([5.0, 5.0]), "y": np.array([0.0, 2.0])}
@@ -65,9 +64,9 @@ def motions_between(odometry: Table, time: Float[np.ndarray, " t"]) -> Float[np.
 
 
 def relative_motions(poses: Float[np.ndarray, "t 3"]) -> Float[np.ndarray, "t-1 3"]:
-    """Return each pose relative to the one before.
+    """Return each pose relative to the pose before.
 
-    `poses` [m, m, rad]. Returns [m, m, rad]: forward, sideways, and the turn the shorter way.
+    `poses` [m, m, rad]. Returns forward, sideways [m] and the shorter turn [rad].
 
     >>> relative_motions(np.array([[1.0, 1.0, 3.0], [1.0, 1.0, -3.0]])).round(3) + 0.0
     array([[0.   , 0.   , 0.283]])
@@ -79,10 +78,10 @@ def relative_motions(poses: Float[np.ndarray, "t 3"]) -> Float[np.ndarray, "t-1 
 
 
 def poses_along(motions: Float[np.ndarray, "k _"]) -> Float[np.ndarray, "k+1 3"]:
-    """Return the poses that motions lead to, one after another, from the origin.
+    """Return the poses along a sequence of motions, from the origin.
 
-    `motions` [m, m, rad]: forward, sideways, turn; what follows is not looked at. Returns [m, m,
-    rad]: headings wrapped. `relative_motions` gives the motions again, up to rounding.
+    `motions`: forward, sideways [m] and turn [rad]; further columns are ignored. Returns [m, m,
+    rad] with wrapped headings. Inverse of `relative_motions`, up to rounding.
 
     >>> poses_along(np.array([[1.0, 0.0, np.pi / 2], [1.0, 0.0, 0.0]])).round(3)[:, :2] + 0.0
     array([[0., 0.],
@@ -95,11 +94,10 @@ def poses_along(motions: Float[np.ndarray, "k _"]) -> Float[np.ndarray, "k+1 3"]
 
 
 def jumps(motions: Float[np.ndarray, "k _"], dt: Float[np.ndarray, " k"]) -> Int[np.ndarray, " j"]:
-    """Find steps that may be a restart of the odometry's frame instead of motion.
+    """Find possible restarts of the odometry's frame: steps of implausible speed.
 
-    `motions` [m, m, rad]; `dt` [s]. Returns those in which the vehicle would go, or turn, more than
-    ten times as fast as in nine tenths of the steps in which it does so at all, and half a metre or
-    half a radian or more.
+    `motions` [m, m, rad]; `dt` [s]. Returns the steps of 0.5 m or 0.5 rad or more whose speed, or
+    angular rate, exceeds ten times the 90th percentile of the moving steps.
 
     >>> drive = np.tile([0.1, 0.0, 0.0], (20, 1))
     >>> drive[7] = [40.0, -3.0, 0.0]
@@ -119,7 +117,7 @@ def jumps(motions: Float[np.ndarray, "k _"], dt: Float[np.ndarray, " k"]) -> Int
 def _turned(
     points: Float[np.ndarray, "k 2"], angle: Float[np.ndarray, " k"]
 ) -> Float[np.ndarray, "k 2"]:
-    """Turn each point by its angle."""
+    """Rotate each point by its angle."""
     c, s, (x, y) = np.cos(angle), np.sin(angle), points.T
     return np.column_stack([c * x - s * y, s * x + c * y])
 
@@ -127,7 +125,7 @@ def _turned(
 def _at_rows(
     time: Float[np.ndarray, " t"], rows: Float[np.ndarray, " n"]
 ) -> Float[np.ndarray, " t"]:
-    """Snap times to rows that differ from them by rounding alone."""
+    """Snap times to the times of rows within `_RESOLUTION`."""
     after = np.clip(np.searchsorted(rows, time), 1, len(rows) - 1)
     nearest = np.where(time - rows[after - 1] < rows[after] - time, rows[after - 1], rows[after])
     return np.where(np.abs(nearest - time) <= _RESOLUTION, nearest, time)
@@ -136,7 +134,7 @@ def _at_rows(
 def _poses_at(
     time: Float[np.ndarray, " t"], rows: Float[np.ndarray, " n"], poses: Float[np.ndarray, "n 3"]
 ) -> Float[np.ndarray, "t 3"]:
-    """Return the poses at other times, on curves of constant velocity between the rows."""
+    """Interpolate poses at other times, on curves of constant velocity between the rows."""
     ways = np.vstack([relative_motions(poses), np.zeros((1, 3))])
     lengths = np.append(np.diff(rows), 1.0)
     row = np.searchsorted(rows, time, side="right") - 1
@@ -150,7 +148,7 @@ def _poses_at(
 def _across_arc(
     points: Float[np.ndarray, "k 2"], turn: Float[np.ndarray, " k"], *, back: bool = False
 ) -> Float[np.ndarray, "k 2"]:
-    """Convert arc lengths along turns to displacements, or back."""
+    """Convert arc lengths along turns to displacements; with `back`, the inverse."""
     half = 0.5 * turn
     chord = np.sinc(half / np.pi)[:, None]
     return _turned(points / chord, -half) if back else _turned(points * chord, half)
@@ -163,14 +161,11 @@ def _step_covariances(
     poses: Float[np.ndarray, "n 3"],
     stated: Float[np.ndarray, "n 3 3"],
 ) -> Float[np.ndarray, "t-1 3 3"]:
-    """Sum the covariances of the rows' motions, in the axes at the start of each step.
-
-    Rows, those of one time too, and the ends of steps cut the drive into parts, each of one way.
-    """
+    """Sum the covariances of the rows' motions, in the axes at the start of each step."""
     extra = np.flatnonzero(~np.isin(time, stamp))
     order = np.argsort(np.append(stamp, time[extra]), kind="stable")
     cut, at = np.append(stamp, time[extra])[order], np.vstack([poses, there[extra]])[order]
-    way = np.cumsum(order < len(stamp))[:-1]  # by the row to which it leads
+    way = np.cumsum(order < len(stamp))[:-1]  # index of the row that ends the motion
     whole = stamp[way] - stamp[way - 1]
     share = np.divide(np.diff(cut), whole, out=np.ones(len(whole)), where=whole > 0.0)
     step = np.searchsorted(time, cut[1:]) - 1
@@ -191,7 +186,7 @@ def _step_covariances(
 
 
 def _check_ways(odometry: Table, poses: Float[np.ndarray, "n 3"]) -> None:
-    """Refuse poses more than a whole turn or too far from the one before."""
+    """Raise if two consecutive poses differ by more than a whole turn or by `FARTHEST`."""
     turn = np.abs(np.diff(odometry.column["heading"]))
     far = np.flatnonzero(turn > 2.0 * np.pi * 1.001)
     if far.size:
@@ -210,7 +205,7 @@ def _check_ways(odometry: Table, poses: Float[np.ndarray, "n 3"]) -> None:
 
 
 def _covariances(odometry: Table) -> Float[np.ndarray, "n 3 3"]:
-    """Return the covariance of the motion that led to each row; NaN where the row states none."""
+    """Return the covariance of the motion to each row; NaN if the row does not state it."""
     absent = np.full(len(odometry.line), np.nan)
     column = [odometry.column.get(name, absent) for name in MOTION_COVARIANCE]
     values = np.column_stack(column)
@@ -232,7 +227,7 @@ def _covariances(odometry: Table) -> Float[np.ndarray, "n 3 3"]:
 def _definite(
     odometry: Table, covariance: Float[np.ndarray, "n 3 3"], rows: Int[np.ndarray, " n"]
 ) -> Float[np.ndarray, "n 3 3"]:
-    """Refuse a matrix that is no covariance; set eigenvalues to 0 that rounding made negative."""
+    """Raise if a matrix is not a covariance; set negative eigenvalues of rounding to 0."""
     variance = np.diagonal(covariance, axis1=1, axis2=2)
     std = np.sqrt(np.maximum(variance, 0.0))
     unit = np.where(std > 0.0, std, 1.0)[:, :, None]

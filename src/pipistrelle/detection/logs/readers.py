@@ -1,8 +1,7 @@
-"""The formats of recorded logs: one entry each, found by what a folder holds.
+"""The formats of recorded logs, and how a log's format is recognised.
 
-To add one, write what reads it in a file of its own beside this one, and give it an entry here. An
-entry's reader is imported when a log is read: the command line names the formats at once. The
-truth of a log is none of this room's business; whoever may see it finds it by the entry's name.
+To add a format, write its reader in a new file of this folder, and add an entry here. A reader is
+imported only when a log is read. The truth of a log is read elsewhere, by the entry's name.
 """
 
 from collections.abc import Callable, Sequence
@@ -18,9 +17,9 @@ _OTHERS = {
     frozenset({".wav", ".flac", ".aif", ".aiff", ".ogg", ".mp3"}): "an audio recording, which is "
     "no log; make a log folder of it with `pipistrelle hear` (docs/sound.md)",
 }
-"""Recordings that have no reader, by the endings of their files."""
+"""Recordings without a reader, by the suffixes of their files."""
 Robot = int | str
-"""Whose log of several: by number or by name, as the format has it."""
+"""A robot of a log of several, by number or by name, as the format has it."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -29,29 +28,27 @@ class Reader:
 
     name: str
     title: str
-    """Name in refusals."""
+    """Name in errors."""
     recognises: Callable[[Path], bool]
-    """Tells by its files whether it holds such a log."""
+    """Return whether a path holds such a log."""
     read: "Callable[..., Log]"
-    """Reads the folder or file, of one robot where it holds several, as a `Log`."""
+    """Read a path, and a robot if it holds several, as a `Log`."""
     configured: bool = False
-    """Whether ``read`` is given the settings of the section ``bag``, after the path."""
+    """Whether ``read`` takes the settings of the section ``bag``, after the path."""
     robots: Callable[[Path], Sequence[Robot]] | None = None
-    """Lists the robots whose logs it holds, by number or by name: ``read`` is given one of
-    these. Without it there is one, and it needs no name."""
+    """List the robots of a path, by number or by name; None if a log has only one robot."""
     files: tuple[str, ...] = ("*",)
-    """Patterns of what it may read in the folder, by which a log is known to be the same again."""
+    """Patterns of files that it may read in a folder; their content identifies a log."""
     help: str = ""
     robot_help: str = ""
-    """`help` and `robot_help`: what the command line says of the folder, and of whom ``--robot``
-    chooses from."""
+    """`help` and `robot_help`: texts of the command line for the path, and for ``--robot``."""
 
 
 def reader_of(folder: Path, readers: Sequence[Reader] = ()) -> Reader:
     """Find the reader of a folder: the first that recognises it.
 
-    `readers`: asked before the package's own. A folder that none recognises goes to the reader of
-    the package's own log folders, which says what is missing.
+    `readers` are tried before the package's. If none recognises the folder, the reader of log
+    folders is returned, whose error names the missing files.
 
     >>> reader_of(Path("/nowhere")).name
     'folder'
@@ -64,8 +61,7 @@ def reader_of(folder: Path, readers: Sequence[Reader] = ()) -> Reader:
 
 
 def recording_of(path: Path) -> str | None:
-    """Name the kind of a recording that no reader takes, and say what can be done with it.
-
+    """Return advice for a recording that no reader takes, such as audio; None if there is none.
 
     >>> recording_of(Path("walk.wav"))[:36], recording_of(Path("walk"))
     ('an audio recording, which is no log;', None)
@@ -84,7 +80,7 @@ def _read_log_folder(folder: Path) -> "Log":
 
 
 def _is_bag(path: Path) -> bool:
-    """Tell whether a path is named as a ROS bag, or is a folder of ROS 2."""
+    """Return whether a path has the suffix of a ROS bag, or is a folder of a ROS 2 bag."""
     from pipistrelle.detection.logs.bag import BAGS, storages
 
     if not path.is_dir():
@@ -100,12 +96,12 @@ def _read_bag(path: Path, settings: Any, **framed: Any) -> "Log":
 
 
 def _is_mrclam(folder: Path) -> bool:
-    """Tell whether a folder is a MRCLAM set: it has barcodes, or odometry of a robot."""
+    """Return whether a folder is a MRCLAM set: it has barcodes, or a robot's odometry."""
     return (folder / "Barcodes.dat").exists() or any(folder.glob("Robot*_Odometry.dat"))
 
 
 def _mrclam_robots(folder: Path) -> list[Robot]:
-    """List the robots whose odometry is there, by number or by the text in its place."""
+    """List the robots with odometry in a MRCLAM set, by number if the file name has one."""
     files = sorted(path.name for path in folder.glob("Robot*_Odometry.dat"))
     names = [name.removeprefix("Robot").removesuffix("_Odometry.dat") for name in files]
     numbers = {str(number): number for number in range(1, 6)}
@@ -147,4 +143,4 @@ ROS_BAG = Reader(
     files=("metadata.yaml", "*.db3*", "*.mcap*"),
 )
 READERS = (LOG_FOLDER, MRCLAM, ROS_BAG)
-"""All formats, in the order in which they are asked."""
+"""All formats, in the order in which they are tried."""

@@ -1,10 +1,10 @@
 """A recorded drive: rows of odometry become steps, measurements become scans.
 
 A row of odometry holds from its time to the next row's; the last row only ends the log. A row of
-poses says where the vehicle is, and a step is the motion from one to another (`poses`). A
-measurement is used at the end of the step (t[i-1], t[i]] that holds it, at the start when its time
-is the first row's. Oddities that sound logs contain are dropped and counted. This is the same for
-all formats, and here alone do recorded measurements become scans.
+poses gives the vehicle's position and heading, and a step is the motion between two (`poses`). A
+measurement is used at the end of the step (t[i-1], t[i]] that contains it, and at the start if its
+time is the first row's. Irregular rows that sound logs contain are dropped and counted. All formats
+are converted here.
 """
 
 import math
@@ -31,7 +31,7 @@ from pipistrelle.geometry import wrap
 from pipistrelle.refusals import refusal
 
 MEASUREMENT = ("time", "landmark", "bearing", "range")
-"""What is said of a measurement: when it was made, and the columns of its scan."""
+"""Columns of every measurement: its time, and the columns of its scan."""
 STATED = (
     "bearing_std",
     "range_std",
@@ -40,64 +40,61 @@ STATED = (
     "bearing_slope",
     "level_db",
 )
-"""What may be said besides: how surely it was measured, how much later than the direct call it
-came, as a way of sound, how the bearing hangs on the speed of sound, and how loud it was. Without
-labels an excess path of 0 says that this is the direct call."""
+"""Optional columns of a measurement: standard deviations, excess path, slope of the bearing in the
+speed of sound, and level. Without labels, an excess path of 0 marks the direct call."""
 CALLER = "caller"
-"""Whose call it was, where it was not the vehicle's own: a number, from 1 on."""
+"""Column of the caller's number, from 1; absent or NaN for the vehicle's own call."""
 
 MAX_TIME = 1e11
-"""Beyond the year 5000, if counted from 1970 [s]."""
+"""Latest time [s]: beyond the year 5000, if counted from 1970."""
 
 _RESOLUTION = 1e-6  # [s], of the boundaries of merged steps
 _MAX_STEPS = 10_000_000
-_MAX_GAP = 10.0  # [s], typically between two rows of odometry, or of the truth
-_LONG_GAP = 1000.0  # times what is typical: a recording that drops but one row in ten, each by
+_MAX_GAP = 10.0  # [s], median gap between rows of odometry or of the truth
+_LONG_GAP = 1000.0  # ratio to the median gap: a recording that drops one row in ten, each by
 # itself, loses so many in a row with a chance of 1e-1000
 _UNITS = (1e-3, 1e-6, 1e-9)  # [s], of other clocks
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class LogCaller:
-    """Someone else whose calls were recorded."""
+    """A caller, other than the vehicle, in a recorded log."""
 
     name: str
-    """Number that its rows have."""
+    """Name in ``log.toml`` and in the column of callers."""
     landmark: int
-    """The label that it bears as a landmark."""
+    """Its label as a landmark."""
     moves: bool = False
-    """Whether it moves: it is then no landmark of the map, and filters may follow it."""
+    """Whether it moves: it is then not a landmark of the map, but estimators may track it."""
     place: tuple[float, float] | None = None
     place_std: tuple[float, float] | None = None
-    """`place` and `place_std`: where it stands, and the standard deviation of that: 1e-3 m where
-    none is stated [m]."""
+    """`place` and `place_std`: its position and standard deviation [m], by default 1e-3 m."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Log:
-    """A recorded drive: what the vehicle did and heard, and how far to trust it."""
+    """A recorded drive: controls, scans, and the noise of both."""
 
     name: str
     time: Float[np.ndarray, " t"]
     """The start, then the end of each step [s]."""
     controls: Float[np.ndarray, "t-1 c"]
-    """Velocity [m/s] and angular rate [rad/s] (bicycle, car: speed and steering angle [rad]); of
+    """Velocity [m/s] and angular rate [rad/s] (bicycle, car: speed and steering angle [rad]); for
     poses the motion in the step, forward, sideways [m] and turn [rad], perhaps with its
     covariance (`pipistrelle.estimation.motion`)."""
     dt: Float[np.ndarray, " t-1"]
     """Length of each step [s]."""
     scans: tuple[Scan, ...]
-    """In order; each bears exactly the ``time`` entry at which it is used."""
+    """In order; the ``time`` of each is the entry of `time` at which it is used."""
     motion: Literal["unicycle", "bicycle", "poses", "ackermann"]
     wheelbase: float = 1.0
     """Bicycle and car only [m]."""
     speed_offset: float = 0.0
-    """How far left of the middle of the rear axle a car's speed is measured [m]."""
+    """Lateral offset of a car's speed sensor, to the left of the middle of the rear axle [m]."""
     sensor_pose: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    """Where the sensor is in the vehicle: ahead, to the left [m] and turned to the left [rad]."""
+    """Pose of the sensor on the vehicle: ahead, to the left [m], and turned to the left [rad]."""
     control_std: tuple[float, ...]
-    """Noise of the controls in one step, constant over it; of a motion that does not say its
-    own."""
+    """Noise of the controls, constant over a step, unless the motion states its covariance."""
     noise_at_rest: bool = True
     """Whether a step of zero controls or zero motion has noise; if not, it is exact."""
     initial_pose: tuple[float, float, float]
@@ -108,31 +105,28 @@ class Log:
     bearing_std: float
     """Bearing std [rad]."""
     excess_path_std: float | None = None
-    """None: not said [m]."""
+    """None if the log does not state it [m]."""
     range_bounds: tuple[float, float]
     """Nearest and farthest range of a passive landmark [m]."""
     callers: tuple[LogCaller, ...] = ()
     """The other callers; the first is number 1 of the scans' callers."""
     association: Mapping[str, float] = field(default_factory=dict)
-    """What the log says of its sensor for an association, by the names of settings."""
+    """Settings of `association` that the log states for its sensor."""
     gate: float | None = None
-    """Share of a measurement's predicted distribution that is accepted; None: not said."""
+    """Probability that a measurement passes the gate; None if the log does not state it."""
     ignored_rows: dict[str, int]
-    """Rows that were dropped, by reason."""
+    """Number of dropped rows, by reason."""
     bearings: Float[np.ndarray, " n"] | None = None
-    """Bearings of all scans' rows before they were wrapped; None: as they are in the scans."""
+    """Bearings of all scans before they were wrapped; None if the scans' are unchanged."""
     former_names: tuple[str, ...] = ()
     """Columns and keys that the log calls by former names (`text_tables.FORMER_NAMES`)."""
     notes: tuple[str, ...] = ()
-    """What its reader chose or converted, for the user, a line each."""
+    """Choices and conversions of the reader, for the user, a line each."""
     doubts: tuple[str, ...] = ()
-    """What its reader took and finds odd: warnings for the user, a line each."""
+    """Oddities that the reader accepted: warnings for the user, a line each."""
 
     def recorded_bearings(self) -> Float[np.ndarray, " n"]:
-        """Return the bearings of all rows in the order of the scans, as they were recorded.
-
-        Where the rows of scans are others than those that were read, their bearings are returned.
-        """
+        """Return the recorded bearings of all scans, before wrapping."""
         wrapped = np.concatenate([np.empty(0), *(scan.bearing for scan in self.scans)])
         read = wrapped if self.bearings is None else self.bearings
         return read if np.array_equal(wrap(read), wrap(wrapped), equal_nan=True) else wrapped
@@ -148,37 +142,18 @@ def assemble(
     ignored_rows: dict[str, int] | None = None,
     **settings: Any,
 ) -> Log:
-    """Make a log of two tables: rows become steps, measurements become scans.
+    """Make a log of a table of odometry and a table of measurements.
 
-    Parameters
-    ----------
-    odometry : Table of ``time`` and two controls, or of poses
-        Of ``motion = "poses"`` as `motions_between` takes them.
-    measurements : Table of ``time``, ``landmark``, ``bearing`` and ``range``
-        Perhaps with ``bearing_std``, ``range_std``, ``excess_path``, ``excess_path_std`` and
-        ``caller``, its number, NaN where it is not known. A row without a bearing is a further
-        excess path of a landmark.
-    step : [s]
-        Length of the steps into which rows are merged; None: one step each.
-    time_offset : [s]
-        How late the times of measurements are, by the odometry's clock.
-    span : (start, end) [s]
-        The log is cut to it.
-    ignored_rows : dict of str to int
-        Rows dropped so far, by reason.
-    settings
-        The other fields of `Log`.
+    `odometry` has ``time`` and two controls or, for ``motion = "poses"``, the columns of
+    `motions_between`. `measurements` has the columns `MEASUREMENT`, and any of `STATED` and
+    `CALLER` (NaN if unknown); a row without a bearing is a further excess path of a landmark.
+    `step` [s]: length of the steps into which rows are merged (None: each row is a step);
+    `time_offset` [s]: delay of the measurements' times relative to the odometry's clock; `span`
+    [s]: times to which the log is cut; `ignored_rows`: rows dropped so far, by reason; `settings`:
+    the other fields of `Log`.
 
-    Returns
-    -------
-    Log
-
-    Raises
-    ------
-    InputError
-        If nothing of the odometry or of the measurements is left, a landmark is measured twice at
-        one time by the same call, an excess path has no caller, or times can be no seconds;
-        what `motions_between` refuses.
+    Raises InputError if no odometry or no measurement remains, a landmark is measured twice at one
+    time with the same call, an excess path has no caller, or times cannot be seconds.
     """
     check_seconds(odometry)
     check_seconds(measurements, math.inf)
@@ -223,9 +198,9 @@ def assemble(
 
 
 def _labelled(measurements: Table, callers: tuple[LogCaller, ...]) -> tuple[Table, int]:
-    """Return the rows that have a label, or all where none has; how many were left out."""
+    """Return the labelled rows, or all if no row has a label, and the number of rows left out."""
     clutter = measurements.column["landmark"] == UNLABELLED
-    if clutter.all():  # nobody has labelled anything
+    if clutter.all():
         return _of_callers(measurements, callers), 0
     kept = _of_callers(rows_kept(measurements, ~clutter), callers)
     check_unique(kept, "time", "landmark", besides=CALLER)
@@ -233,24 +208,10 @@ def _labelled(measurements: Table, callers: tuple[LogCaller, ...]) -> tuple[Tabl
 
 
 def scan_at(time: float, rows: Table, callers: tuple[LogCaller, ...]) -> Scan:
-    """Make a scan of the rows of one time, as `assemble` does of a table.
+    """Make the scan of measurements at one time, as `assemble` does.
 
-    Parameters
-    ----------
-    time : [s]
-    rows : Table of ``landmark``, ``bearing``, ``range`` and ``caller``
-        And of what else a log may say of a measurement; at least one row.
-    callers : tuple of LogCaller
-
-    Returns
-    -------
-    Scan
-        Rows without a bearing stand at its end.
-
-    Raises
-    ------
-    InputError
-        For a row that no log may have.
+    `rows` have ``landmark``, ``bearing``, ``range``, ``caller``, perhaps other columns of a log.
+    Raises InputError if a row is not valid in a log.
     """
     check_columns(rows)
     rows = _of_callers(rows, callers)
@@ -262,10 +223,7 @@ def scan_at(time: float, rows: Table, callers: tuple[LogCaller, ...]) -> Scan:
 
 
 def check_seconds(table: Table, longest_gap: float = _MAX_GAP) -> None:
-    """Refuse times that are not plausible as seconds; name the unit they may have.
-
-    `table`: with a column ``time``; `longest_gap` [s]: typically between two rows.
-    """
+    """Raise if times, or gaps above `longest_gap` [s], are implausible; name the likely unit."""
     time = table.column["time"]
     gaps = np.diff(time)
     typical = float(np.median(gaps[gaps > 0.0])) if np.any(gaps > 0.0) else 0.0
@@ -274,14 +232,14 @@ def check_seconds(table: Table, longest_gap: float = _MAX_GAP) -> None:
         return
     if latest > MAX_TIME:
         factor = next((unit for unit in _UNITS if latest * unit <= MAX_TIME / 10.0), _UNITS[-1])
-    else:  # of 1 ms, 1 us and 1 ns, that which makes it likeliest 0.1 s
+    else:  # the unit of 1 ms, 1 us and 1 ns that makes the median gap closest to 0.1 s
         factor = min(_UNITS, key=lambda unit: abs(math.log10(typical * unit / 0.1)))
     found = f"times from {time[0].item():g} to {time[-1].item():g}, typically {typical:g} apart"
     raise refusal(table.path, found, "seconds", f"multiply them by {factor:g}")
 
 
 def _cut(path: Path | str, time: np.ndarray, span: tuple[float, float]) -> np.ndarray:
-    """Return the times (k + 1) of the rows within a span, its ends among them."""
+    """Return the odometry's times within a span, including both ends of the span."""
     start, end = max(time[0], span[0]), min(time[-1], span[1])
     if start >= end:
         found = f"times from {time[0].item()!r} to {time[-1].item()!r}"
@@ -293,7 +251,7 @@ def _cut(path: Path | str, time: np.ndarray, span: tuple[float, float]) -> np.nd
 
 
 def _single(odometry: Table, time: np.ndarray) -> np.ndarray:
-    """Return the times of rows that are one step each; refuse a row that holds too long."""
+    """Return the odometry times; raise if a gap is longer than `LONGEST_STEP`."""
     long = np.flatnonzero(np.diff(time) > LONGEST_STEP)
     if long.size:
         row = int(np.searchsorted(odometry.column["time"], time[long[0] + 1]))
@@ -305,7 +263,7 @@ def _single(odometry: Table, time: np.ndarray) -> np.ndarray:
 
 
 def _merged(path: Path | str, time: np.ndarray, step: float) -> np.ndarray:
-    """Return the times of the start and of the ends of steps of one length."""
+    """Return the start, then the ends of steps of equal length."""
     count = max(1.0, np.ceil((time[-1] - time[0] - _RESOLUTION) / step))
     if count > _MAX_STEPS:
         gap, start, end, _ = _widest_gap(time)
@@ -319,7 +277,7 @@ def _merged(path: Path | str, time: np.ndarray, step: float) -> np.ndarray:
 
 
 def _widest_gap(time: np.ndarray) -> tuple[float, float, float, float]:
-    """Return the widest gap between times, its start and end, and what is typical [s]."""
+    """Return the widest gap between times, its start and end, and the median gap [s]."""
     gaps = np.diff(time)
     row = int(np.argmax(gaps))
     start, end = time[row : row + 2].tolist()
@@ -327,7 +285,7 @@ def _widest_gap(time: np.ndarray) -> tuple[float, float, float, float]:
 
 
 def _silence(time: np.ndarray, step: float | None) -> list[str]:
-    """Ask about a gap that no recorder leaves by chance."""
+    """Return a warning if one gap in the odometry is far longer than the others."""
     gap, start, end, typical = _widest_gap(time)
     if not gap > max(_LONG_GAP * typical, _MAX_GAP):
         return []
@@ -353,7 +311,7 @@ def _mean_controls(
 
 
 def _of_callers(measurements: Table, callers: tuple[LogCaller, ...]) -> Table:
-    """Return the caller numbers of all rows; refuse invalid excess paths and empty rows."""
+    """Add the callers' numbers as a column; raise on invalid excess paths and empty rows."""
     column, nothing = measurements.column, np.full(len(measurements.line), np.nan)
     caller, excess_path = column.get(CALLER, nothing), column.get("excess_path", nothing)
     own = np.array([UNLABELLED, *(one.landmark for one in callers)])
@@ -387,7 +345,7 @@ def _of_callers(measurements: Table, callers: tuple[LogCaller, ...]) -> Table:
 
 
 def _in_order(measured: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
-    """Return measurements in the order of time; rows without a bearing are the last of theirs."""
+    """Sort measurements by time; at equal times, rows without a bearing are last."""
     order = np.lexsort((np.isnan(measured["bearing"]), measured["time"]))
     return {name: column[order] for name, column in measured.items()}
 
@@ -398,7 +356,7 @@ def _scans(
     resolution: float,
     callers: tuple[LogCaller, ...],
 ) -> tuple[Scan, ...]:
-    """Return a scan for each time of ordered measurements, at the end of the step that holds it."""
+    """Return a scan for each time of the sorted measurements, at the end of its step."""
     labels = (
         np.array([UNLABELLED, *(caller.landmark for caller in callers)]) if callers else NO_CALLERS
     )
@@ -417,9 +375,9 @@ def _scans(
 
 
 def _with_direct_calls(scan: Scan, callers: int) -> Scan:
-    """Return a scan without labels that knows which rows are direct calls: excess paths of 0."""
+    """Mark the direct call of each caller in a scan without labels: an excess path of 0."""
     direct, straight = np.full(1 + callers, UNLABELLED), scan.excess_path == 0.0
-    for row in np.flatnonzero(straight)[::-1]:  # the first counts
+    for row in np.flatnonzero(straight)[::-1]:  # the first is used
         direct[scan.caller[row]] = row
     excess = np.where(straight, np.nan, scan.excess_path)
     return replace(with_columns(scan, excess_path=excess), direct=direct)

@@ -1,6 +1,6 @@
-"""Text files of columns of numbers, read so that whatever is wrong has a line.
+"""Text tables: columns of numbers, parsed with errors that name the line.
 
-A sound file is read at once, 60,000 rows in some hundredths of a second; any other, row by row.
+A valid file is parsed at once, 60,000 rows in some hundredths of a second; any other, row by row.
 """
 
 import math
@@ -35,7 +35,7 @@ _BOUNDS = {
     "angular_rate": ("rad/s", -WIDEST, WIDEST),
     "steering": ("rad", -WIDEST, WIDEST),
 }
-"""Unit, least and most of a column's numbers."""
+"""Unit, smallest and largest value of a column."""
 FORMER_NAMES = MappingProxyType({"detour": "excess_path", "detour_std": "excess_path_std"})
 """Former names of columns and keys of logs, and their present names."""
 
@@ -45,15 +45,15 @@ class Table:
     """The checked rows of a text file: numbers are finite, and times never decrease."""
 
     path: Path | str
-    """The file; of a bag, with the topic."""
+    """The file; for a bag, with the topic."""
     line: Int[np.ndarray, " n"]
-    """Line of each row in the file, from 1; of a bag, its message in the topic."""
+    """Line of each row in the file, from 1; for a bag, its message in the topic."""
     unit: str = "line"
-    """What `line` counts, in refusals."""
+    """The noun of `line` in errors."""
     column: dict[str, np.ndarray]
-    """Values by column; labels are integers, what is missing is NaN."""
+    """Values by column; labels are integers, missing values NaN."""
     former: tuple[str, ...] = ()
-    """Columns that the file calls by a former name (`FORMER_NAMES`)."""
+    """Former names of columns in the file (`FORMER_NAMES`)."""
 
 
 def read_table(
@@ -65,37 +65,16 @@ def read_table(
     in_order: bool = True,
     words: Mapping[str, tuple[str, ...]] = MappingProxyType({}),
 ) -> Table:
-    r"""Read rows of numbers; blank lines and lines that begin with ``#`` are skipped.
+    r"""Read a text file of columns of numbers; blank lines and lines with ``#`` are skipped.
 
-    Each column keeps what its name promises: ``time`` never runs back, ``range`` and the standard
-    deviations are positive, labels are integers.
+    Columns are checked by name: ``time`` never decreases, ``range`` and the standard deviations are
+    positive, labels are integers.
 
-    Parameters
-    ----------
-    path : Path
-    columns : names
-        With a separator, the first line must hold them.
-    separator : str or None
-        None: white space, and no header.
-    optional : names
-        The columns whose fields may be empty. Those that are not among ``columns`` may follow them;
-        one that the header does not hold is empty in every row.
-    in_order : bool
-        Whether those that follow do so in this order.
-    words : dict of column to words
-        Columns that hold one of these words; their values are its place in the list.
+    `columns` must be in the header; without a `separator` there is none, and fields are separated
+    by white space. Fields of `optional` columns may be empty; a column that is not in the header is
+    empty in every row. `in_order`: whether further columns must follow in this order. `words`:
+    words of a column, replaced by their indices. Raises InputError with the file and the line.
 
-    Returns
-    -------
-    Table
-
-    Raises
-    ------
-    InputError
-        With the file and the line.
-
-    Examples
-    --------
     >>> from tempfile import TemporaryDirectory
     >>> with TemporaryDirectory() as place:
     ...     path = Path(place) / "posts.csv"
@@ -140,7 +119,7 @@ def read_table(
 
 
 def table_text(columns: tuple[str, ...], *values: np.ndarray) -> str:
-    r"""Lay out columns with a header: floats exactly, NaN as an empty field.
+    r"""Format columns as text with a header: floats exactly, NaN as an empty field.
 
     `values`: numbers, or words without commas.
 
@@ -160,20 +139,20 @@ def _field(value: float | str) -> str:
 
 
 def place_of(table: Table, row: int) -> str:
-    """Say where a row stands."""
+    """Return the file and line of a row, for an error message."""
     return f"{table.path}, {table.unit} {table.line[row]}"
 
 
 def rows_kept(table: Table, kept: Bool[np.ndarray, " n"]) -> Table:
-    """Return a table of some of its rows."""
+    """Select rows of a table by a mask."""
     column = {name: values[kept] for name, values in table.column.items()}
     return replace(table, line=table.line[kept], column=column)
 
 
 def check_unique(table: Table, *names: str, besides: str | None = None) -> None:
-    """Refuse a table in which two rows agree in all of these columns.
+    """Raise if two rows of a table agree in all of these columns.
 
-    `besides` is one more column of whole numbers, which refusals do not name.
+    `besides`: a further column of whole numbers, which the error does not name.
 
     >>> column = {"landmark": np.array([4, 7, 4])}
     >>> check_unique(Table(path=Path("x.csv"), line=np.array([2, 3, 4]), column=column), "landmark")
@@ -197,7 +176,7 @@ def check_unique(table: Table, *names: str, besides: str | None = None) -> None:
 def _numbered(
     where: str, line: str, columns: tuple[str, ...], words: Mapping[str, tuple[str, ...]]
 ) -> str:
-    """Replace words by numbers in a row of comma-separated fields."""
+    """Replace words by their indices in a row of comma-separated fields."""
     fields = line.split(",") if words else []
     if len(fields) != len(columns):
         return line
@@ -215,7 +194,7 @@ def _numbered(
 def _read_at_once(
     lines: list[str], columns: int, separator: str | None
 ) -> Float[np.ndarray, "n c"] | None:
-    """Parse all rows at once; None if one is not the right number of finite numbers."""
+    """Parse all rows at once; None if any row is not `columns` finite numbers."""
     try:
         values = np.loadtxt(lines, delimiter=separator, comments=None, ndmin=2)
     except ValueError:
@@ -231,7 +210,7 @@ def _read_row(
     line: int,
     text: str,
 ) -> list[float]:
-    """Return the numbers of one row, or refuse it."""
+    """Parse the numbers of a row; raise at the first invalid field."""
     where, fields = f"{path}, line {line}", text.split(separator)
     if len(fields) != len(columns):
         expected = f"{len(columns)}: {', '.join(columns)}"
@@ -263,7 +242,7 @@ def check_columns(table: Table) -> None:
             from_here = "above 0" if least == 1.0 / LARGEST else f"from {least:g}"
             promise = f"a {name} {from_here} {unit}, up to {most:g} {unit}"
         elif name in _LABELS:
-            if np.isnan(values).all():  # nobody has labelled anything
+            if np.isnan(values).all():
                 values[:] = UNLABELLED
             wrong = (values != np.rint(values)) | (values < UNLABELLED) | (values >= 2**53)
             promise = f"an integer from 0 to {2**53 - 1}, or {UNLABELLED} for clutter"
@@ -287,5 +266,5 @@ def check_columns(table: Table) -> None:
 
 
 def _written(value: float) -> str:
-    """Return a number as a message shows it; quotes around nothing for an empty field."""
+    """Format a number for an error; NaN is an empty field, in quotes."""
     return "''" if math.isnan(value) else repr(value)

@@ -1,4 +1,4 @@
-"""What ``log.toml`` says: how a vehicle moves, where it starts, and how surely it measures."""
+"""The keys of ``log.toml``: motion model, initial pose, noise, sensor and callers."""
 
 from collections.abc import Mapping
 from math import inf, pi
@@ -40,7 +40,7 @@ NOISY = {
     "ackermann": ("speed", "steering"),
     "poses": ("forward", "sideways", "turn"),
 }
-"""What of a row of odometry has a standard deviation in ``log.toml``."""
+"""Quantities of each motion model that have a standard deviation in ``log.toml``."""
 ODOMETRY = NOISY | {"poses": POSE}
 """Columns of a row of odometry, besides its time."""
 
@@ -70,7 +70,7 @@ class _Caller(Section):
 
 
 class _Association(Section):
-    """What is known of the sensor; settings of the same names."""
+    """Properties of the sensor, by the names of the settings of `association`."""
 
     model_config = ConfigDict(strict=True)
 
@@ -120,7 +120,7 @@ class Vehicle(Section):
         return bounds
 
     def told(self) -> dict[str, Any]:
-        """Return what it says by the names of a `Log`."""
+        """Return the values as fields of a `Log`."""
         values = {name: getattr(self, name) for name in type(self).model_fields if name in TOLD}
         values["control_std"] = tuple(getattr(self, f"{name}_std") for name in NOISY[self.motion])
         values["association"] = self.association.model_dump(exclude_none=True)
@@ -128,7 +128,7 @@ class Vehicle(Section):
         return values
 
     def text(self) -> str:
-        """Return ``log.toml``."""
+        """Return the text of ``log.toml``."""
         import tomli_w
 
         return tomli_w.dumps(self.model_dump(mode="json", exclude_defaults=True, exclude_none=True))
@@ -169,15 +169,15 @@ KINDS: dict[str, type[Vehicle]] = {
     "poses": _Poses,
 }
 OF_FILES = ("format", "step", "time_offset")
-"""The keys that say how the tables are read."""
+"""Keys that affect how the tables are read."""
 SHARED = tuple(name for name in Vehicle.model_fields if name not in OF_FILES)
-"""The keys that every log has."""
+"""Keys that every log has."""
 TOLD = (*SHARED, "wheelbase", "speed_offset")
-"""The keys that are those of a `Log`, where a motion model has them."""
+"""Keys that become fields of a `Log`, if the motion model has them."""
 
 
 def read_vehicle(path: Path) -> tuple[Vehicle, tuple[str, ...]]:
-    """Read a ``log.toml``; return what it says, and which keys it calls by former names."""
+    """Read a ``log.toml``; return its values and the former names of keys in it."""
     raw = parse_toml(read_text(path), path)
     former = tuple(key for key in raw if FORMER_NAMES.get(key, key) not in raw)
     raw |= {FORMER_NAMES[key]: raw.pop(key) for key in former}
@@ -185,10 +185,7 @@ def read_vehicle(path: Path) -> tuple[Vehicle, tuple[str, ...]]:
 
 
 def vehicle_of(table: Mapping[str, Any], where: object) -> Vehicle:
-    """Check what a table says of a vehicle; `where` names it in refusals.
-
-    Of several errors the first is named, unknown keys before missing ones, and those all at once.
-    """
+    """Validate a table of the keys of ``log.toml``; raise its first error, at `where`."""
     model = KINDS.get(str(table.get("motion")), _Unicycle)
     try:
         return model.model_validate(table)
@@ -203,7 +200,7 @@ def vehicle_of(table: Mapping[str, Any], where: object) -> Vehicle:
 
 
 def _missing(where: object, names: list[Any], model: type[Vehicle]) -> InputError:
-    """Refuse a table without some keys; without a motion, keys of no motion model are named."""
+    """Return the error of missing keys; without a motion, only keys that all models share."""
     known = Vehicle.model_fields if "motion" in names else model.model_fields
     named = [repr(name) for name in names if name in known]
     expected, plural = f"the keys {', '.join(known)}", "s" * (len(named) > 1)
@@ -233,7 +230,7 @@ def _key_refusal(path: object, fault: Any, model: type[Vehicle]) -> InputError:
 
 
 def _caller_refusal(path: object, fault: Any) -> InputError:
-    """Refuse a caller by its number, from 1 on, and key."""
+    """Return the error of a key of a caller, numbered from 1."""
     _, number, name, *_ = fault["loc"]
     key, known = f"callers.{number + 1}.{name}", _Caller.model_fields
     if fault["type"] == "missing":

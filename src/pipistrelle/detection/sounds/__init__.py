@@ -1,5 +1,6 @@
-"""Sound files to logs: what a recording holds, when its vehicle called, what is heard in it.
+"""Sound files to logs: read a recording, find the vehicle's calls and detect the echoes.
 
-A recording is a folder: sound files, ``recording.toml`` (`description`), ``array.csv``
-(`recorded_array`), ``calls.csv`` and odometry. `hearing` takes it to a log.
+A recording is a folder: sound files (`sound_file`), ``recording.toml`` and ``array.csv``
+(`description`), ``calls.csv`` (`calls`) and odometry. `check` looks for common mistakes, and
+`hearing` detects the echoes and makes the log.
 """

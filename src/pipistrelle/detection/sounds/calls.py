@@ -1,18 +1,17 @@
-r"""When the vehicle called: told by ``calls.csv`` or a period, or found in the sound.
+r"""Times of the vehicle's calls in a recording, and the matched-filter sums of its samples.
 
-A trigger is a channel whose level rises when a call begins. Where nothing tells, the call is found
-by its own leak into the microphones: nothing answers its matched filter as loudly. Counted is what
-passes a share of the level that the loudest has in most stretches.
+Calls are stated by ``calls.csv`` or a period, or found in the sound: by a trigger channel whose
+level rises when a call begins, or else by the call's leakage into the microphones, the strongest
+output of its matched filter. A peak counts if it passes a share of the typical loudest level.
 
-Real samples -> block sums at the tones, as the front end takes them.
+For tones, real samples become block sums, as in the front end:
 
 .. math:: S_b = 2 \sum_{n=bB}^{(b+1)B-1} x[n] e^{-2\pi i f n / f_s}
 
-with n counted from the vehicle's call. Where a call and a block last a whole number of 0.2 ms and
-tones are whole bins, blocks are those of the simulation, and noise is independent from tone to
-tone; elsewhere blocks are about a fourteenth of a call, and tones any below half the rate.
-
-Real samples -> outputs of matched filters, where somebody sends no plain tone.
+with n counted from the vehicle's call. If a call and a block last a whole number of 0.2 ms and
+tones are whole bins, blocks are the simulation's, and noise is independent between tones; otherwise
+a block is about a fourteenth of a call, and tones are arbitrary below half the rate. If any call is
+not a tone, samples become outputs of matched filters.
 """
 
 import math
@@ -39,7 +38,7 @@ MIN_SAMPLES = 10
 
 
 class Blocks(NamedTuple):
-    """How samples are summed."""
+    """Sampling of a frame: sample rate, block length and tones."""
 
     rate: float
     """[Hz]."""
@@ -50,7 +49,7 @@ class Blocks(NamedTuple):
     blank: int
     """Samples from the beginning of the vehicle's call to the first block."""
     tones: Float[np.ndarray, " c"]
-    """The vehicle's first [Hz]."""
+    """Frequencies of the calls, the vehicle's first [Hz]."""
 
     @property
     def interval(self) -> float:
@@ -65,9 +64,9 @@ def blocks_of(
     where: str,
     deaf: float | None = None,
 ) -> Blocks:
-    """Choose the blocks of a call of a duration [s].
+    """Choose the block length for a call of a duration [s].
 
-    `where`: the file, for refusals; `deaf`: time before the first block, else the duration [s].
+    `where`: the file, for errors; `deaf`: time before the first block, by default the duration [s].
 
     >>> blocks_of(200e3, 2.8e-3, np.array([35e3, 30e3]), "")[1:4]
     (40, 14, 560)
@@ -96,11 +95,10 @@ def blocks_of(
 
 
 class ToneSums:
-    """Sums samples of the channels of an array, each scaled by its own noise."""
+    """Sums of samples over blocks at each tone, for all channels, in units of their noise."""
 
     apart, gaps = 1, 256
-    """Sums from one that tells of the noise to the next; most gaps between calls, spread over the
-    recording, in which it is listened to."""
+    """Step between sums for the noise; most gaps between calls that are read for it."""
 
     def __init__(self, blocks: Blocks, channel: Int[np.ndarray, "f e"]) -> None:
         self.blocks, self.channel = blocks, channel
@@ -108,14 +106,14 @@ class ToneSums:
         wave = np.exp(-2j * np.pi * turns)
         self._table = np.ascontiguousarray(np.stack((wave.real, wave.imag), axis=1))
         self.gain = np.full((len(channel), blocks.tones.size, channel.shape[1]), 2.0)
-        """What a sum is multiplied by."""
+        """Factor of a sum."""
         self.mean = np.zeros(int(channel.max()) + 1)
-        """Of the samples of each channel; taken away."""
+        """Mean of each channel's samples, which is subtracted."""
 
     def __call__(
         self, samples: Float[np.ndarray, "t m"], out: Complex[np.ndarray, "..."] | None = None
     ) -> Complex[np.ndarray, "b f c e"]:
-        """Return the sums of the blocks after the call with which the samples begin."""
+        """Return the sums of the blocks after a call; the samples begin with the call."""
         heard, on = samples[self.blocks.blank :], self.blocks
         shape = (len(heard) // on.block, *self.gain.shape)
         sums = np.empty(shape, dtype=np.complex128) if out is None else out
@@ -163,13 +161,13 @@ def _sum_blocks(
 
 
 class CallOutputs:
-    """Filters samples of the channels of an array, each scaled by its own noise.
+    """Matched-filter outputs of samples for each call and channel, in units of the noise.
 
-    `ToneSums` is the same of tones alone, but for the boxcar. A block is a lag here.
+    Used instead of `ToneSums` and its boxcar if any call is not a tone; a block is a lag here.
     """
 
     gaps = 64
-    """Most gaps between calls in which noise is listened to."""
+    """Most gaps between calls from which noise is measured."""
 
     def __init__(
         self, calls: Sequence[Call], rate: float, blank: int, channel: Int[np.ndarray, "f e"]
@@ -181,18 +179,18 @@ class CallOutputs:
         tone = any(isinstance(call, ToneBurst) for call in calls)
         alike = self.blocks.pulse if tone else round(BLOCK / self.blocks.interval)
         self.apart = max(alike, 1)
-        """Outputs from one that tells of the noise to the next, which is to know nothing of it."""
+        """Step between outputs from which noise is measured, so that they are independent."""
         self.gain = np.ones((len(channel), len(calls), channel.shape[1]))
-        """What an output is multiplied by."""
+        """Factor of an output."""
         self.mean = np.zeros(int(channel.max()) + 1)
-        """Of the samples of each channel; taken away."""
+        """Mean of each channel's samples, which is subtracted."""
 
     def __call__(
         self, samples: Float[np.ndarray, "t m"], *, around: bool = False
     ) -> Complex[np.ndarray, "l f c e"]:
-        """Return the outputs after the call with which the samples begin.
+        """Return the outputs after a call; the samples begin with the call.
 
-        `around`: also those at lags where a call is only partly heard (`BandFilters.around`).
+        `around`: also at lags at which only a part of a call is received (`BandFilters.around`).
         """
         heard = samples[self.blocks.blank :]
         if len(heard) < self._filters.length:
@@ -206,37 +204,34 @@ class CallOutputs:
 
 FILE = "calls.csv"
 LONGEST = 2.0
-"""How long is listened after a call at most [s]."""
+"""Longest time after a call that is used [s]."""
 MIN_GAP = 2
-"""Fewest lengths of a call from the end of one to the beginning of the next."""
+"""Fewest call lengths from the end of one call to the beginning of the next."""
 MOST_CALLS = 10_000_000
 """Most calls of a period: a day of a hundred a second, half a gigabyte of numbers."""
 ONSET = 0.35
 """Share of the usual amplitude of a leak or a trigger that counts as a call."""
 _STRETCH = 10.0
-"""Time in which the vehicle calls at least once, where that is sought in the sound [s]."""
+"""Time in which the vehicle calls at least once, if calls are sought in the sound [s]."""
 _LISTEN = 8
-"""Most channels in which a leak is sought."""
+"""Most channels in which leakage is sought."""
 _CHUNK = 1 << 21
-"""Numbers that are read at a time where calls are sought."""
+"""Numbers that are read at a time to find calls."""
 
 
 class Calls(NamedTuple):
     """The vehicle's calls, in order."""
 
     sample: Int[np.ndarray, " k"]
-    """At which each begins, from 0 on."""
+    """Sample at which each begins, from 0."""
     time: Float[np.ndarray, " k"]
-    """When, by the odometry's clock [s]."""
+    """Time by the odometry's clock [s]."""
     length: Int[np.ndarray, " k"]
-    """Samples that are listened to, from its beginning."""
+    """Samples that belong to each call, from its beginning."""
 
 
 def calls_of(folder: Path, about: Description, sound: Sound, blocks: Blocks, sent: Call) -> Calls:
-    """Return when the vehicle called: told by a file or a setting, else found in the sound.
-
-    A call is left out where the sound ends before a whole echo could be heard after it.
-    """
+    """Return the vehicle's calls: from ``calls.csv`` or a setting, or found in the sound."""
     path, call = folder / FILE, about.call
     stated = None
     if os.path.lexists(path):
@@ -270,7 +265,7 @@ def calls_of(folder: Path, about: Description, sound: Sound, blocks: Blocks, sen
 
 
 def _told(path: Path, sound: Sound) -> tuple[Float[np.ndarray, " k"], Float[np.ndarray, " k"]]:
-    """Read ``calls.csv``: samples, and times where there are any."""
+    """Read ``calls.csv``: samples, and times or NaN."""
     table = read_table(path, ("sample",), optional=("time",))
     sample, time = table.column["sample"], table.column["time"]
     for wrong, found, expected in (
@@ -290,7 +285,7 @@ def _told(path: Path, sound: Sound) -> tuple[Float[np.ndarray, " k"], Float[np.n
 def _lengths(
     sample: Int[np.ndarray, " k"], sound: Sound, blocks: Blocks, where: str
 ) -> Int[np.ndarray, " k"]:
-    """Return how many samples belong to each call; refuse calls that follow too fast."""
+    """Return the number of samples of each call; raise if calls follow too fast."""
     gap = np.diff(sample)
     last = int(np.median(gap)) if gap.size else round(LONGEST * sound.rate)
     least = blocks.blank + MIN_GAP * blocks.pulse * blocks.block
@@ -304,7 +299,7 @@ def _lengths(
 
 
 def _pieces(sound: Sound, step: int, more: int) -> Iterator[tuple[int, Float[np.ndarray, "t m"]]]:
-    """Yield the sound in pieces of whole steps, each with so many samples more of the next."""
+    """Yield the sound in pieces of whole steps, each with `more` samples of the next."""
     size = max(_CHUNK // sound.channels // step, 1) * step
     for first in range(0, sound.samples, size):
         samples = sound.read(first, min(size + more, sound.samples - first))
@@ -313,7 +308,7 @@ def _pieces(sound: Sound, step: int, more: int) -> Iterator[tuple[int, Float[np.
 
 
 def _least(sound: Sound, sample: Float[np.ndarray, " k"], level: Float[np.ndarray, " k"]) -> float:
-    """Return the least level of a call, from the loudest of stretches."""
+    """Return the least level of a call: a share of the median of the loudest of each stretch."""
     stretches, stretch = np.unique(sample / sound.rate // _STRETCH, return_inverse=True)
     loudest = np.zeros(stretches.size)
     np.maximum.at(loudest, stretch, level)
@@ -321,7 +316,7 @@ def _least(sound: Sound, sample: Float[np.ndarray, " k"], level: Float[np.ndarra
 
 
 def _triggered(sound: Sound, channel: int, where: str, apart: int) -> Float[np.ndarray, " k"]:
-    """Return where one channel rises, and is as loud at the next sample, so far apart at least."""
+    """Find the samples of a rise of the trigger channel, with a minimum gap."""
     if channel >= sound.channels:
         found, expected = f"channel {channel + 1}", f"1 to {sound.channels}"
         raise refusal(where, found, expected, "correct it")
@@ -337,7 +332,7 @@ def _triggered(sound: Sound, channel: int, where: str, apart: int) -> Float[np.n
 
 
 def _leaks(sound: Sound, sent: Call, apart: int) -> Float[np.ndarray, " k"]:
-    """Return where a call's matched filter answers the loudest, so many samples apart at least."""
+    """Find the samples of the loudest matched-filter outputs, with a minimum gap."""
     filters = BandFilters((sent,), sound.rate)
     step, loudest = filters.step, []
     some = max(apart // step, 1)
@@ -361,10 +356,7 @@ def _leaks(sound: Sound, sent: Call, apart: int) -> Float[np.ndarray, " k"]:
 def _loudest_around(
     sample: Float[np.ndarray, " k"], level: Float[np.ndarray, " k"], apart: int
 ) -> Bool[np.ndarray, " k"]:
-    """Return which are the loudest within so many samples, the first of several that are.
-
-    Only neighbours in time are compared: of hours of a loud tone there are millions.
-    """
+    """Return a mask of the samples that are the loudest within a gap, the first of equals."""
     order = np.argsort(sample, kind="stable")
     place = sample[order]
     begin = np.searchsorted(place, place - apart - 1.0)
@@ -378,7 +370,7 @@ def _loudest_around(
 
 
 def _aside(level: Float[np.ndarray, " n"]) -> float:
-    """Return how many steps beside the second of three levels a parabola through them peaks."""
+    """Return the offset of a parabola's peak from the middle of three levels, in steps."""
     if level.size < 3 or level[1] <= max(level[0], level[2]):
         return 0.0
     return float(0.5 * (level[2] - level[0]) / (2.0 * level[1] - level[0] - level[2]))

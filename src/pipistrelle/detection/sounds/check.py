@@ -1,13 +1,11 @@
-"""Mistakes that everybody makes: what is odd about a recording, and what would explain it.
+"""Checks of a sound recording: dead or swapped channels, wrong rate, irregular calls.
 
-The array, checked by the loudest sound: orders, signs and mirror images that would fit better.
+Array: the *misfit* of a loud echo is the share of its energy that the best beam of a face, or of
+all microphones without a face, misses; two swapped channels, or a wrong sign, raise it. A line
+counted from its wrong end fits as well, but gives the mirror image of each angle: two faces that
+hear one echo then disagree, as they do if faces are swapped.
 
-What of the energy of a loud echo the best beam of a face, or of all microphones without a face,
-misses is their *misfit*; two channels that are swapped, or one whose sign is, raise it. A line
-that is counted from the wrong end fits as well, but says the mirror image of each angle: then two
-faces that hear one echo disagree, as they do where faces are swapped.
-
-What was heard of some calls, for a figure: the matched filter's output and the echoes.
+`Overview` keeps matched-filter output and echoes of some calls for a figure.
 """
 
 import math
@@ -32,24 +30,24 @@ from pipistrelle.detection.sounds.sound_file import Sound, open_sound
 from pipistrelle.geometry import wrap
 
 CALLS, SNAPSHOTS = 64, 60
-"""Most calls that are listened to, and snapshots of a face that are kept."""
+"""Most calls that are read, and echoes of a face that are kept."""
 MIN_SNAPSHOTS, MIN_PAIRS = 5, 10
 MOST_FACES = 4
-"""Most faces of which all orders are tried."""
+"""Most faces for which all orders are tried."""
 LOUD = 300.0
 """Least power of an echo over the noise of a steered beam."""
 WIDEST = 0.2
-"""Widest group whose order a tone tells, in lengths of the call."""
+"""Largest extent of a group of microphones for a tone to reveal their order, in call lengths."""
 AROUND, AT_ONCE = 16, 1 << 21
-"""Outputs to both sides of an echo that is no tone; numbers that are in memory at a time."""
+"""Outputs to both sides of an echo that is not of a tone; most numbers in memory at a time."""
 MISFIT, BETTER = 0.02, 0.5
-"""Least misfit that asks for another order, and the share of it that one leaves which is named."""
+"""Least misfit that is reported; largest share of it that a suggested change may leave."""
 DISAGREE = 0.15
-"""Least median difference between the bearings of two faces that asks for other faces [rad]."""
+"""Least median difference between the bearings of two faces that is reported [rad]."""
 
 
 class _Echo(NamedTuple):
-    """A loud echo, as a group of microphones heard it at the time of its middle."""
+    """A loud echo at a group of microphones, at the time of its middle."""
 
     frequency: Float[np.ndarray, " k"]
     """Frequency of a tone, or frequencies of the parts of a band [Hz]."""
@@ -58,7 +56,7 @@ class _Echo(NamedTuple):
 
 
 def array_faults(hearing: Hearing) -> Iterator[str]:
-    """Say which other order of the channels would explain the loudest sounds better."""
+    """Yield suggested corrections of ``array.csv`` that would explain the loudest echoes better."""
     heard: list[list[_Echo]] = [[] for _ in hearing.array.face]
     pairs: list[tuple[int, float, int, float]] = []
     last = hearing.calls.sample.size - 1
@@ -87,9 +85,10 @@ def _collect(frame: Frame, hearing: Hearing, heard: list[list[_Echo]]) -> None:
 
 
 def _echo(frame: Frame, hearing: Hearing, d: int) -> _Echo | None:
-    """Return what a group heard of a detection; None of one at the record's ends.
+    """Return a group's outputs for a detection, or None too near the ends of the frame.
 
-    What is no tone is parted into frequencies, for its microphones hear it one by one.
+    The outputs of a wideband call are split into frequencies, as the microphones of a large array
+    receive it at different times.
     """
     found, caller = frame.detections, int(frame.detections.caller[d])
     row, members = hearing.array.layout.members(int(found.face[d]))
@@ -114,7 +113,7 @@ def _echo(frame: Frame, hearing: Hearing, d: int) -> _Echo | None:
 
 
 def _pairs(frame: Frame, hearing: Hearing) -> list[tuple[int, float, int, float]]:
-    """Pair detections of one echo by two faces: the loudest of each within a quarter of a call."""
+    """Pair loud detections of one echo by two faces, within a quarter of a call of each other."""
     found, pairs = frame.detections, []
     late = 0.25 * hearing.about.call.duration
     for one, other in combinations(np.flatnonzero(found.power >= LOUD).tolist(), 2):
@@ -127,9 +126,9 @@ def _pairs(frame: Frame, hearing: Hearing) -> list[tuple[int, float, int, float]
 
 
 def _order(hearing: Hearing, g: int, echoes: list[_Echo]) -> Iterator[str]:
-    """Try to swap two channels of a group, or the sign of one."""
+    """Yield a report if swapping two channels of a group, or a sign, would lower its misfit."""
     lead, gain = _directions(hearing, g)
-    if np.ptp(lead, axis=1).max() > WIDEST * hearing.about.call.duration:  # one by one
+    if np.ptp(lead, axis=1).max() > WIDEST * hearing.about.call.duration:  # keep wideband only
         echoes = [echo for echo in echoes if echo.frequency.size > 1]
     if not echoes:
         return
@@ -153,13 +152,10 @@ def _order(hearing: Hearing, g: int, echoes: list[_Echo]) -> Iterator[str]:
 def _shares(
     echo: _Echo, lead: Float[np.ndarray, "b e"], gain: Float[np.ndarray, " e"]
 ) -> tuple[float, Float[np.ndarray, "e e"]]:
-    """Return the share of an echo's energy that the best beam has, as the microphones are.
-
-    And with two of them swapped, or on the diagonal, with the sign of one turned round.
-    """
+    """Return an echo's energy share in the best beam, now and after each swap or sign change."""
     now, changed = 0.0, np.zeros((gain.size, gain.size))
     for some in np.array_split(lead, math.ceil(lead.size * gain.size / AT_ONCE)):
-        # of each direction, for each place what each channel would add to a beam
+        # for each direction, position and channel: the term that would be added to a beam
         heard = np.exp(-2j * np.pi * some[..., np.newaxis] * echo.frequency) @ echo.output
         energy, added = np.abs(heard) ** 2, gain[:, np.newaxis] * heard
         own, own_energy = (np.einsum("bii->bi", each) for each in (added, energy))
@@ -176,10 +172,7 @@ def _shares(
 def _directions(
     hearing: Hearing, g: int
 ) -> tuple[Float[np.ndarray, "b e"], Float[np.ndarray, " e"]]:
-    """Return how much earlier a group's microphones hear sound of many directions [s], and gains.
-
-    Directions are so dense that between two the phase turns by some 0.2 rad.
-    """
+    """Return the time leads of a group's microphones for many directions [s], and their gains."""
     layout, speed = hearing.array.layout, hearing.config.assumed_sound_speed
     (place, gain), normal = layout.places(g), float(layout.normal[g])
     place = place - gain**2 @ place / np.sum(gain**2)
@@ -192,13 +185,13 @@ def _directions(
 
 
 def _named(hearing: Hearing, g: int) -> str:
-    """Return what a group of microphones is called."""
+    """Return the name of a group of microphones for a message."""
     name = hearing.array.face[g]
     return name if " " in name else f"face {name}"
 
 
 def _faces(hearing: Hearing, pairs: Float[np.ndarray, "n 4"]) -> Iterator[str]:
-    """Try other orders of the faces, and lines that are counted from the other end."""
+    """Yield a report if another order of the faces, or of their channels, would fit better."""
     normal, names = hearing.array.layout.normal, hearing.array.face
     count = len(names)
     face, angle = pairs[:, [0, 2]].astype(np.int64), pairs[:, [1, 3]]
@@ -225,7 +218,7 @@ def _faces(hearing: Hearing, pairs: Float[np.ndarray, "n 4"]) -> Iterator[str]:
 
 
 def _change(names: tuple[str, ...], order: tuple[int, ...], side: float) -> str:
-    """Say what makes the faces stand in an order, and their lines turn round."""
+    """Format a change: the new order of the faces, and whether their channels are reversed."""
     changes = ["count each face's channels from its other end"] if side < 0 else []
     moved = [(f, o) for f, o in enumerate(order) if f != o]
     changes += [f"let face {names[f]} be where face {names[o]} is" for f, o in moved]
@@ -240,21 +233,21 @@ BINS = 400
 
 @dataclass(kw_only=True)
 class Overview:
-    """The first calls that were heard."""
+    """The matched-filter output and detections of the first calls, for a figure."""
 
     names: tuple[str, ...]
-    """Who calls, the vehicle first."""
+    """Names of the callers, the vehicle first."""
     time: list[float] = field(default_factory=list)
-    """Of the calls [s]."""
+    """Times of the calls [s]."""
     delay: list[Float[np.ndarray, " n"]] = field(default_factory=list)
-    """Since the vehicle's call, of each bin [s]."""
+    """Delay of each bin since the vehicle's call [s]."""
     level_db: list[Float[np.ndarray, "n c"]] = field(default_factory=list)
-    """Of the loudest face over the noise of its elements, in each bin [dB]."""
+    """Level of the loudest face over the noise of its elements, in each bin [dB]."""
     detections: list[Detections] = field(default_factory=list)
     scans: list[Scan] = field(default_factory=list)
 
     def look(self, frame: Frame) -> None:
-        """Keep what was heard after a call, if it is one of the first."""
+        """Keep a frame, if it is one of the first `SHOWN_CALLS`."""
         if len(self.time) == SHOWN_CALLS:
             return
         lags, faces, tones, elements = frame.matched.shape
@@ -272,7 +265,7 @@ class Overview:
         self.scans.append(frame.scan)
 
     def direct(self, number: int) -> Float[np.ndarray, " k"]:
-        """Return when a caller's direct call began after each call of the vehicle, or NaN [s]."""
+        """Return the delay of a caller's direct call after each call of the vehicle, or NaN [s]."""
         if number == OWN:
             return np.full(len(self.time), np.nan)
         calls = (found.direct for found in self.detections)
@@ -280,18 +273,18 @@ class Overview:
 
 
 GAPS = 16
-"""Most gaps that are looked at, spread over the recording."""
+"""Most gaps between calls that are read, spread over the recording."""
 RATES = (44_100, 48_000, 88_200, 96_000, 176_400, 192_000, 200_000, 250_000, 256_000, 300_000,
          384_000, 500_000)  # fmt: skip
 """Usual sample rates [Hz]."""
 _FAINT, _FLAT = 10 ** (-30 / 20), 10
-"""A dead channel's noise beside the others'; fewest flat tops of a clipped one."""
+"""Noise of a dead channel relative to the others'; fewest flat tops of a clipped channel."""
 LEAKS = 0.5
-"""Least share of the sound while the vehicle calls that is its call at some sample rate."""
+"""Least share of the sound during the vehicle's call that is its call at some sample rate."""
 
 
 def check_recording(folder: Path, about: Description, config: Config) -> list[str]:
-    """Return what is odd about a recording, a line each."""
+    """Return a line for each suspected fault of a recording: channels, rate, clock, array."""
     with open_sound(folder, about) as sound:
         array = recorded_array(folder, sound.channels, one_centre=about.one_centre)
         sums, sent = sums_of(folder, sound, about, array)
@@ -312,7 +305,7 @@ def check_recording(folder: Path, about: Description, config: Config) -> list[st
 def _channels(
     sound: Sound, calls: Calls, gaps: Int[np.ndarray, " g"], array: RecordedArray
 ) -> tuple[bool, list[str]]:
-    """Look for channels that are dead, clipped or off zero; tell whether any is dead."""
+    """Find dead, clipped and offset channels; return whether any is dead, and a line for each."""
     noise, mean, flat = [], [], np.zeros(sound.channels)
     for k in gaps:
         samples = sound.read(int(calls.sample[k]), int(calls.length[k]))
@@ -343,7 +336,7 @@ def _channels(
 def _tone_rate(
     sound: Sound, calls: Calls, gaps: Int[np.ndarray, " g"], sent: Call
 ) -> Iterator[str]:
-    """Ask whether the tone that leaks into the microphones has the frequency that it should."""
+    """Yield a report if the tone that leaks into the microphones has the wrong frequency."""
     length = round(sent.duration * sound.rate)
     power = np.zeros(8 * length // 2 + 1)
     for k in gaps:
@@ -352,7 +345,7 @@ def _tone_rate(
         power += (np.abs(np.fft.rfft(windowed, 8 * length, axis=0)) ** 2).sum(axis=1)
     peak = int(power[1:-1].argmax()) + 1
     if not power[peak] > 50.0 * np.median(power):
-        return  # nothing leaks, or all is silence
+        return  # no leakage, or silence
     a, b, c = np.log(power[peak - 1 : peak + 2])
     found = (peak + 0.5 * (a - c) / (a - 2.0 * b + c)) * sound.rate / (8 * length)
     own = sent.frequency
@@ -370,7 +363,7 @@ def _tone_rate(
 def _call_rate(
     sound: Sound, calls: Calls, gaps: Int[np.ndarray, " g"], sent: Call
 ) -> Iterator[str]:
-    """Ask at which sample rate what leaks into the microphones is the call."""
+    """Yield a report if the leaked call fits another sample rate better."""
     share = {}
     for rate in (sound.rate, *RATES):
         if extent_of(sent, rate)[1] >= rate / 2.0:
@@ -396,7 +389,7 @@ def _call_rate(
 
 
 def _clock(calls: Calls, blocks: Blocks) -> Iterator[str]:
-    """Ask whether the calls come as regularly as most of them do."""
+    """Yield a report if a few calls are not as regular as the others."""
     gap = np.diff(calls.sample)
     if gap.size < 5:
         return
@@ -404,7 +397,7 @@ def _clock(calls: Calls, blocks: Blocks) -> Iterator[str]:
     off = np.abs(gap - usual) > max(2.0, 1e-4 * usual)
     odd = np.flatnonzero(off)
     if not 0 < odd.size <= 0.2 * gap.size:
-        return  # regular, or not meant to be
+        return  # regular, or irregular by design
     k = int(odd[0])
     more = f", and {odd.size - 1} more such" if odd.size > 1 else ""
     yield (

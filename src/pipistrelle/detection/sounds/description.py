@@ -1,7 +1,4 @@
-"""``recording.toml``: what a sound recording says of itself, and how it was made.
-
-The array of a recording, and which channel of the sound each of its microphones is.
-"""
+"""A sound recording's description: the keys of ``recording.toml``, the array in ``array.csv``."""
 
 from pathlib import Path
 from typing import Annotated, Any, Literal, NamedTuple
@@ -32,25 +29,22 @@ ARRAY_FILE = "array.csv"
 
 
 class RecordedArray(NamedTuple):
-    """Microphones, and where they are in a sound file."""
+    """The microphones of a recording, and their channels in the sound file."""
 
     layout: Layout | Scattered
     channel: Int[np.ndarray, "f e"]
-    """Numbers of the channels in a sound file, from 0 on."""
+    """Channel of each microphone, from 0."""
     face: tuple[str, ...]
     """Names of the groups of microphones that are scanned together."""
 
     @property
     def used(self) -> Int[np.ndarray, " m"]:
-        """The channels that are microphones, in order."""
+        """The channels that have a microphone, in order."""
         return np.unique(self.channel)
 
 
 def recorded_array(folder: Path, channels: int, *, one_centre: bool) -> RecordedArray:
-    """Read ``array.csv`` of a recording that has some channels.
-
-    `one_centre`: whether faces are heard as if all stood at the vehicle's point.
-    """
+    """Read a recording's ``array.csv``; `one_centre` puts all faces at the vehicle's position."""
     path = folder / ARRAY_FILE
     microphones = read_array(path, some=True)
     if (most := int(microphones.channel.max())) > channels:
@@ -73,13 +67,13 @@ _Channel = Annotated[int, Field(ge=1, le=1024)]
 
 
 class _Told(CallConfig):
-    """What somebody sends, in the words of the settings; a file lies beside the recording."""
+    """A call, with the keys of the settings; a file name is relative to the recording."""
 
     model_config = ConfigDict(strict=True)
 
     band: Annotated[tuple[Positive, Positive], Field(strict=False)] = (60e3, 35e3)
     frequency: Positive = 0.0
-    """Tone, or where a file's band lies; a sweep has its band [Hz]."""
+    """Frequency of a tone or centre of a file's band [Hz]; a sweep has `band`."""
 
     @model_validator(mode="after")
     def _of_some_frequency(self) -> "_Told":
@@ -90,18 +84,18 @@ class _Told(CallConfig):
 
 
 class OwnCall(_Told):
-    """The vehicle's own call, and when it comes."""
+    """The vehicle's own call, and its times."""
 
     duration: Annotated[float, Field(ge=1e-5, le=1.0)]
     """Length [s]."""
     deaf: Annotated[float, Field(ge=1e-5, le=10.0)] | None = None
-    """How long the microphones hear nothing else from its beginning on; else while it lasts [s]."""
+    """Time after its beginning in which nothing else is received [s]; None: its duration."""
     window: Literal["rectangular"] = "rectangular"
     level_db: Level | None = None
     period: Annotated[float, Field(ge=1e-3, le=1e4)] | None = None
     """Time from one call to the next [s]."""
     first: NonNegative = 0.0
-    """When the first begins, after the sound does; beside a period [s]."""
+    """Time of the first call after the beginning of the sound, with a period [s]."""
     trigger: _Channel | None = None
     """Channel whose level rises when a call begins."""
 
@@ -117,43 +111,43 @@ class OwnCall(_Told):
 
 
 class OtherCaller(_Told):
-    """Somebody else who calls."""
+    """A caller other than the vehicle."""
 
     name: _Name
     level_db: Level | None = None
     landmark: Annotated[int, Field(ge=0, lt=2**53)] | None = None
-    """The label that the truth gives it."""
+    """Its label in the truth."""
     moves: bool = False
     own_clock: bool = False
-    """Whether it calls when it likes, not when the vehicle does: its rows are then left out."""
+    """Whether it calls independently of the vehicle: its measurements are then left out."""
 
 
 class Description(Section):
-    """All that ``recording.toml`` says."""
+    """The keys of ``recording.toml``."""
 
     model_config = ConfigDict(strict=True)
 
     format: Literal[1]
     sound: Annotated[tuple[_FileName, ...], Field(strict=False)] = ()
-    """The sound files, in the order of time; else all that are there, by name."""
+    """The sound files, in the order of time; empty: all in the folder, by name."""
     sample_rate: _Rate | None = None
-    """What the files must say, too [Hz]."""
+    """Sample rate that the files must have [Hz]."""
     samples: Annotated[int, Field(ge=1, lt=2**62)] | None = None
-    """Of each channel, in all files."""
+    """Samples per channel, in all files."""
     start: Real = 0.0
     """Time of the first sample, by the odometry's clock [s]."""
     scale: Positive = 1.0
-    """Amplitude of what the files hold as 1."""
+    """Amplitude of the value 1 in the files."""
     speed_of_sound: Annotated[float, Field(ge=10, le=10_000)]
-    """By which delays become ranges, and phases bearings [m/s]."""
+    """Converts delays to ranges and phases to bearings [m/s]."""
     one_centre: bool = False
-    """Whether faces are heard as if all stood at the vehicle's point, as the simulated square."""
+    """Whether all faces are treated as if at the vehicle's position, as in the simulated square."""
     medium: dict[str, Any] = Field(default_factory=dict)
-    """Of what it was: for the reader."""
+    """Description of the medium, for the reader only."""
     call: OwnCall
     callers: Annotated[tuple[OtherCaller, ...], Field(strict=False, max_length=MAX_OTHERS)] = ()
     log: dict[str, Any]
-    """What ``log.toml`` of the log says that is made: motion, start and noise."""
+    """Keys of the ``log.toml`` to write: motion, start and noise."""
 
     @field_validator("sound")
     @classmethod
@@ -174,7 +168,7 @@ class Description(Section):
         return self
 
     def calls(self, folder: Path) -> tuple[Call, ...]:
-        """Return what everybody sends, the vehicle first; `folder`: of the recording."""
+        """Return the calls of all callers, the vehicle's first; `folder`: of the recording."""
         duration, calls = self.call.duration, []
         for key, one in zip(self._keys(), (self.call, *self.callers), strict=True):
             file = {} if one.call in (TONE, SWEEP) else {"call": str(folder / one.call)}
@@ -184,12 +178,12 @@ class Description(Section):
         return tuple(calls)
 
     def _keys(self) -> list[str]:
-        """Return the tables of those who call."""
+        """Return the keys of the tables of all callers, the vehicle's first."""
         return ["call", *(f"callers.{j}" for j in range(1, len(self.callers) + 1))]
 
 
 def read_description(folder: Path) -> Description:
-    """Read ``recording.toml`` of a folder, or refuse its first fault."""
+    """Read ``recording.toml`` of a folder; raise at its first fault."""
     path = folder / FILE
     raw = parse_toml(read_text(path), path)
     try:

@@ -1,26 +1,24 @@
-r"""Sound in: a recording is heard call by call, by the front end of the simulation, into a log.
+r"""Hear a recording: noise levels, copied channels, and the echoes of each call, into a log.
 
-The noise of each channel at each frequency, as a recording itself tells.
-
-Echoes fill much of the time after a call. So the gap from call to call is parted into stretches,
-and those count which are as quiet as the quietest, over all channels. Of their block sums :math:`S`
-each channel's level is that of the median: the power of noise is exponentially distributed,
+Each call is processed by the front end of the simulation. The noise of each channel at each
+frequency is estimated from the recording. Echoes fill much of the time after a call, so the gap
+between calls is divided into stretches, and only the quietest are used. A channel's level is that
+of the median of their block sums :math:`S`, as the power of noise is exponentially distributed:
 
 .. math:: \sigma^2 = \operatorname{median}(|S|^2) / \ln 2 ,
 
-and nearly half of the sums may be anything. Where channels, or frequencies too, differ by no more
-than chance, they have one level, their mean: to weigh them by their chance would move bearings.
+and nearly half of the sums may be outliers. If channels, or also frequencies, differ by no more
+than chance, all have the mean level, as weighting by chance would bias bearings.
 
-Channels that hold one microphone's sound, as a wrong route or list of channels makes them.
-
-Two microphones have noise of their own, so no channel is a multiple of another. Of a copy, scaled
-by a and perhaps some samples late, nothing is left but what rounding to a file's quantum q adds,
+Copied channels: two microphones have independent noise, so no channel is a multiple of another. If
+channel j is a copy of i, scaled by a and perhaps delayed by d samples, the residual is only the
+rounding to a file's quantum q,
 
 .. math:: \sum_t (x_j[t] - a x_i[t - d])^2 \le \frac{q^2}{12} (1 + a^2) n
           \left(1 + 5 \sqrt{2 / n}\right) ,
 
-five standard deviations over its mean for n samples. Where all sound is below that, nothing can be
-told of it.
+five standard deviations over its mean for n samples. If all sound is below that, copies cannot be
+detected.
 """
 
 import math
@@ -66,17 +64,17 @@ from pipistrelle.detection.wideband import Wide
 from pipistrelle.refusals import refusal
 
 GROUP, FIRST_GAPS = 64, 8
-"""How many gaps are listened to at a time; and how many to find which parts are quiet."""
+"""Gaps that are read at a time; gaps from which the quiet stretches are found."""
 STRETCHES, QUIET = 8, 3
-"""Into how many stretches a gap is parted, and how many count at most."""
+"""Stretches in a gap, and most stretches that are used."""
 MIN_SUMS = 50
 """Fewest block sums of a channel."""
 CHANCE = 5.0
-"""Channels whose levels differ by fewer standard deviations have one."""
+"""Least difference of channels' levels, in standard deviations, for them to be distinguished."""
 
 
 def set_noise(sums: ToneSums | CallOutputs, sound: Sound, calls: Calls, folder: Path) -> None:
-    """Measure noise and mean of each channel, and have the sums scaled to unit noise."""
+    """Measure noise and mean of each channel, and scale the sums to unit noise."""
     last = calls.sample.size - 1
     first, gaps = (
         np.unique(np.linspace(0, last, most).round().astype(np.int64))
@@ -111,7 +109,7 @@ def set_noise(sums: ToneSums | CallOutputs, sound: Sound, calls: Calls, folder: 
 def _gaps(
     sound: Sound, calls: Calls, numbers: Int[np.ndarray, " g"]
 ) -> Iterator[Float[np.ndarray, "t m"]]:
-    """Yield the samples of some gaps, from a call on."""
+    """Yield the samples of some gaps, each from the beginning of a call."""
     for k in numbers:
         samples = sound.read(int(calls.sample[k]), int(calls.length[k]))
         sound.refuse_odd(int(calls.sample[k]), samples)
@@ -125,7 +123,7 @@ def _powers(
     numbers: Int[np.ndarray, " g"],
     stretches: Sequence[int],
 ) -> list[Float[np.ndarray, "b f c e"]]:
-    """Return the powers in each of some stretches of some gaps."""
+    """Return the powers of the sums in some stretches, concatenated over some gaps."""
     power: list[list[np.ndarray]] = [[] for _ in stretches]
     for samples in _gaps(sound, calls, numbers):
         heard = sums(samples)[:: sums.apart]
@@ -137,7 +135,7 @@ def _powers(
 
 
 def _quiet(power: Sequence[Float[np.ndarray, "b f c e"]]) -> list[int]:
-    """Return which stretches are as quiet as the quietest, but for chance: three at most."""
+    """Return the stretches that are as quiet as the quietest, up to chance: three at most."""
     level = np.array([np.median(part) if part.size else np.inf for part in power])
     order = level.argsort()[:QUIET]
     count = power[int(order[0])].size
@@ -146,7 +144,7 @@ def _quiet(power: Sequence[Float[np.ndarray, "b f c e"]]) -> list[int]:
 
 
 def _alike(power: Float[np.ndarray, "f c e"], count: int) -> Float[np.ndarray, "f c e"]:
-    """Return the mean over all, or by frequency over channels, where chance explains the rest."""
+    """Average the channels' levels, overall or by frequency, if chance explains differences."""
     chance = CHANCE / (math.log(2.0) * math.sqrt(count))
     for axes in ((0, 1, 2), (0, 2)):
         mean = power.mean(axis=axes, keepdims=True)
@@ -156,19 +154,19 @@ def _alike(power: Float[np.ndarray, "f c e"], count: int) -> Float[np.ndarray, "
 
 
 GAPS, SAMPLES = 16, 8192
-"""Most gaps that are looked at, spread over the recording, and most samples of each."""
+"""Most gaps that are read, spread over the recording, and most samples of each."""
 LATEST = 2
-"""Most samples by which a copy is earlier or later."""
+"""Largest delay or advance of a copy [samples]."""
 ROUNDING = 1e-12
-"""Share of a channel's power that floating-point numbers may add."""
+"""Share of a channel's power that floating-point rounding may add."""
 
 
 def copied_channels(
     sound: Sound, calls: Calls, blank: int, used: Int[np.ndarray, " m"]
 ) -> Iterator[str]:
-    """Say which of the channels that are used (numbered from 0) are copies of others.
+    """Yield a report for each used channel (numbered from 0) that is a copy of another.
 
-    `blank`: samples from the beginning of a call to those that are looked at.
+    `blank`: samples from the beginning of a call to the first that is used.
     """
     product, source, power, count = _sums(sound, calls, blank, used)
     audible = (source > 0.0)[:, :, np.newaxis] & (power > 0.0)
@@ -193,10 +191,7 @@ def copied_channels(
 def _sums(
     sound: Sound, calls: Calls, blank: int, used: Int[np.ndarray, " m"]
 ) -> tuple[Float[np.ndarray, "d m m"], Float[np.ndarray, "d m"], Float[np.ndarray, " m"], int]:
-    """Return the sums of products of channels, the first so many samples earlier, and of squares.
-
-    And of how many samples they are.
-    """
+    """Return sums over samples: products of channels at each delay, squares, and the count."""
     lates = range(-LATEST, LATEST + 1)
     product, count = np.zeros((len(lates), used.size, used.size)), 0
     source, power = np.zeros((len(lates), used.size)), np.zeros(used.size)
@@ -225,23 +220,23 @@ Progress = Callable[[str, int, int], None]
 
 
 class Frame(NamedTuple):
-    """What was heard after one call of the vehicle."""
+    """The matched-filter output and detections after a call of the vehicle."""
 
     time: float
-    """Of the call [s]."""
+    """Time of the call [s]."""
     matched: Complex[np.ndarray, "l f c e"]
-    """The matched filters' output, in units of the noise; the next frame overwrites it."""
+    """Matched-filter output in units of the noise; the next frame overwrites it."""
     start: float
     """Delay of lag 0 [s]."""
     interval: float
-    """Between two lags [s]."""
+    """Time between two lags [s]."""
     detections: Detections
     scan: Scan
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Hearing:
-    """A recording that is open, and all that is the same for each of its calls."""
+    """An open recording, with everything that its calls share."""
 
     folder: Path
     about: Description
@@ -253,14 +248,11 @@ class Hearing:
     config: Config
     end: FrontEnd
     own_clock: Bool[np.ndarray, " c"]
-    """Whether each caller has a clock of its own: its rows are left out."""
+    """Whether each caller calls independently of the vehicle: its detections are left out."""
 
     @classmethod
     def of(cls, folder: Path, sound: Sound, about: Description, config: Config) -> "Hearing":
-        """Look at a recording: its microphones, when its vehicle called, and its noise.
-
-        `config`: sections detection, matching and assumed count; the rest is the recording's.
-        """
+        """Prepare an open recording: its microphones, calls, noise and detector."""
         array = recorded_array(folder, sound.channels, one_centre=about.one_centre)
         sums, sent = sums_of(folder, sound, about, array)
         blocks = sums.blocks
@@ -281,12 +273,12 @@ class Hearing:
         )
 
     def wide(self, caller: int, group: int) -> Wide | None:
-        """Return what finds a call in a group's outputs over its whole band; None of a tone."""
+        """Return the wideband detector of a caller and a group; None for a tone."""
         wide = self.end.wide if isinstance(self.end, Mixed) else ()
         return next((one for p, g, one in wide if (p, g) == (caller, group)), None)
 
     def frames(self, numbers: Sequence[int]) -> Iterator[Frame]:
-        """Hear what came after some of the calls, numbered from 0 on."""
+        """Yield the frames after some of the calls, numbered from 0."""
         calls, room = self.calls, Workspace()
         for k in numbers:
             first = int(calls.sample[k])
@@ -297,7 +289,7 @@ class Hearing:
     def _matched(
         self, first: int, samples: Float[np.ndarray, "t m"], room: Workspace
     ) -> Complex[np.ndarray, "l f c e"]:
-        """Filter what came after one call, which begins with a sample; refuse no numbers."""
+        """Filter the samples after a call, from its first sample; raise if they are not finite."""
         on, shape = self.blocks, self.sums.gain.shape
         if isinstance(self.sums, CallOutputs):
             self.sound.refuse_odd(first, samples)
@@ -333,7 +325,7 @@ class Hearing:
 def sums_of(
     folder: Path, sound: Sound, about: Description, array: RecordedArray
 ) -> tuple[ToneSums | CallOutputs, tuple[Call, ...]]:
-    """Return what sums the samples at each tone, or filters them by each call, and the calls."""
+    """Return the block sums or matched filters of a recording, and its callers' calls."""
     where, calls = str(folder / FILE), about.calls(folder)
     tones = np.array([call.frequency for call in calls])
     if all(isinstance(call, ToneBurst) for call in calls):
@@ -364,9 +356,10 @@ def hear_recording(
     look: Callable[[Frame], None],
     progress: Progress | None = None,
 ) -> list[str]:
-    """Hear a recording, call by call; return why its echoes may be wrong, a line each.
+    """Hear a recording, call by call; return reasons why its echoes may be wrong, a line each.
 
-    `frames`: given the number of calls, which of them are heard; `look`: given each.
+    `frames` returns the range of calls to hear, given their number; `look` is called with each
+    frame.
     """
     with open_sound(folder, about) as sound:
         hearing = Hearing.of(folder, sound, about, config)
@@ -380,7 +373,7 @@ def hear_recording(
 
 
 def log_callers(about: Description) -> list[dict[str, Any]]:
-    """Return the callers, as ``log.toml`` lists them."""
+    """Return the callers, as in ``log.toml``."""
     return [
         {"name": one.name, "landmark": number if one.landmark is None else one.landmark}
         | ({"moves": True} if one.moves else {})
@@ -389,7 +382,7 @@ def log_callers(about: Description) -> list[dict[str, Any]]:
 
 
 def _settled(config: Config, about: Description, rate: float) -> Config:
-    """Return settings with what the recording says of rate, call and speed of sound."""
+    """Return settings with the recording's sample rate, call duration and speed of sound."""
     assumed = config.assumed.speed_of_sound or about.speed_of_sound
     return config.model_copy(
         update={

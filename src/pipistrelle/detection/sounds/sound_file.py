@@ -1,11 +1,10 @@
-"""Sound files, read in pieces by the package soundfile: a long recording is never in memory.
+"""Sound files: read in pieces by the package soundfile, after a check of their headers.
 
-Headers of sound files: whether the bytes that they announce are there, and fit their fields.
-
-Libraries read a file that was cut as a shorter one. WAV (RIFF, RIFX, RF64), W64, AIFF and CAF are
-chunks of a name and a size, of which one holds the sound; AU has one header. FLAC and ALAC announce
-no size but a number of samples. They spend a bit or more on each sample that is not predicted
-exactly: a file of fewer bits than samples is mostly digital silence, or holds fewer than it says.
+A long recording is never held in memory. Libraries read a truncated file as a shorter one, so the
+size that a header announces is compared with the file's. WAV (RIFF, RIFX, RF64), W64, AIFF and CAF
+consist of chunks with a name and a size, and one holds the sound; AU has one header. FLAC and ALAC
+announce a number of samples, and spend a bit or more on each that is not predicted exactly: a file
+of fewer bits than samples is mostly digital silence, or incomplete.
 """
 
 import os
@@ -28,28 +27,28 @@ if TYPE_CHECKING:
 
 WIDTHS = {"PCM_S8": 1, "PCM_U8": 1, "ULAW": 1, "ALAW": 1, "PCM_16": 2, "PCM_24": 3, "PCM_32": 4,
           "FLOAT": 4, "DOUBLE": 8}  # fmt: skip
-"""Bytes of a sample, where each has as many."""
+"""Bytes of a sample, for subtypes of constant width."""
 UNFILLED = (0, 0x7FFFF000, 0x7FFFFFFF, 0xFFFFFFFF)
-"""Sizes that programs write before they know the true one, which a pipe cannot take back."""
+"""Sizes that programs write before they know the true size, and cannot correct in a pipe."""
 UNTIL_THE_END = {b"caff": 2**64 - 1, b".snd": 0xFFFFFFFF}
-"""Sizes that mean all that follows."""
+"""Sizes that mean everything up to the end of the file."""
 MOST_CHUNKS = 10_000
-"""Most chunks that are looked at."""
+"""Most chunks that are read."""
 PACKED = ("FLAC", "ALAC_16", "ALAC_20", "ALAC_24", "ALAC_32")
-"""Formats and subtypes that pack samples without loss, by prediction and Rice's code."""
+"""Formats and subtypes of lossless compression, by prediction and Rice's code."""
 
 
 class _Kind(NamedTuple):
-    """How a kind of file has its chunks."""
+    """The layout of chunks in a kind of file."""
 
     first: int
-    """Where the first begins [byte]."""
+    """Offset of the first chunk [byte]."""
     head: struct.Struct
     """Name and size."""
     own: int
-    """Bytes of the head that the size counts."""
+    """Bytes of the head that the size includes."""
     even: int
-    """Chunks begin at multiples of it, but for `first`."""
+    """Alignment of chunks after the first [byte]."""
     data: bytes
     """Name of the chunk that holds the sound."""
 
@@ -67,29 +66,29 @@ _KINDS = {
 
 
 class _Announced(NamedTuple):
-    """What a header says of the sound."""
+    """Size of the sound that a header announces."""
 
     size: int
-    """Bytes of it."""
+    """Announced size [byte]."""
     there: int
-    """Bytes from its beginning to the end of the file."""
+    """Size from its beginning to the end of the file [byte]."""
     rate: int | None = None
-    """Bytes a second, where that is said."""
+    """Bytes per second, if announced."""
 
 
 class Header(NamedTuple):
-    """The beginning of a file."""
+    """The beginning of a sound file."""
 
     magic: bytes
     """Its first four bytes."""
     length: int
-    """Of the file [bytes]."""
+    """Length of the file [byte]."""
     sound: _Announced | None
-    """None of a kind that does not say how many bytes its sound has."""
+    """None if the kind of file does not announce a size."""
 
 
 def header_of(path: Path) -> Header:
-    """Read what a file's header announces."""
+    """Read the announced size from a sound file's header."""
     length = path.stat().st_size
     with path.open("rb") as raw:
         magic = raw.read(4)
@@ -97,7 +96,7 @@ def header_of(path: Path) -> Header:
 
 
 def check_header(path: Path, file: "SoundFile", header: Header) -> None:
-    """Refuse a file whose header announces other sound than is there."""
+    """Raise if a header does not agree with the file: size, samples or rate."""
     magic, length, said = header
     if said is not None:
         _check_size(path, file, said, magic)
@@ -112,7 +111,7 @@ def check_header(path: Path, file: "SoundFile", header: Header) -> None:
 
 
 def _check_size(path: Path, file: "SoundFile", said: _Announced, magic: bytes) -> None:
-    """Refuse a size that was not filled in, that is not there, or that other fields contradict."""
+    """Raise if the announced size is not filled in, exceeds the file, or contradicts a field."""
     if said.size in UNFILLED and said.size != said.there:
         raise InputError(
             f"{path}: found a header in which the size of its sound was never filled in "
@@ -138,7 +137,7 @@ def _check_size(path: Path, file: "SoundFile", said: _Announced, magic: bytes) -
 
 
 def _announced(raw: BinaryIO, magic: bytes, length: int) -> _Announced | None:
-    """Return what a header says of the sound; None of a kind that says nothing, or has none."""
+    """Return the announced size; None for an unknown kind, or a file without sound."""
     if magic == b".snd" and length >= 12:
         begin, size = struct.unpack(">II", raw.read(8))
         there = max(length - begin, 0)
@@ -171,29 +170,29 @@ if TYPE_CHECKING:
     from soundfile import SoundFile
 
 ENDINGS = (".wav", ".rf64", ".w64", ".flac", ".aif", ".aiff", ".caf", ".au")
-"""Of files that are taken for sound."""
+"""Suffixes of sound files."""
 
 
 LARGEST_SAMPLE = 1e12
-"""No sound is louder, in units of a file's 1."""
+"""Largest valid sample, in units of a file's 1."""
 
 
 class Sound:
-    """Sound files that follow one another, as one."""
+    """Consecutive sound files, read as a single recording."""
 
     def __init__(self, paths: Sequence[Path], files: "Sequence[SoundFile]") -> None:
         self.paths, self._files = paths, files
         self._begin = np.cumsum([0, *(file.frames for file in files)])
         self.rate, self.channels = float(files[0].samplerate), files[0].channels
         self.samples = int(self._begin[-1])
-        """Of each channel."""
+        """Samples per channel."""
         kinds = [file.subtype for file in files if file.subtype.startswith("PCM_")]
         widths = [int(kind.removeprefix("PCM_").strip("SU")) for kind in kinds]
         self.quantum = max((2.0 ** (1 - bits) for bits in widths), default=0.0)
-        """Largest step of a sample, in units of 1; 0 of floats, and where steps differ."""
+        """Largest step of a sample, in units of 1; 0 for floats."""
 
     def read(self, first: int, count: int) -> Float[np.ndarray, "t m"]:
-        """Read samples of all channels, float32, from number `first` on."""
+        """Read `count` samples of all channels from sample `first`, as float32."""
         if not 0 <= first <= first + count <= self.samples:
             raise ValueError(f"samples {first} to {first + count} of {self.samples}")
         samples = np.empty((count, self.channels), dtype=np.float32)
@@ -213,7 +212,7 @@ class Sound:
         return samples
 
     def refuse_odd(self, first: int, samples: Float[np.ndarray, "t m"]) -> None:
-        """Refuse samples that are no finite numbers, or none of a sound."""
+        """Raise if samples are not finite, or larger than `LARGEST_SAMPLE`."""
         odd = ~(np.abs(samples) <= LARGEST_SAMPLE)
         if odd.any():
             row, channel = (int(one[0]) for one in np.nonzero(odd))
@@ -227,7 +226,7 @@ class Sound:
 
 @contextmanager
 def open_sound(folder: Path, about: Description) -> Iterator[Sound]:
-    """Open the sound files of a recording; refuse what is none, broken, or not as described."""
+    """Open a recording's sound files; raise if a file is missing, broken or not as described."""
     with ExitStack() as stack:
         paths = _paths(folder, about)
         files = [stack.enter_context(_opened(path)) for path in paths]
@@ -261,7 +260,7 @@ def _paths(folder: Path, about: Description) -> list[Path]:
 
 
 def _opened(path: Path) -> "SoundFile":
-    """Open one sound file, or refuse it."""
+    """Open a sound file, and check its header."""
     try:
         import soundfile
     except ImportError:
@@ -277,7 +276,7 @@ def _opened(path: Path) -> "SoundFile":
         if not path.stat().st_size:
             raise refusal(path, "an empty file", "a sound file", "copy it again")
         header = header_of(path)
-        name: Any = os.fsencode(path)  # it takes bytes, and refuses text that is not UTF-8
+        name: Any = os.fsencode(path)  # bytes, as text that is not UTF-8 is refused
         file = soundfile.SoundFile(name)
     try:
         check_header(path, file, header)
@@ -289,7 +288,7 @@ def _opened(path: Path) -> "SoundFile":
 
 @contextmanager
 def faults_named(path: Path) -> Iterator[None]:
-    """Refuse what soundfile cannot read, by the file's name."""
+    """Turn failures of soundfile into errors that name the file."""
     from soundfile import SoundFileError
 
     try:
