@@ -1,9 +1,10 @@
 """Scans to beliefs: where the vehicle is, where the landmarks are, and how surely.
 
-`motion` moves the vehicle and `measurement` measures from it (Bradley & Abaid, Sec. II-E);
-`beliefs` are the records that every filter speaks. `ekf` keeps one Gaussian over pose and map
-(Sec. III-A), `fastslam` particles, sampled paths with a map each (Sec. III-B); both place a
-landmark of which only the bearing is known as one of `rays` (Sec. III-C).
+`motion` and `measurement` are the models (Bradley & Abaid, Sec. II-E), `rays` the partially
+initialised landmarks of passive sensing (Sec. III-C), `beliefs` the records and protocols of all
+estimators, which `catalogue` lists: `ekf` (Sec. III-A), `fastslam` (Sec. III-B) and `smoother`.
+`session` runs an estimator over control steps and scans, with `data_association` (protocol in
+`association`), input checks (`checking`) and recovery from odometry failures (`recovery`).
 """
 
 from lazy_loader import attach

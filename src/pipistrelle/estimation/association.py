@@ -1,12 +1,10 @@
-r"""Data association: which landmark each row of a scan is of, between prediction and correction.
+"""Protocol of data association: label the measurements of a scan between prediction and update.
 
-An `Association` sees the predicted belief and a scan without labels, and answers with an
-`Assignment`: a label for each row, and landmarks to remove or to merge. It has a memory, handed in
-and out as beliefs are, for what is tentative. Rows of one label are merged, rows without a label
-are left out (`pipistrelle.detection.scans.labelled`), and the filter is corrected with the rest.
-
-What a row ought to be, were it of a landmark, and how surely, the belief's joint Gaussian tells
-(`expected`): of several rows at once, since all share the error of the pose.
+An `Association` receives the predicted belief and a scan without labels, and returns an
+`Assignment` with labels, and landmarks to remove or merge. Its memory of tentative landmarks is
+passed in and out like a belief. Measurements of the same label are merged, and unlabelled
+measurements are discarded (`pipistrelle.detection.scans.labelled`) before the update. `expected`
+predicts measurements from the joint Gaussian of the belief, as they share the error of the pose.
 """
 
 from collections.abc import Mapping, Sequence
@@ -24,42 +22,40 @@ from pipistrelle.geometry import wrap_angle
 from pipistrelle.jit import kernel
 
 KNOWN = "known"
-"""The method that takes the labels that come with a scan (Bradley & Abaid, Sec. III-B)."""
+"""Method that uses the labels of the scan (Bradley & Abaid, Sec. III-B)."""
 
 M = TypeVar("M")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Assignment:
-    """Labels of one scan's rows, and changes of the map."""
+    """Labels of the measurements of a scan, and changes of the map."""
 
     label: Int[np.ndarray, " m"]
-    """Label of each row: a landmark of the map, a new number for one that is not in it, or
-    UNLABELLED for clutter."""
+    """Label of each measurement: a mapped landmark, a new number, or UNLABELLED for clutter."""
     remove: tuple[int, ...] = ()
-    """Landmarks that are none, to remove from the map before the correction, where it holds them:
-    their rows are taken back, as far as the session remembers."""
+    """Landmarks to remove from the map before the update; the session repeats the scans in its
+    memory without their measurements."""
     merge: tuple[tuple[int, int], ...] = ()
-    """Pairs of landmarks that are one: the first label stays, the second goes."""
+    """Pairs of duplicate landmarks: the first label replaces the second."""
     scan: Scan | None = None
-    """The scan as the association states it, where it states more than came: the labels of callers,
-    or how far away one is. With as many rows."""
+    """The scan with changes by the association, such as callers' labels or a caller's range; the
+    same measurements in the same order."""
     again: Any = None
-    """News about earlier scans, or None: all scans that the session remembers are associated again
-    with memories that have it (`informed`)."""
+    """Information on earlier scans, or None. It makes the session associate all scans in its memory
+    again, with memories changed by ``informed``."""
     earlier: Mapping[int, Scan] = field(default_factory=dict)
-    """Earlier scans, by their numbers from 0, stated otherwise, or with labels for rows that had
-    none: the session hears again those that it remembers, and all since, before it corrects by
-    this one."""
+    """Earlier scans, by number from 0, with changes or new labels: the session repeats them, and
+    all later scans, before the update."""
 
 
 class Association(Protocol[M]):
-    """A stage that decides which landmark each row of a scan is of; a frozen record of settings.
+    """A method of data association, which assigns each measurement of a scan to a landmark.
 
-    Three methods are optional. ``informed(memory, news)`` returns an earlier memory with what has
-    become known (`Assignment.again`). ``knowing(memory, known, callers)`` returns a first memory
-    with the landmarks and callers that are on the map beforehand. ``tentative(memory)`` returns the
-    labels of landmarks that may be none, and are left out of the map.
+    Three methods are optional: ``informed(memory, news)`` adds information to an earlier memory
+    (`Assignment.again`), ``knowing(memory, known, callers)`` adds the known landmarks and callers
+    of the initial map to the first memory, and ``tentative(memory)`` returns the labels of
+    landmarks to leave out of the reported map.
     """
 
     def start(self) -> M:
@@ -67,22 +63,23 @@ class Association(Protocol[M]):
         ...
 
     def associate(self, memory: M, belief: Belief, scan: Scan) -> tuple[M, Assignment]:
-        """Return the memory after a scan, and what is decided; change nothing that is given."""
+        """Return the memory after a scan, and the assignment, leaving all arguments unchanged."""
         ...
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Candidates:
-    """Rows of a scan held against landmarks of the map, n pairs of a row and a landmark.
+    """Comparison of n pairs of a measurement and a landmark.
 
-    Each pair has three numbers: bearing [rad], range [m], excess path [m]; NaN where the row does
-    not have one, or its caller is not on the map.
+    Each pair has three numbers: bearing [rad], range [m], excess path [m]; NaN if not measured, or
+    if the caller is not on the map.
     """
 
     difference: Float[np.ndarray, "n 3"]
-    """Measured minus expected."""
+    """Measured minus expected values."""
     covariance: Float[np.ndarray, "n 3 n 3"]
-    """Joint covariance of all differences: of pose and map, and, in the diagonal, of the rows."""
+    """Joint covariance of all differences: from pose and map, plus the measurement noise in the
+    diagonal."""
 
 
 def expected(
@@ -92,38 +89,32 @@ def expected(
     landmark: Int[np.ndarray, " n"],
     callers: Int[np.ndarray, " c"] = NO_CALLERS,
 ) -> Candidates:
-    r"""Compare rows of a scan with what is expected of landmarks of the map.
+    r"""Compare measurements of a scan with predictions for landmarks of the map.
 
     .. math:: \nu_i = z_i - h_i(\hat x), \qquad S_{ij} = H_i P H_j^T + \delta_{ij} R_i
+
+    These are the innovations of joint compatibility tests: Neira & Tardos, IEEE Transactions on
+    Robotics and Automation 17 (2001).
 
     Parameters
     ----------
     joint : JointGaussian
-        ``belief.joint()``.
+        Result of ``belief.joint()``.
     scan : Scan
-        With standard deviations.
+        A scan with standard deviations.
     row, landmark : (n)
-        Pairs of a row of the scan and the label of a landmark of ``joint``.
+        Pairs of a measurement's index in the scan and the label of a landmark of ``joint``.
     callers : (c)
         Label of each caller as a landmark, by its number, for excess paths.
-
-    Returns
-    -------
-    Candidates
 
     Raises
     ------
     InputError
-        For a landmark that ``joint`` does not hold.
-
-    Notes
-    -----
-    The innovations that joint compatibility tests: Neira & Tardos, IEEE Transactions on Robotics
-    and Automation 17 (2001).
+        If ``joint`` lacks a landmark.
 
     Examples
     --------
-    Two landmarks ahead of a vehicle whose heading alone is uncertain are off by the same angle.
+    An uncertain heading correlates the differences of two landmarks.
 
     >>> from pipistrelle.detection.scans import make_scan
     >>> joint = JointGaussian(
@@ -166,7 +157,7 @@ def expected(
 
 @kernel
 def is_among(label: Int[np.ndarray, " m"], labels: Int[np.ndarray, " n"]) -> Bool[np.ndarray, " m"]:
-    """Return a mask of labels that are among some others: of few, sooner than `np.isin`."""
+    """Return which labels are in a set of labels; faster than `np.isin` for few labels."""
     among = np.zeros(label.size, np.bool_)
     for m in range(label.size):
         for other in labels:
@@ -176,14 +167,14 @@ def is_among(label: Int[np.ndarray, " m"], labels: Int[np.ndarray, " n"]) -> Boo
 
 @kernel
 def how_many_among(label: Int[np.ndarray, " m"], labels: Int[np.ndarray, " n"]) -> int:
-    """Return how many labels are among some others."""
+    """Count the labels that are in a set of labels."""
     return int(np.count_nonzero(is_among(label, labels)))
 
 
 def edited(belief: B, remove: Sequence[int] = (), merge: Sequence[tuple[int, int]] = ()) -> B:
-    """Return a belief without some landmarks, and with the two of each pair as one.
+    """Remove landmarks from a belief and merge pairs of duplicates.
 
-    It raises InputError for a belief that has no ``edited``.
+    Raises InputError for a belief that has no ``edited``.
     """
     if not (remove or merge):
         return belief

@@ -1,4 +1,4 @@
-"""Records of what estimators compute, and the protocols of estimators and their beliefs."""
+"""Records of estimation results, and the protocols of estimators and beliefs."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
@@ -10,7 +10,7 @@ from jaxtyping import Bool, Float, Int
 from pipistrelle.detection.scans import Scan
 
 MAX_CALLER_STD = 2.0
-"""Largest standard deviation [m] at which the place of a moving caller counts as known."""
+"""Largest standard deviation [m] of the position of a moving caller that counts as located."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -18,11 +18,12 @@ class Gaussian:
     """A mean and its covariance; leading axes, if any, count instances."""
 
     mean: Float[np.ndarray, "*n d"]
-    """(*n, d)."""
+    """Mean, (*n, d)."""
     covariance: Float[np.ndarray, "*n d d"]
-    """(*n, d, d), of true value minus mean; to first order where another error is normal."""
+    """Covariance of true value minus mean, (*n, d, d); to first order if another error is normal.
+    """
     invariant: bool = False
-    """Of poses: whether the right-invariant error is normal (`estimation.ekf.invariant`)."""
+    """Whether the right-invariant error of a pose is normal (`estimation.ekf.invariant_error`)."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -30,13 +31,13 @@ class Landmarks:
     """The map: one row per hypothesis; a landmark with a single row is fully initialised."""
 
     landmark: Int[np.ndarray, " h"]
-    """Label."""
+    """Label of each row's landmark."""
     mean: Float[np.ndarray, "h 2"]
-    """(h, 2) [m]."""
+    """Position, (h, 2) [m]."""
     covariance: Float[np.ndarray, "h 2 2"]
-    """(h, 2, 2) [m^2]."""
+    """Covariance, (h, 2, 2) [m^2]."""
     weight: Float[np.ndarray, " h"]
-    """Aggregated likelihood; it sums to 1 over the rows of a landmark."""
+    """Aggregated likelihood, with sum 1 over the rows of a landmark."""
 
 
 def no_landmarks() -> Landmarks:
@@ -54,7 +55,7 @@ def no_landmarks() -> Landmarks:
 
 
 def some_of(landmarks: Landmarks, rows: Bool[np.ndarray, " h"]) -> Landmarks:
-    """Return the rows of a map that a mask selects."""
+    """Select rows of a map by a mask."""
     return Landmarks(
         landmark=landmarks.landmark[rows],
         mean=landmarks.mean[rows],
@@ -64,7 +65,7 @@ def some_of(landmarks: Landmarks, rows: Bool[np.ndarray, " h"]) -> Landmarks:
 
 
 def joined(some: Landmarks, others: Landmarks) -> Landmarks:
-    """Return the rows of two maps, one after the other."""
+    """Concatenate the rows of two maps."""
     return Landmarks(
         landmark=np.concatenate((some.landmark, others.landmark)),
         mean=np.concatenate((some.mean, others.mean)),
@@ -74,10 +75,9 @@ def joined(some: Landmarks, others: Landmarks) -> Landmarks:
 
 
 def placed(landmarks: Landmarks) -> Bool[np.ndarray, " h"]:
-    """Return a mask of the rows of a map that are fully initialised landmarks.
+    """Return which rows of a map are fully initialised landmarks.
 
-    A landmark with a single row is fully initialised, one with several partially (Bradley & Abaid,
-    Sec. V-A).
+    A landmark of several rows is partially initialised (Bradley & Abaid, Sec. V-A).
 
     >>> mean, covariance = np.zeros((3, 2)), np.zeros((3, 2, 2))
     >>> rows = dict(landmark=np.array([4, 9, 9]), weight=np.array([1.0, 0.5, 0.5]))
@@ -89,7 +89,7 @@ def placed(landmarks: Landmarks) -> Bool[np.ndarray, " h"]:
 
 
 def in_sight(moving: Landmarks) -> Landmarks:
-    """Return the moving callers whose place is known: one row each, std up to `MAX_CALLER_STD`.
+    """Select the located moving callers: a single row, with a std up to `MAX_CALLER_STD`.
 
     >>> rows = dict(landmark=np.array([4, 9, 9]), weight=np.array([1.0, 0.5, 0.5]))
     >>> spread = np.eye(2) * np.array([0.01, 1.0, 1.0])[:, None, None]
@@ -102,25 +102,25 @@ def in_sight(moving: Landmarks) -> Landmarks:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class JointGaussian:
-    """Pose and placed landmarks of a belief together, n of them, with the linear error."""
+    """Joint Gaussian of pose and n initialised landmarks; the covariance is of the linear error."""
 
     landmark: Int[np.ndarray, " n"]
-    """Labels."""
+    """Labels of the landmarks."""
     mean: Float[np.ndarray, " d"]
-    """(3 + 2n): x, y [m], heading [rad]; then x, y [m] of each landmark."""
+    """Mean, (3 + 2n): x, y [m], heading [rad]; then x, y [m] of each landmark."""
     covariance: Float[np.ndarray, "d d"]
 
 
 class Innovations(NamedTuple):
-    """Sums over the measurements of placed landmarks that a filter has used."""
+    """Sums over the used measurements of initialised landmarks."""
 
     squared: float = 0.0
-    """Innovations squared, each divided by its expected variance."""
+    """Squared innovations, each divided by its expected variance."""
     degrees: float = 0.0
-    """Degrees of freedom: two of range and bearing, one of a bearing."""
+    """Degrees of freedom: two for range and bearing, else one per measurement."""
 
     def plus(self, squared: float, degrees: float) -> "Innovations":
-        """Return the sums with more added."""
+        """Return the sums with others added."""
         return Innovations(self.squared + squared, self.degrees + degrees)
 
 
@@ -129,37 +129,36 @@ NO_INNOVATIONS = Innovations()
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Track:
-    """The path and the map that a filter estimated: the start, then one row per control step."""
+    """Estimated trajectory and map: one pose at the start and one after each control step."""
 
     time: Float[np.ndarray, " k"]
-    """(k) [s]."""
+    """Times, (k) [s]."""
     pose: Gaussian
-    """x, y [m], heading [rad], (k, 3) and (k, 3, 3); with a scan, after its update. Of a filter
-    that revises its path, all as it believes them at the end."""
+    """Poses x, y [m], heading [rad], (k, 3) and (k, 3, 3), after the update by a scan; from a
+    smoother, the final trajectory."""
     landmarks: Landmarks
     """The final map."""
     gated: int
-    """Measurements that the gate rejected."""
+    """Number of gated measurements."""
     innovations: Innovations = NO_INNOVATIONS
-    """All zero where the filter does not count them."""
+    """Sums of innovations, zero if the estimator does not provide them."""
     cloud: Float[np.ndarray, "p 3"] | None = None
-    """The particles' last poses [m, m, rad], where the filter has particles."""
+    """Final poses of the particles [m, m, rad], if any."""
     full: float | None = None
-    """The particles' weighted mean number of fully initialised landmarks."""
+    """Weighted mean number of fully initialised landmarks over particles."""
     online: Gaussian | None = None
-    """Of a filter that revises its path: each pose as it was believed at its time."""
+    """Pose estimates at their time, from a smoother."""
     labels: tuple[Int[np.ndarray, " m"], ...] = ()
-    """Of each scan the labels of its rows, as an association has them at the end."""
+    """Final labels of the measurements of each scan by data association."""
     calibration: Mapping[str, tuple[float, float]] = field(default_factory=dict)
-    """What the filter estimated of the vehicle itself: value and standard deviation, by name."""
+    """Calibrated parameters of the vehicle: value and standard deviation, by name."""
     callers: Mapping[int, Gaussian] = field(default_factory=dict)
-    """Where moving callers were, by label, (k, 2) and (k, 2, 2): at their time, at steps with a
-    scan at which they were `in_sight`, else NaN; or as a filter that revises them believes at the
-    end."""
+    """Positions of moving callers by label, (k, 2) and (k, 2, 2), NaN if unknown: online, after
+    scans that locate them (`in_sight`), or from a smoother the final estimate."""
 
 
 def at_steps(track: Track, steps: Int[np.ndarray, " k"]) -> Track:
-    """Take a track at some of its steps."""
+    """Select steps of a track."""
     if steps.size == track.time.size:
         return track
 
@@ -177,23 +176,21 @@ def at_steps(track: Track, steps: Int[np.ndarray, " k"]) -> Track:
 
 @runtime_checkable
 class Belief(Protocol):
-    """What an estimator knows; a belief is never changed once it is made.
+    """State of an estimator; immutable.
 
-    Some methods are optional (`answer`): ``moving()`` returns moving callers, which are no
-    landmarks of the map, as Landmarks of a row per hypothesis. ``path()`` returns the start and
-    every control step so far, (k + 1, 3) and (k + 1, 3, 3), of an estimator that revises its path,
-    and ``tracks()`` a Gaussian (k + 1, 2) and (k + 1, 2, 2) of each caller by its label, NaN where
-    unknown. ``calibration()`` returns value and standard deviation of what it estimates of the
-    vehicle itself, by name. ``cloud()`` returns the poses (p, 3) of particles, with ``full``, the
-    weighted mean number of fully initialised landmarks. An association asks for three more:
-    ``joint()`` returns a `JointGaussian`, ``labels()`` those of all landmarks and callers, and
-    ``edited(remove, merge)`` the belief without the landmarks of the labels ``remove``, and with
-    the two of each pair ``merge`` as one, under the first label.
+    Optional methods (`answer`): ``moving()`` returns moving callers as Landmarks, ``path()`` a
+    smoother's trajectory, (k + 1, 3) and (k + 1, 3, 3), ``tracks()`` a Gaussian (k + 1, 2) and (k +
+    1, 2, 2) for each caller by label (NaN if unknown), ``calibration()`` value and standard
+    deviation of calibration parameters by name, and ``cloud()`` the particles' poses (p, 3), with
+    the attribute ``full``, the weighted mean number of fully initialised landmarks. Data
+    association requires ``joint()``, a `JointGaussian`, ``labels()`` of all landmarks and callers,
+    and ``edited(remove, merge)``, the belief without the labels ``remove``, and with the second of
+    each pair ``merge`` merged into the first.
     """
 
     @property
     def gated(self) -> int:
-        """How many measurements were rejected so far."""
+        """Number of gated measurements so far."""
         ...
 
     def pose(self) -> Gaussian:
@@ -206,7 +203,7 @@ class Belief(Protocol):
 
 
 def answer(belief: Belief, question: str) -> Any:
-    """Return what a belief's optional method returns (`Belief`); None where it has no such."""
+    """Call an optional method of a belief (`Belief`); None if it has no such method."""
     return getattr(belief, question)() if hasattr(belief, question) else None
 
 
@@ -215,19 +212,19 @@ B = TypeVar("B", bound=Belief)
 
 @runtime_checkable
 class AcceptsMap(Protocol[B]):
-    """An estimator that accepts a map of known landmarks beforehand."""
+    """An estimator that accepts a map of known landmarks at the start."""
 
     def knowing(self, belief: B, known: Landmarks) -> B:
-        """Return a first belief that has landmarks in its map, placed, each one's error its own."""
+        """Return the initial belief with known landmarks on its map, with independent errors."""
         ...
 
 
 @runtime_checkable
 class Estimator(Protocol[B]):
-    """A SLAM filter: a frozen record of its settings, with beliefs going in and coming out."""
+    """A SLAM estimator: an immutable record of settings, with beliefs passed in and out."""
 
     def init(self, pose: Gaussian) -> B:
-        """Return the belief that knows a pose, (3) and (3, 3), and no landmark."""
+        """Return the initial belief at a pose, (3) and (3, 3), without landmarks."""
         ...
 
     def predict(
@@ -237,9 +234,9 @@ class Estimator(Protocol[B]):
         dt: Float[np.ndarray, " k"],
         rng: np.random.Generator,
     ) -> tuple[B, Gaussian]:
-        """Carry a belief through control steps; the poses are those after each step."""
+        """Predict a belief through control steps; return it, and the pose after each step."""
         ...
 
     def update(self, belief: B, scan: Scan, rng: np.random.Generator) -> B:
-        """Correct a belief with a frame's measurements."""
+        """Update a belief with a frame's measurements."""
         ...

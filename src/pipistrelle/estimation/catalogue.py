@@ -1,14 +1,9 @@
-"""All estimators by name, one entry each: the only list of them.
+"""Catalogue of all estimators by name, and loading of external estimators and associations.
 
-Verbs, plans, memory checks, figures and reports read here what they need to know of an estimator.
-To add one, write it (`pipistrelle.estimation.beliefs.Estimator`) and give it an entry. Its module
-is imported when it is built, so the command line lists all names at once. An estimator that is not
-listed is named ``module:Class`` (`entry`).
-
-Classes from outside, estimators and associations: found, checked and built by their names.
-
-The module is an installed one, or one in the current folder, which goes first, as with
-``python -m``. Everything that can be wrong with it is refused in one line.
+To add an estimator, implement `pipistrelle.estimation.beliefs.Estimator` and add an `Entry`.
+Modules are imported only when an estimator is built. External classes are named ``module:Class``;
+the module is installed or in the current folder, which has priority, as with ``python -m``. All
+their errors become an InputError of one line.
 """
 
 import math
@@ -24,15 +19,15 @@ from pipistrelle.refusals import meant
 
 
 class Role(NamedTuple):
-    """Kind of a class from outside: its name in refusals, and its methods."""
+    """Kind of an external class: its name in error messages, and its methods."""
 
     key: str
-    """As a refusal begins: the option or setting that names the class."""
+    """Option or setting that names the class, the prefix of error messages."""
     title: str
     methods: tuple[str, ...]
-    """Methods that every such class has."""
+    """Required methods."""
     from_config: str
-    """How a class is built that is no dataclass."""
+    """Signature of the class method that builds a class that is no dataclass."""
 
 
 ESTIMATOR = Role(
@@ -44,14 +39,14 @@ ASSOCIATION = Role(
 
 
 def look_in(folder: Path) -> None:
-    """Put a folder first among those where modules are found, as ``python -m`` does."""
+    """Put a folder first in the module search path, as ``python -m`` does."""
     if sys.path[:1] != [str(folder)]:
         sys.path[:] = [str(folder), *(place for place in sys.path if place != str(folder))]
-    invalidate_caches()  # a module may be younger than the last look
+    invalidate_caches()  # a module may be newer than the last search
 
 
 def names_class(name: str) -> bool:
-    """Tell whether a name has the form ``module:Class``.
+    """Return whether a name has the form ``module:Class``.
 
     >>> names_class("mine.filters:Own"), names_class("ekf")
     (True, False)
@@ -63,7 +58,7 @@ def names_class(name: str) -> bool:
 def class_of(role: Role, name: str) -> type:
     """Import the class ``module:Class`` and check that it has the methods of its role.
 
-    It raises InputError where module or class is missing, the import fails, or methods are missing.
+    Raises InputError if module or class is missing, the import fails, or methods are missing.
     """
     module, _, wanted = name.partition(":")
     look_in(Path.cwd())
@@ -86,9 +81,7 @@ def class_of(role: Role, name: str) -> type:
 
 
 def title_met(name: str) -> str | None:
-    """Return the title of a class from outside that is imported already; import nothing.
-
-    It is None where the class is not imported or has no title that can be printed.
+    """Return the title of an external class; None if it is not imported or has no printable title.
 
     >>> title_met("never.imported:Here") is None
     True
@@ -99,10 +92,9 @@ def title_met(name: str) -> str | None:
 
 
 def build(role: Role, name: str, kind: Any, given: tuple[Any, ...], values: dict[str, Any]) -> Any:
-    """Build an object of a class from outside.
+    """Build an object of an external class; raise InputError if that fails.
 
-    `given`: what its ``from_config`` is given, where it has one; `values`: by name, for the fields
-    of a dataclass. It raises InputError where it cannot be built.
+    `given`: arguments of its ``from_config``, if any; `values`: for a dataclass, by field.
     """
     try:
         if hasattr(kind, "from_config"):
@@ -113,7 +105,7 @@ def build(role: Role, name: str, kind: Any, given: tuple[Any, ...], values: dict
 
 
 def _arguments(role: Role, kind: Any, values: dict[str, Any]) -> dict[str, Any]:
-    """Return the values for the fields of a dataclass that have one."""
+    """Select the values for the fields of a dataclass."""
     if not is_dataclass(kind):
         raise InputError(f"it is no dataclass; make it one, or write {role.from_config}")
     asked = [field for field in fields(kind) if field.init]
@@ -127,7 +119,7 @@ def _arguments(role: Role, kind: Any, values: dict[str, Any]) -> dict[str, Any]:
 
 
 def worded(error: BaseException) -> str:
-    r"""Describe an error of a class from outside: its kind, and the first line of its text.
+    r"""Format an error of an external class: its type, and the first line of its message.
 
     >>> worded(ArithmeticError("\nno solution\nsee the manual"))
     'ArithmeticError: no solution'
@@ -147,42 +139,42 @@ READ = ("listening", "association", "filter", "rays")
 DOUBLE = 8
 """Bytes of a number."""
 COPIES = 3.0
-"""How many times arrays that are worked on are held: before, during and after, as measured."""
+"""Measured number of simultaneous copies of an estimator's arrays."""
 GATE = 0.999
-"""Default share of a measurement's predicted distribution that is accepted from a recorded log."""
+"""Default gate for recorded logs, as a share of a measurement's predicted distribution."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Entry:
-    """What the rest of the package knows of an estimator."""
+    """Properties of an estimator for the rest of the package."""
 
     name: str
-    """As settings, tables and files have it."""
+    """Name in settings, tables and files."""
     title: str
-    """As a reader knows it."""
+    """Title for readers."""
     build: "Callable[[Config, Motion], Estimator]"
-    """Makes the estimator from the settings, for a vehicle with this motion model."""
+    """Function that builds the estimator from the settings for a motion model."""
     sections: tuple[str, ...]
-    """The sections of the settings that it reads; none of them changes what is heard."""
+    """Sections of the settings that it reads; none changes the measurements."""
     nees_limit: float
-    """A NEES above it means that the estimator has diverged."""
+    """NEES above which the estimator counts as diverged."""
     memory: Callable[[int, int, Config], float]
-    """The most bytes that it holds at once, by the number of landmarks, that of each one's members,
-    and a Config."""
+    """Memory estimate [bytes] from the number of landmarks, hypotheses per landmark, and the
+    settings."""
     calibrates: bool = False
-    """Whether it estimates what ``filter.calibrate`` names."""
+    """Whether it estimates the parameters in ``filter.calibrate``."""
     follows: bool = False
-    """Whether scans give it moving callers (`beliefs.Belief.moving`), or rows of what stands
-    alone."""
+    """Whether it estimates moving callers (`beliefs.Belief.moving`); else it gets only fixed
+    landmarks."""
     gate: float = GATE
-    """What ``filter.gate = "auto"`` means to it: the share of a measurement's predicted
-    distribution that it accepts of a log; 1 drops nothing."""
+    """Gate that ``filter.gate = "auto"`` selects for a log: accepted share of a measurement's
+    predicted distribution; 1 keeps all."""
     robust_gate: float = GATE
-    """The same with ``filter.robust = "huber"``."""
+    """Gate that ``filter.gate = "auto"`` selects with ``filter.robust = "huber"``."""
 
 
 def gate_of(name: str, config: Config) -> float:
-    """Return the share of a predicted distribution that an estimator accepts: ``filter.gate``.
+    """Return an estimator's gate by ``filter.gate``: accepted share of predicted distributions.
 
     >>> from pipistrelle.config import FilterConfig
     >>> gate_of("ekf", Config()), gate_of("ekf", Config(filter=FilterConfig(gate="auto")))
@@ -198,39 +190,21 @@ def gate_of(name: str, config: Config) -> float:
 
 
 def entry(name: str) -> Entry:
-    """Look an estimator up, by its name here, or as a class from outside, ``module:Class``.
+    """Look up an estimator by its name here, or as an external class ``module:Class``.
 
-    The module is one that is installed, or one in the current folder, which goes first, as it
-    does for ``python -m``. The class is an `Estimator`. Its classmethod
-    ``from_config(config, motion)`` builds it, where it has one; else it is a dataclass and is
-    given, by keyword, those of its fields that are called
+    The module is installed or in the current folder, which has priority. The class is an
+    `Estimator`. Its classmethod ``from_config(config, motion)`` builds it, or it is a dataclass
+    with any of the fields
 
     - ``motion``: the `Motion` of the vehicle,
     - ``rays``, ``gate``: these settings,
-    - ``config``: all settings.
+    - ``config``: all settings;
 
-    Its other fields need defaults. It may have the attributes ``title``, as a reader is to know
-    it (else its name), ``nees_limit`` (else infinity: only a NEES that is not finite means
-    that it diverged) and ``follows`` (else False: True gives it what is heard of callers that
-    move, whose labels are in the scan's ``moving``). What memory it needs is not known, and not
-    checked.
+    other fields need defaults. Optional attributes are ``title`` (default: its name),
+    ``nees_limit`` (default: infinity) and ``follows`` (default False; True: scans include moving
+    callers, with their labels in ``moving``). Its memory is not checked. Raises InputError for an
+    unknown name, a module that cannot be imported, or a class that is missing or no estimator.
 
-    Parameters
-    ----------
-    name : str
-
-    Returns
-    -------
-    Entry
-
-    Raises
-    ------
-    InputError
-        For an unknown name, a module that is not there or cannot be imported, a class that is
-        not there or is no estimator.
-
-    Examples
-    --------
     >>> entry("fastslam").title
     'FastSLAM 2.0'
     >>> entry("pipistrelle.estimation.ekf.filter:EkfSlam").title
@@ -257,10 +231,9 @@ def entry(name: str) -> Entry:
 
 
 def check_name(name: str, *groups: str, where: str = "filter") -> str:
-    """Return an estimator's name; refuse one neither listed nor of the form ``module:Class``.
+    """Return an estimator's name; raise InputError if it is unknown and not ``module:Class``.
 
-    ``groups`` are names of several estimators that were allowed, too, and ``where`` is where it is
-    named, for the refusal.
+    ``groups``: further accepted names; ``where``: its origin, for the message.
 
     >>> check_name("ikef")
     Traceback (most recent call last):
@@ -276,7 +249,7 @@ def check_name(name: str, *groups: str, where: str = "filter") -> str:
 
 
 def short_name(name: str) -> str:
-    """Return an estimator's name as files bear it: of one from outside, the class.
+    """Return an estimator's name for files: for an external estimator, the class.
 
     >>> short_name("ekf"), short_name("mine.filters:DeadReckoning")
     ('ekf', 'DeadReckoning')
@@ -285,10 +258,9 @@ def short_name(name: str) -> str:
 
 
 def title_of(name: str) -> str:
-    """Return an estimator's name as a reader knows it, without loading it.
+    """Return an estimator's title for readers, without importing it.
 
-    One from outside has its own title once it has been looked up in this process (`entry`); before
-    that, the name of its class.
+    External estimators have the name of their class until they are imported (`entry`).
 
     >>> title_of("ekf"), title_of("not.installed:Here")
     ('EKF', 'Here')
@@ -299,7 +271,7 @@ def title_of(name: str) -> str:
 
 
 def check_distinct(names: Iterable[str], where: str = "filter") -> None:
-    """Refuse estimators whose files would have the same name; ``where`` says where they are named.
+    """Raise InputError if estimators share a file name; ``where``: their origin, for the message.
 
     >>> check_distinct(["ekf", "a:Own", "b:Own"])
     Traceback (most recent call last):
@@ -313,7 +285,7 @@ def check_distinct(names: Iterable[str], where: str = "filter") -> None:
 
 
 def _builder(name: str, where: str) -> "Callable[[Config, Motion], Estimator]":
-    """Return what builds an EKF or the smoother, a class ``module:Class`` of this room."""
+    """Return a function that builds an EKF, given as ``module:Class`` within `estimation`."""
 
     def build(config: Config, motion: "Motion") -> "Estimator":
         module, _, kind = where.partition(":")
@@ -324,7 +296,7 @@ def _builder(name: str, where: str) -> "Callable[[Config, Motion], Estimator]":
 
 
 def _settings(name: str, config: Config, motion: "Motion") -> dict[str, Any]:
-    """Return what an EKF or the smoother is made with."""
+    """Return the arguments common to the EKFs and the smoother."""
     settings = config.filter
     return {
         "motion": motion,
@@ -349,30 +321,26 @@ def _smoother(config: Config, motion: "Motion") -> "Estimator":
 
 
 def _built(name: str, kind: Any, config: Config, motion: "Motion") -> "Estimator":
-    """Build an estimator from outside."""
+    """Build an external estimator."""
     values = {"motion": motion, "rays": config.rays, "gate": config.filter.gate, "config": config}
     return build(ESTIMATOR, name, kind, (config, motion), values)
 
 
 def _with_gate(name: str, config: Config) -> Config:
-    """Return the settings with a number for the gate, as estimators from outside get them."""
+    """Return the settings with a numeric gate, as external estimators receive them."""
     settings = config.filter.model_copy(update={"gate": gate_of(name, config)})
     return config.model_copy(update={"filter": settings})
 
 
 def _smoother_bytes(landmarks: int, _: int, config: Config) -> float:
-    """Estimate the memory of what the elimination leaves at each pose, and of all measurements.
-
-    Three rows of the border at each pose, held twice where all is linearised anew; every landmark
-    heard from every pose.
-    """
+    """Estimate the smoother's memory [bytes]: three separator rows per pose, and measurements."""
     poses = config.scenario.steps / config.scenario.steps_per_frame
     each = 2.0 * COPIES * 3 * (1 + 2 * landmarks) + 12 * landmarks
     return DOUBLE * (poses * each + COPIES * (1 + 2 * landmarks) ** 2)
 
 
 def _ekf_bytes(landmarks: int, members: int, _: Config) -> float:
-    """Estimate the memory of three covariances: before, during and after a correction."""
+    """Estimate the EKF's memory [bytes]: three covariances, before, during and after an update."""
     return COPIES * DOUBLE * (3 + 2 * landmarks * members) ** 2
 
 
@@ -385,7 +353,7 @@ def _fastslam(config: Config, motion: "Motion") -> "Estimator":
 
 
 def _fastslam_bytes(landmarks: int, members: int, config: Config) -> float:
-    """Estimate the memory of three sets of particles: before, corrected and resampled."""
+    """Estimate the memory [bytes] of three sets of particles: before, updated and resampled."""
     slopes = 4 if config.listening.timing else 0
     each = 6 * landmarks * members + landmarks + slopes * landmarks
     return COPIES * DOUBLE * config.fastslam.particles * each
@@ -433,8 +401,8 @@ CATALOGUE = {
         ),
     )
 }
-"""All estimators; the limits are those of Bradley & Abaid, Sec. V-A."""
+"""All estimators by name; NEES limits from Bradley & Abaid, Sec. V-A."""
 PAPERS = ("ekf", "fastslam")
-"""The two estimators of Bradley & Abaid."""
+"""Names of the two estimators of Bradley & Abaid."""
 SECTIONS = tuple(dict.fromkeys(name for known in CATALOGUE.values() for name in known.sections))
-"""All sections of the settings that estimators read; none of them changes what is heard."""
+"""All sections of the settings that estimators read; none changes the measurements."""

@@ -1,8 +1,8 @@
-"""Checks of a filter's inputs: first pose, known landmarks, control steps and scans.
+"""Checks of an estimator's inputs: initial pose, known landmarks, control steps and scans.
 
-A kernel reads beyond an array that is too short, and a NaN spreads through a belief unnoticed. So
-each call checks shapes, types and numbers once. Sound input is returned as it is; lists, and
-arrays of other types, are converted.
+Kernels do not check array bounds, and NaNs spread through a belief unnoticed. So each call checks
+shapes, types and values once. Valid input is returned unchanged; lists and arrays of other types
+are converted.
 """
 
 import math
@@ -42,9 +42,9 @@ from pipistrelle.refusals import shown
 FLOAT, INTEGER = np.dtype(np.float64), np.dtype(np.int64)
 ARRAY = np.ndarray
 WHOLES = ("landmark", "caller", "callers", "moving")
-"""Columns of a scan that hold whole numbers."""
+"""Integer columns of a scan."""
 MIN_STD = 1e-12
-"""Least standard deviation [m] or [rad]: the square of a smaller one is lost in rounding."""
+"""Least standard deviation [m] or [rad]; its square is still above rounding errors."""
 MAX_CONTROLS = {
     "bicycle": ((FASTEST, WIDEST), f"a speed up to {FASTEST:g} m/s, an angle up to {WIDEST:g} rad"),
     "unicycle": (
@@ -61,11 +61,11 @@ MAX_CONTROLS = {
         "all six numbers, or NaN",
     ),
 }
-"""Largest controls of each motion model, in numbers and in words."""
+"""Largest controls of each motion model, as numbers and in words."""
 LABELS_END = 2**53
-"""Labels are below it, as in a log."""
+"""Upper bound of labels, as in a log."""
 INDEFINITE = 1e-6
-"""How far rounding may put a correlation matrix from being positive semidefinite."""
+"""Tolerance for rounding in checks of positive semidefinite correlation matrices."""
 
 UNSETTLED, NO_LABEL, NO_CALLER, TWICE, NO_NUMBER, UNSTATED, NO_CALLERS = range(1, 8)
 WORDS = {
@@ -81,11 +81,11 @@ WORDS = {
     "where "
     "there are such, as pipistrelle.detection.noise states them",
 }
-"""What is wrong with rows of a scan; their labels replace {}."""
+"""Error messages by fault of a scan's measurements; {} is replaced by labels."""
 
 
 def check_gate(gate: Any) -> None:
-    """Refuse a filter's gate that is no share in (0, 1]."""
+    """Raise InputError unless a gate is in (0, 1]."""
     if isinstance(gate, bool) or not isinstance(gate, (int, float)) or not 0.0 < gate <= 1.0:
         raise InputError(
             f"gate: found {shown(gate)}, expected above 0 and up to 1; 1 drops nothing"
@@ -93,7 +93,7 @@ def check_gate(gate: Any) -> None:
 
 
 def check_belief(belief: Any, kind: type) -> None:
-    """Refuse a belief that is not one of this filter's."""
+    """Raise InputError unless a belief belongs to this estimator."""
     if not isinstance(belief, kind):
         raise InputError(
             f"belief: found {shown(belief)}, expected one of this filter, {kind.__name__}; init "
@@ -102,7 +102,7 @@ def check_belief(belief: Any, kind: type) -> None:
 
 
 def usable_pose(pose: Gaussian) -> Gaussian:
-    """Return a copy of a first pose, (3) and (3, 3), as filters take it; refuse anything else."""
+    """Return a copy of an initial pose, (3) and (3, 3); raise InputError if it is invalid."""
     if not isinstance(pose, Gaussian):
         raise InputError(
             f"init: found {shown(pose)}, expected a Gaussian of a pose, (3), and its covariance, "
@@ -126,7 +126,7 @@ def usable_pose(pose: Gaussian) -> Gaussian:
 
 
 def usable_known(known: Landmarks) -> Landmarks:
-    """Return known landmarks as filters take them; refuse anything else."""
+    """Return known landmarks with valid arrays; raise InputError if they are invalid."""
     if not isinstance(known, Landmarks):
         raise InputError(
             f"knowing: found {shown(known)}, expected Landmarks; they are in "
@@ -162,7 +162,7 @@ def usable_known(known: Landmarks) -> Landmarks:
 def usable_controls(
     motion: Motion, controls: Float[np.ndarray, "k c"], dt: Float[np.ndarray, " k"]
 ) -> tuple[Float[np.ndarray, "k c"], Float[np.ndarray, " k"]]:
-    """Return control steps and their times [s] as filters take them; refuse anything else."""
+    """Return control steps and their durations [s] as arrays; raise InputError if invalid."""
     steps, times = controls, dt
     if not (_is_plain(controls) and _is_plain(dt)):
         steps, times = _converted(controls, FLOAT), _converted(dt, FLOAT)
@@ -190,11 +190,11 @@ def usable_controls(
 
 
 def usable_scan(scan: Scan) -> Scan:
-    """Return a scan as filters take it: one row per landmark, and none without a label.
+    """Return a scan with one measurement per landmark, all labelled; raise InputError if invalid.
 
-    Rows of a landmark that several callers lit up are merged (`detection.merging.labelled`). It
-    refuses arrays that do not fit, bad labels, two bearings of a landmark by one call, rows that
-    are neither bearing nor excess path, and rows without standard deviations.
+    Measurements of a landmark by several callers are merged (`detection.scans.labelled`). Invalid
+    are arrays of unequal length, bad labels, two bearings of a landmark by the same call,
+    measurements with neither bearing nor excess path, or without standard deviations.
     """
     if not isinstance(scan, Scan):
         raise InputError(
@@ -210,7 +210,7 @@ def usable_scan(scan: Scan) -> Scan:
 
 
 def _is_laid_out(scan: Scan) -> bool:
-    """Tell whether a scan's columns are arrays as kernels take them."""
+    """Return whether a scan's columns are arrays as kernels require them."""
     landmark, caller, numbers = scan.landmark, scan.caller, scan.numbers
     callers, moving = scan.callers, scan.moving
     return (
@@ -229,7 +229,7 @@ def _is_laid_out(scan: Scan) -> bool:
 
 
 def _laid_out(scan: Scan) -> Scan:
-    """Convert a scan's columns to arrays as kernels take them, or refuse them."""
+    """Convert a scan's columns to arrays for kernels; raise InputError if that fails."""
     columns: dict[str, Any] = {name: _converted(getattr(scan, name), INTEGER) for name in WHOLES}
     columns["numbers"] = _converted(scan.numbers, FLOAT)
     if not any(column is None for column in columns.values()):
@@ -245,18 +245,15 @@ def _laid_out(scan: Scan) -> Scan:
 
 
 def _is_plain(values: Any) -> bool:
-    """Tell whether values are a float array as kernels take it."""
+    """Return whether values are a float array as kernels require it."""
     return type(values) is ARRAY and values.dtype == FLOAT and values.flags.carray
 
 
 def _converted(values: Any, kind: np.dtype) -> np.ndarray | None:
-    """Return a copy of values as an array that kernels take; None where they are no such numbers.
-
-    An empty list passes as either type.
-    """
+    """Convert values to an array for kernels; None if their type does not permit it."""
     try:
         given = np.asarray(values)
-    except (TypeError, ValueError):  # rows of unlike lengths
+    except (TypeError, ValueError):  # rows of unequal lengths
         return None
     if given.size and given.dtype.kind not in ("iu" if kind == INTEGER else "fiu"):
         return None
@@ -264,7 +261,7 @@ def _converted(values: Any, kind: np.dtype) -> np.ndarray | None:
 
 
 def _shape_of(values: Any) -> str:
-    """Describe type and shape of what was given instead of an array."""
+    """Describe type and shape of a value that is not a valid array."""
     try:
         given = np.asarray(values)
     except (TypeError, ValueError):
@@ -273,7 +270,7 @@ def _shape_of(values: Any) -> str:
 
 
 def _worded(scan: Scan, fault: int) -> str:
-    """Describe what is wrong with a scan, and name its landmarks."""
+    """Format a scan's fault, with the affected landmarks."""
     if fault == NO_CALLERS:
         return (
             f"the callers' labels {scan.callers.tolist()} and {scan.moving.tolist()} for who "
@@ -292,7 +289,7 @@ def _fault(
     callers: Int[np.ndarray, " c"],
     moving: Int[np.ndarray, " v"],
 ) -> int:
-    """Return the number of the first fault in a scan; 0 where it is sound."""
+    """Return the code of the first fault in a scan; 0 if it is valid."""
     for m in range(landmark.size):
         fault = _fault_of_row(landmark, caller, numbers, m)
         if fault:
@@ -313,7 +310,7 @@ def _fault_of_row(
     numbers: Float[np.ndarray, "8 m"],
     m: Whole,
 ) -> int:
-    """Return the number of a row's fault, or 0."""
+    """Return the code of a measurement's fault, or 0."""
     if landmark[m] < UNLABELLED or landmark[m] >= LABELS_END:
         return NO_LABEL
     if caller[m] < 0:
@@ -349,7 +346,7 @@ def _are_steps(
     most: tuple[float, ...],
     poses: Flag,
 ) -> Flag:
-    """Tell whether these are control steps."""
+    """Return whether all control steps and durations are within limits, with valid covariances."""
     for k in range(times.size):
         if not 0.0 < times[k] <= LONGEST_STEP:
             return False
@@ -364,7 +361,7 @@ def _are_steps(
 
 @kernel
 def is_covariance(entries: Float[np.ndarray, "6"]) -> Flag:
-    """Tell whether xx, xy, xh, yy, yh and hh are a covariance, up to rounding."""
+    """Return whether xx, xy, xh, yy, yh and hh form a covariance, up to rounding."""
     xx, yy, hh = entries[0], entries[3], entries[5]
     if not (0.0 <= xx <= LARGEST**2 and 0.0 <= yy <= LARGEST**2 and 0.0 <= hh <= LARGEST**2):
         return False
@@ -378,7 +375,7 @@ def is_covariance(entries: Float[np.ndarray, "6"]) -> Flag:
 
 @kernel
 def _correlation(covariance: float, one: float, other: float) -> float:
-    """Return the correlation of two numbers; infinite where one has no variance and they covary."""
+    """Return the correlation of two numbers; infinite for a covariance without variance."""
     if covariance == 0.0:
         return 0.0
     return covariance / math.sqrt(one * other)

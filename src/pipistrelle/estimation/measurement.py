@@ -1,7 +1,6 @@
-"""The measurement model with its Jacobians: range, bearing and excess path of a point.
+"""The measurement model with Jacobians: range, bearing and excess path of a point.
 
-`Measurements` and `ExcessPaths` are the rows of a scan as the filters' kernels take them. A filter
-that weighs what else a scan may hold (its levels) adds a field here.
+`Measurements` and `ExcessPaths` hold a scan's measurements as the estimators' kernels take them.
 """
 
 import math
@@ -24,29 +23,28 @@ from pipistrelle.geometry import wrap_angle
 from pipistrelle.jit import Whole, kernel, no_alloc
 
 NEAREST = 1e-3
-"""Points nearer than this [m] are too near to linearise a measurement."""
+"""Distance [m] below which a measurement is not linearised."""
 MIN_TDOA_SIGMAS = 3.0
-"""An excess path places something only if it is above so many of its standard deviations: that of a
-point between vehicle and caller is 0, and an error would place the point near one of them,
-seemingly surely."""
+"""Least ratio of an excess path to its standard deviation for initialisation. Between vehicle and
+caller it is 0, and an error would falsely place a point near one of them with high confidence."""
 HUBER_K = 2.0
-"""Standard deviations beyond which Huber's rule lets a measurement count less."""
+"""Standard deviations above which Huber's rule down-weights a measurement."""
 
 
 class Measurements(NamedTuple):
-    """Rows of a scan, each of a landmark of its own, as the kernels take them."""
+    """Bearings and ranges of a scan, of distinct landmarks, as kernels take them."""
 
     landmark: Int[np.ndarray, " m"]
     bearing: Float[np.ndarray, " m"]  # [rad]
-    range: Float[np.ndarray, " m"]  # [m], NaN where passive
+    range: Float[np.ndarray, " m"]  # [m], NaN if passive
     bearing_variance: Float[np.ndarray, " m"]  # [rad^2]
     range_variance: Float[np.ndarray, " m"]  # [m^2]
 
 
 class ExcessPaths(NamedTuple):
-    """The rows of a scan that have an excess path and a caller with a known label."""
+    """Excess paths of a scan from callers with known labels."""
 
-    landmark: Int[np.ndarray, " d"]  # no landmark is its own caller
+    landmark: Int[np.ndarray, " d"]  # never the caller
     caller: Int[np.ndarray, " d"]
     excess_path: Float[np.ndarray, " d"]  # [m]
     variance: Float[np.ndarray, " d"]  # [m^2]
@@ -54,20 +52,20 @@ class ExcessPaths(NamedTuple):
 
 
 Columns = tuple[Int[np.ndarray, " m"], Float[np.ndarray, "8 m"]]
-"""Labels and numbers of a scan's rows."""
+"""Labels and numbers of a scan's measurements."""
 Timings = tuple[Int[np.ndarray, " m"], Int[np.ndarray, " callers"], Int[np.ndarray, " v"]]
-"""Callers of a scan's rows; the labels of the callers, and of those that move."""
+"""Caller of each measurement of a scan; labels of the callers, and of the moving callers."""
 
 
 def columns_of(scan: Scan) -> Columns:
-    """Return a scan as kernels take it: a plain tuple is passed faster than a record."""
+    """Return a scan as a tuple for kernels, faster to pass than a record."""
     return scan.landmark, np.ascontiguousarray(scan.numbers)
 
 
 def timings_of(scan: Scan) -> Timings | None:
-    """Return caller columns of a scan as kernels take them; None where it names no caller.
+    """Return the caller columns of a scan for kernels, or None if it names no caller.
 
-    A kernel that gets None is compiled without its code for excess paths.
+    For None, kernels are compiled without code for excess paths.
     """
     if scan.callers.size == 0 and scan.moving.size == 0:
         return None
@@ -78,7 +76,7 @@ def timings_of(scan: Scan) -> Timings | None:
 def measurements(columns: Columns) -> Measurements:
     """Return the bearings and ranges of a scan, with variances.
 
-    Rows of an excess path without a bearing stand at the end and are left out.
+    Measurements with only an excess path, which come last, are left out.
     """
     landmark, numbers = columns
     rows = landmark.size
@@ -96,7 +94,7 @@ def measurements(columns: Columns) -> Measurements:
 
 @kernel
 def excess_paths(columns: Columns, timings: Timings) -> ExcessPaths:
-    """Return the excess paths of a scan. A caller's own row is no excess path over itself.
+    """Return the excess paths of a scan, without the callers' direct calls.
 
     >>> from dataclasses import replace
     >>> from pipistrelle.detection.scans import make_scan
@@ -122,7 +120,7 @@ def excess_paths(columns: Columns, timings: Timings) -> ExcessPaths:
 
 
 class Row(NamedTuple):
-    """One of `Measurements`, as numbers: a kernel passes it faster than the arrays."""
+    """A bearing and range of `Measurements` as scalars, faster to pass to kernels than arrays."""
 
     landmark: Whole
     bearing: float
@@ -133,7 +131,7 @@ class Row(NamedTuple):
 
 @no_alloc
 def row_of(heard: Measurements, m: Whole) -> Row:
-    """Return measurement m."""
+    """Return measurement m as scalars."""
     return Row(
         heard.landmark[m],
         heard.bearing[m],
@@ -169,29 +167,14 @@ def measurement_jacobians(
               H_m = \begin{bmatrix} c & s \\ -s/d & c/d \end{bmatrix}
 
     with (c, s) the unit vector from the vehicle to the landmark and d their distance. A passive
-    measurement is the bearing alone,
+    measurement is only the bearing,
 
     .. math:: \phi_i = \operatorname{atan2}(y_i - y_v, x_i - x_v) - \theta_v
        :label: eq-7
 
-    and has the second rows alone.
+    with only the second rows. Source: Bradley & Abaid, with Eqs. (6), (7) and (11). ``pose`` is (3)
+    [m, m, rad], ``point`` (2) [m]; returns H_x (2, 3) and H_m (2, 2).
 
-    Parameters
-    ----------
-    pose : (3) [m, m, rad]
-    point : (2) [m]
-
-    Returns
-    -------
-    H_x : (2, 3)
-    H_m : (2, 2)
-
-    Notes
-    -----
-    Bradley & Abaid, with Eqs. (6), (7) and (11).
-
-    Examples
-    --------
     >>> measurement_jacobians(np.zeros(3), np.array([2.0, 0.0]))[1]
     array([[ 1. ,  0. ],
            [-0. ,  0.5]])
@@ -204,11 +187,11 @@ def measurement_jacobians(
 def excess_path_slopes(
     x: float, y: float, px: float, py: float, bx: float, by: float
 ) -> tuple[float, float, float, float, float]:
-    """Return the excess path over a point and its slopes, for kernels.
+    """Return the excess path via a point and its derivatives, for kernels.
 
     The vehicle is at (x, y), the point at (px, py) and the caller at (bx, by). Returns the excess
-    path [m], its derivatives by the point (2) and by the caller (2); those by the vehicle are minus
-    their sum. Distances are bounded from below by `NEAREST`.
+    path [m], its derivatives by the point (2) and by the caller (2); the derivatives by the vehicle
+    are minus their sum. Distances are bounded from below by `NEAREST`.
     """
     ux, uy, near = _away(x, y, px, py)
     wx, wy, onward = _away(bx, by, px, py)
@@ -227,9 +210,9 @@ def _away(x: float, y: float, px: float, py: float) -> tuple[float, float, float
 
 @kernel
 def range_by_excess_path(excess_path: float, dx: float, dy: float, c: float, s: float) -> float:
-    """Return the range of a point in direction (c, s) of the vehicle, the caller at (dx, dy).
+    """Return the range of a point in direction (c, s) from the vehicle, for a caller at (dx, dy).
 
-    It is infinite or negative where no point there has such an excess path; see `landmark_range`.
+    It is infinite or negative if no point in this direction has the excess path (`landmark_range`).
     """
     if excess_path <= 0.0:
         return math.inf
@@ -246,9 +229,9 @@ def range_by_excess_path(excess_path: float, dx: float, dy: float, c: float, s: 
 def caller_range_by_excess_path(
     excess_path: float, dx: float, dy: float, c: float, s: float
 ) -> float:
-    """Return the range of a caller in direction (c, s) of the vehicle, the point at (dx, dy).
+    """Return the range of a caller in direction (c, s) from the vehicle, for a point at (dx, dy).
 
-    It is infinite or negative where no caller there makes such an excess path.
+    It is infinite or negative if no caller in this direction causes the excess path.
     """
     if excess_path <= 0.0:
         return math.inf
@@ -259,15 +242,13 @@ def caller_range_by_excess_path(
 def excess_path_of(
     vehicle: Float[np.ndarray, "2"], point: Float[np.ndarray, "2"], caller: Float[np.ndarray, "2"]
 ) -> float:
-    """Return how much longer the path of a sound over a point is than the straight one [m].
+    """Return the excess path of an echo via a point [m]: its path length minus the direct path.
 
     .. math:: e = |b - l| + |l - p| - |b - p|
 
-    Points of one excess path lie on an ellipse whose foci are the caller b and the vehicle p; all
-    are x, y [m].
+    Points of equal excess path form an ellipse with the caller b and the vehicle p as foci; all are
+    x, y [m].
 
-    Examples
-    --------
     >>> excess_path_of(np.zeros(2), np.array([3.0, 4.0]), np.array([6.0, 0.0]))
     4.0
     """
@@ -290,28 +271,15 @@ def excess_path_jacobians(
 
 
 def landmark_range(excess_path: float, caller: Float[np.ndarray, "2"], bearing: float) -> float:
-    r"""Return the range of a point by its bearing and its excess path over a known caller.
+    r"""Return the range of a point [m] from its bearing and its excess path via a known caller.
 
     .. math:: r = \frac{(d + e)^2 - d^2}{2 (d + e - u \cdot v)}
 
-    with v the vector from the vehicle to the caller, d its length and u the direction of the
-    bearing: where the ray from the vehicle crosses the ellipse of that excess path. Between vehicle
-    and caller numerator and denominator vanish together: there an excess path says nothing about
-    the range. An excess path of 0 or less gives no range.
+    with v the vector from the vehicle to the caller (``caller``, in the vehicle's axes) [m], d its
+    length, u the direction of the bearing [rad] and e the excess path [m]: the intersection of the
+    bearing with the ellipse of equal excess path. Between vehicle and caller the range is
+    undetermined (0 / 0). An excess path of 0 or less gives no range.
 
-    Parameters
-    ----------
-    excess path : [m]
-    caller : (2) [m]
-        From the vehicle, in its axes.
-    bearing : [rad]
-
-    Returns
-    -------
-    [m]
-
-    Examples
-    --------
     >>> round(landmark_range(4.0, np.array([6.0, 0.0]), math.atan2(4.0, 3.0)), 9)
     5.0
     """

@@ -1,16 +1,14 @@
-r"""Motion models with their Jacobians.
+r"""Motion models with their Jacobians: bicycle, unicycle, car and relative poses.
 
-The *controls* of a step are two numbers of a bicycle, a unicycle or a car. Of *poses*, as odometry
-gives them, they are the motion since the previous pose in its axes, forward, sideways and turn,
+The *controls* of a step are two numbers for bicycle, unicycle and car. For *poses*, as odometry
+reports them, they are the motion since the previous pose in its axes, forward, sideways and turn,
 
 .. math:: (x, y)_k = (x, y)_{k-1} + R(\theta_{k-1}) \, (d_x, d_y), \quad
           \theta_k = \theta_{k-1} + d_\theta
 
-followed, where a recorder states it, by the six numbers of its covariance.
-
-The kernels return plain numbers, so that the filters can inline them; the functions beside them
-return arrays. In the kernels a motion model is a number: 0 bicycle, 1 unicycle, 2 poses,
-3 Ackermann.
+followed by the six numbers of its covariance, if recorded. Kernels return scalars, so that
+estimators can inline them; public functions return arrays. In kernels a motion model is its index
+in `MOTION_MODELS`.
 """
 
 import math
@@ -29,8 +27,7 @@ MOTION_MODELS = ("bicycle", "unicycle", "poses", "ackermann")
 BY_POSES = MOTION_MODELS.index("poses")
 ACKERMANN = MOTION_MODELS.index("ackermann")
 MOVED = 3
-"""How many numbers a relative motion has; those of its covariance follow: xx, xy, xh, yy, yh,
-hh."""
+"""Size of a relative motion; its covariance follows: xx, xy, xh, yy, yh, hh."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -38,23 +35,22 @@ class Motion:
     """A motion model and the noise of its controls."""
 
     model: Literal["bicycle", "unicycle", "poses", "ackermann"]
-    """Controls are speed [m/s] and steering angle [rad], of a bicycle, whose pose is the front
-    wheel's, or of a car (Ackermann), whose pose is that of the middle of the rear axle; speed [m/s]
-    and angular rate [rad/s]; or the motion since the pose before: forward, sideways (to the left)
-    [m] and turn [rad], perhaps with its covariance xx, xy, xh, yy, yh, hh (x forward, h turn; NaN:
-    not stated)."""
+    """Motion model by name. Controls are speed [m/s] and steering angle [rad] for a bicycle (pose:
+    front wheel) or a car (Ackermann; pose: middle of the rear axle); speed [m/s] and angular
+    rate [rad/s] for a unicycle; for poses the motion since the previous pose: forward, sideways
+    (left) [m] and turn [rad], optionally with its covariance xx, xy, xh, yy, yh, hh (x forward,
+    h turn; NaN: unknown)."""
     control_std: tuple[float, ...]
-    """Noise of one control step, a number for each of these; of poses, of a motion that does not
-    state its covariance."""
+    """Standard deviation of each control in a step; for poses, of motions without covariance."""
     wheelbase: float = 1.0
-    """[m], of a bicycle or a car."""
+    """Wheelbase of a bicycle or a car [m]."""
     speed_offset: float = 0.0
-    """How far left of the middle of its rear axle a car's speed is measured [m]."""
+    """Lateral offset of a car's speed sensor to the left of the middle of the rear axle [m]."""
     noise_at_rest: bool = True
-    """False: a step without motion is exact."""
+    """Whether a step without motion is noisy, not exact."""
 
     def __post_init__(self) -> None:
-        """Refuse an unknown model, and noise that is not one number for each control."""
+        """Raise InputError for an unknown model or noise of the wrong size."""
         if self.model not in MOTION_MODELS:
             known = ", ".join(MOTION_MODELS)
             raise InputError(f"motion: found the model {self.model!r}, expected one of {known}")
@@ -77,7 +73,7 @@ class Motion:
 
 
 class MotionNumbers(NamedTuple):
-    """A motion model as the kernels take it; variances are those of one control step."""
+    """A motion model for kernels; variances of one control step."""
 
     model: int
     wheelbase: float
@@ -90,7 +86,7 @@ class MotionNumbers(NamedTuple):
 
 @lru_cache(maxsize=16)
 def motion_numbers(motion: Motion) -> MotionNumbers:
-    """Convert a motion model to numbers for the kernels."""
+    """Convert a motion model to numbers for kernels."""
     return MotionNumbers(
         model=MOTION_MODELS.index(motion.model),
         wheelbase=float(motion.wheelbase),
@@ -106,11 +102,11 @@ def motion_numbers(motion: Motion) -> MotionNumbers:
 def motion_increment(
     motion: MotionNumbers, heading: float, control: Float[np.ndarray, " c"], dt: float
 ) -> tuple[float, float, float, float, float, float, float, float, float]:
-    """Take one noise-free control step, for kernels.
+    """Return the motion of a noise-free control step and its Jacobian, for kernels.
 
     Returns dx, dy, dheading, then the Jacobian U by speed (x, y, heading) and by turn (x, y,
-    heading). The derivatives of x and y by heading are -dy and dx. Of poses the column by the
-    sideways motion is missing: it is the first, turned by 90 degrees.
+    heading). The derivatives of x and y by heading are -dy and dx. For poses, the column by the
+    sideways motion, the first rotated by 90 degrees, is omitted.
     """
     if motion.model == BY_POSES:
         c, s = math.cos(heading), math.sin(heading)
@@ -139,7 +135,7 @@ def motion_increment(
 def _arc(
     heading: float, speed: float, turn: float, dt: float
 ) -> tuple[float, float, float, float, float, float, float, float, float]:
-    """Go along the arc of a speed and an angular rate; returns what `motion_increment` does."""
+    """Return the motion along the arc of a speed and an angular rate, as `motion_increment`."""
     half = 0.5 * turn * dt
     if abs(half) < 1e-4:
         sinc, slope = 1.0 - half * half / 6.0, -half / 3.0
@@ -161,7 +157,7 @@ def _arc(
 def _car_increment(
     motion: MotionNumbers, heading: float, control: Float[np.ndarray, " c"], dt: float
 ) -> tuple[float, float, float, float, float, float, float, float, float]:
-    """Go as a car does; returns what `motion_increment` does."""
+    """Return the motion of a car (Ackermann steering), as `motion_increment`."""
     bend = math.tan(control[1]) / motion.wheelbase
     share = 1.0 / (1.0 - motion.speed_offset * bend)
     speed = control[0] * share
@@ -181,7 +177,7 @@ def _car_increment(
 def relative_noise(
     control: Float[np.ndarray, " c"], motion: MotionNumbers
 ) -> tuple[float, float, float, float, float, float]:
-    """Return xx, xy, xh, yy, yh, hh of a motion's covariance, in the axes of the pose before."""
+    """Return the covariance of a motion, xx, xy, xh, yy, yh, hh, in the axes of the pose before."""
     moves = control[0] != 0.0 or control[1] != 0.0 or control[2] != 0.0
     if not (motion.noise_at_rest or moves):
         return 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
@@ -201,9 +197,9 @@ def propagate_pose(
     dt: float,
     motion: MotionNumbers,
 ) -> tuple[float, float]:
-    """Propagate a pose (3) and its covariance (3, 3) through a control step, in place.
+    """Predict a pose (3) and its covariance (3, 3) through a control step, in place.
 
-    F P F^T + U Q U^T (Bradley & Abaid, Eq. (10)); Q has rank 2, of poses 3. Returns dx and dy [m].
+    F P F^T + U Q U^T (Bradley & Abaid, Eq. (10)); Q has rank 2, for poses 3. Returns dx and dy [m].
     """
     dx, dy, dheading, u00, u10, u20, u01, u11, u21 = motion_increment(motion, pose[2], control, dt)
     pose[0] += dx
@@ -237,38 +233,20 @@ def propagate_pose(
 def motion_step(
     motion: Motion, pose: Float[np.ndarray, "3"], control: Float[np.ndarray, " c"], dt: float
 ) -> Float[np.ndarray, "3"]:
-    r"""Return the pose after one noise-free control step.
+    r"""Return the pose after a noise-free control step (Bradley & Abaid, Eq. (5)).
 
     .. math:: x_k = x_{k-1} + V\Delta_t \cos(\theta_{k-1} + \gamma), \quad
               y_k = y_{k-1} + V\Delta_t \sin(\theta_{k-1} + \gamma), \quad
               \theta_k = \theta_{k-1} + \tfrac{V\Delta_t}{B}\sin\gamma
        :label: eq-5
 
-    for the bicycle's front wheel; for the unicycle the exact arc of speed V and angular rate
-    omega, written by its chord :math:`V\Delta_t \operatorname{sinc}(\omega\Delta_t/2)`; of poses
-    the motion as it is. A car's middle of the rear axle goes along the arc of the speed
-    :math:`V / (1 - h \tan(\gamma) / B)` and of that times :math:`\tan(\gamma) / B`, where V is
-    measured h to the left of it.
+    for the bicycle's front wheel; for the unicycle the exact arc of speed V and angular rate omega,
+    with the chord :math:`V\Delta_t \operatorname{sinc}(\omega\Delta_t/2)`; for poses the given
+    motion. The middle of a car's rear axle follows the arc of the speed :math:`V / (1 - h
+    \tan(\gamma) / B)` and the rate :math:`\tan(\gamma) / B` times this speed, if V is measured h to
+    the left of it. ``pose`` is (3) [m, m, rad], ``control`` (c) of the model (`Motion.model`),
+    ``dt`` in s; returns (3) [m, m, rad], with the heading wrapped.
 
-    Parameters
-    ----------
-    motion : Motion
-    pose : (3) [m, m, rad]
-    control : (c)
-        As the model has them.
-    dt : [s]
-
-    Returns
-    -------
-    (3) [m, m, rad]
-        Heading wrapped.
-
-    Notes
-    -----
-    Bradley & Abaid, Eq. (5).
-
-    Examples
-    --------
     >>> motion = Motion(model="unicycle", control_std=(0.1, 0.1))
     >>> motion_step(motion, np.zeros(3), np.array([np.pi, np.pi]), 0.5).round(12)
     array([1.        , 1.        , 1.57079633])
@@ -280,22 +258,11 @@ def motion_step(
 def relative_motions(
     motion: Motion, controls: Float[np.ndarray, "k c"], dt: Float[np.ndarray, " k"]
 ) -> tuple[Float[np.ndarray, "k 3"], Float[np.ndarray, "k 3 3"]]:
-    """Return the motion of each control step in the vehicle's axes before it, and its covariance.
+    """Return the motion of each control step in the vehicle's previous axes, and its covariance.
 
-    Parameters
-    ----------
-    motion : Motion
-    controls : (k, c)
-        As the model has them.
-    dt : (k) [s]
+    ``controls`` (k, c) as in `Motion.model`, ``dt`` (k) [s]; returns (k, 3) [m, m, rad] and (k, 3,
+    3).
 
-    Returns
-    -------
-    (k, 3) [m, m, rad]
-    (k, 3, 3)
-
-    Examples
-    --------
     >>> motion = Motion(model="unicycle", control_std=(0.1, 0.1))
     >>> way, covariance = relative_motions(motion, np.array([[2.0, 0.0]]), np.array([0.5]))
     >>> way, covariance[0].diagonal().round(4)
@@ -309,7 +276,7 @@ def relative_motions(
 def _relative_motions(
     controls: Float[np.ndarray, "k c"], dt: Float[np.ndarray, " k"], motion: MotionNumbers
 ) -> tuple[Float[np.ndarray, "k 3"], Float[np.ndarray, "k 3 3"]]:
-    """Carry a pose at the origin through each control step alone."""
+    """Predict a pose at the origin through each control step separately."""
     ways, covariances = np.zeros((dt.size, 3)), np.zeros((dt.size, 3, 3))
     for k in range(dt.size):
         propagate_pose(ways[k], covariances[k], controls[k], dt[k], motion)
@@ -319,11 +286,11 @@ def _relative_motions(
 def controls_between(
     path: Float[np.ndarray, "t 3"], dt: float | Float[np.ndarray, " t-1"], motion: Motion
 ) -> Float[np.ndarray, "t-1 2"]:
-    r"""Return the controls that lead from each pose to the next, as nearly as the motion model can.
+    r"""Return the controls from each pose to the next, as exactly as the motion model permits.
 
     A unicycle's arc has the turn of the heading, and a bicycle's front wheel the steering angle
-    that makes it, :math:`\sin\gamma = B \Delta\theta / (V \Delta_t)`; the speed is along the arc's
-    chord or the wheel's path. Sideways motion is lost. ``path`` (k + 1, 3) [m, m, rad], ``dt`` [s].
+    :math:`\sin\gamma = B \Delta\theta / (V \Delta_t)`; the speed is along the arc's chord or the
+    wheel's path. Sideways motion is lost. ``path`` (k + 1, 3) [m, m, rad], ``dt`` [s].
 
     >>> motion = Motion(model="bicycle", control_std=(0.1, 0.03), wheelbase=0.2)
     >>> there = motion_step(motion, np.zeros(3), np.array([0.75, 0.1]), 0.125)
@@ -347,25 +314,9 @@ def motion_jacobians(
 ) -> tuple[Float[np.ndarray, "3 3"], Float[np.ndarray, "3 n"]]:
     """Return the derivatives of `motion_step` by the pose, F, and by the noisy control, U.
 
-    Parameters
-    ----------
-    motion : Motion
-    pose : (3) [m, m, rad]
-    control : (c)
-        As the model has them.
-    dt : [s]
+    Arguments as in `motion_step`; F is (3, 3) and U (3, 2), for poses (3, 3). Source: Bradley &
+    Abaid, with Eq. (10).
 
-    Returns
-    -------
-    F : (3, 3)
-    U : (3, 2), of poses (3, 3)
-
-    Notes
-    -----
-    Bradley & Abaid, with Eq. (10).
-
-    Examples
-    --------
     >>> motion = Motion(model="bicycle", control_std=(0.1, 0.03), wheelbase=0.2)
     >>> F, U = motion_jacobians(motion, np.zeros(3), np.array([2.0, 0.0]), 0.5)
     >>> F[1, 2], U[2, 1]
@@ -381,25 +332,11 @@ def motion_jacobians(
 
 
 def motion_noise(motion: Motion, control: Float[np.ndarray, " c"]) -> Float[np.ndarray, "n n"]:
-    """Return the covariance Q of a control step's noise, in the order of the motion model.
+    """Return the covariance Q of a control step's noise, (2, 2), for poses (3, 3).
 
-    Parameters
-    ----------
-    motion : Motion
-    control : (c)
-        Of poses with the covariance that its motion has, perhaps.
+    ``control`` (c) may contain the covariance of a relative pose. Q is zero at rest if that is
+    exact. Source: Bradley & Abaid, with Eq. (10).
 
-    Returns
-    -------
-    (2, 2), of poses (3, 3)
-        Zero at rest, where that is exact.
-
-    Notes
-    -----
-    Bradley & Abaid, with Eq. (10).
-
-    Examples
-    --------
     >>> motion_noise(Motion(model="poses", control_std=(0.5, 0.25, 0.125)), np.ones(3)).diagonal()
     array([0.25    , 0.0625  , 0.015625])
     """

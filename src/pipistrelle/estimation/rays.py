@@ -1,8 +1,8 @@
-r"""Passive landmarks as a ray of Gaussians.
+r"""Rays: passive landmarks as a sequence of Gaussian hypotheses along the first bearing.
 
-A bearing alone does not say how far away a landmark is. Instead of waiting for parallax, the
-landmark enters the map at once as a *ray*: :math:`N_g` Gaussian members along the bearing, at
-ranges that grow by the factor :math:`\beta`, each as long as its range allows,
+A bearing does not measure range. Instead of waiting for parallax, the landmark enters the map as a
+*ray*: :math:`N_g` Gaussian hypotheses (members) along the bearing, at ranges that grow by the
+factor :math:`\beta`, with standard deviations proportional to range,
 
 .. math:: s_1 = \frac{s_{min}}{1-\alpha}, \quad s_j = \beta s_{j-1}, \quad
           \sigma_j = \alpha s_j, \quad
@@ -10,20 +10,18 @@ ranges that grow by the factor :math:`\beta`, each as long as its range allows,
           \frac{s_{max}}{s_{min}}\right) \right\rceil .
    :label: eq-17
 
-Seen from the vehicle the members differ in range only, so one bearing cannot tell them apart; a
-few bearings from different places can. Each new bearing does three things to a ray:
+A few bearings from different positions distinguish them. Each new bearing has three effects:
 
-1. **Weigh.** The aggregated likelihood of member j is its probability given all bearings so far;
-   a bearing multiplies it by its own likelihood :math:`\lambda_j`:
+1. **Weigh.** The aggregated likelihood of hypothesis j is its probability given all bearings; a
+   bearing multiplies it by the likelihood :math:`\lambda_j`:
 
    .. math:: \Lambda_j = 1 / N_g \text{ at first}, \qquad
              \Lambda_j \leftarrow \Lambda_j \lambda_j \Big/ \sum_i \Lambda_i \lambda_i
       :label: eq-18
 
-2. **Share.** The measurement is one; the members are several. Were each corrected with the full
-   measurement, its information would be counted :math:`N_g` times. Federated information sharing
-   gives member j the share :math:`\rho_j`; the shares sum to one, so the information does too (the
-   principle of measurement reproduction):
+2. **Share.** Updating each hypothesis with the full measurement would count its information
+   :math:`N_g` times. Federated information sharing gives hypothesis j the share :math:`\rho_j`; the
+   shares sum to 1 (principle of measurement reproduction):
 
    .. math:: R_j = R / \rho_j, \qquad R^{-1} = \sum_j R_j^{-1}
       :label: eq-20
@@ -35,48 +33,44 @@ few bearings from different places can. Each new bearing does three things to a 
       :label: eq-19
 
    with ``weights = "instantaneous"``, the paper's text, or :math:`\rho_j \propto \Lambda_j^n` with
-   shares under 0.05 skipped and not handed on (``"aggregated"``, as in Sola's own implementation).
-   With ``likelihood = "printed"`` the likelihood is
-   :math:`\exp(-\tfrac12 \nu_j^2 S_j^{-1} / \sqrt{2\pi S_j})`, as the unbalanced bracket of the
-   printed formula may be read: no density, and sharper where S is below 1/(2 pi).
-3. **Prune.** Members are dropped whose aggregated likelihood has become small,
+   shares under 0.05 dropped without redistribution (``"aggregated"``, as in Sola's implementation).
+   ``likelihood = "printed"`` uses :math:`\exp(-\tfrac12 \nu_j^2 S_j^{-1} / \sqrt{2\pi S_j})`, a
+   reading of the unbalanced bracket in the printed formula: no density, and sharper for S below
+   1/(2 pi).
+3. **Prune.** Hypotheses of small aggregated likelihood are removed,
 
    .. math:: \Lambda_j < \tau / N
       :label: eq-21
 
-   N the number before this prune. The heaviest always stays. A ray of one member is a landmark:
-   *fully initialised*.
+   with N the number before pruning, but never the heaviest. A ray of a single hypothesis is a
+   *fully initialised* landmark.
 
-A *range* of a landmark that is still a ray is a fourth thing, and here the paper can be read in
-several ways ("all but the heaviest weighted hypothesis is kept, the measured range is taken as the
-true range, and the bearing and correspondence are updated as usual"). ``ranged`` says which:
+For a *range* to a ray, the paper is ambiguous ("all but the heaviest weighted hypothesis is kept,
+the measured range is taken as the true range, and the bearing and correspondence are updated as
+usual"). ``ranged`` selects the reading:
 
-- ``anew``: the ray goes, and the landmark is placed at range and bearing as a new one;
-- ``heaviest``: the heaviest member alone is kept, its mean at the measured range in its direction,
-  its covariance as it was; the bearing corrects it;
-- ``reset``: the same, its covariance that of a landmark placed there;
-- ``corrected``: the heaviest alone is kept, and corrected by range and bearing as a landmark is;
-- ``bearing``: the range is not used; the bearing does its three things to the ray;
-- ``others``: the sentence to the letter: the heaviest goes, and the bearing does its three things
-  to all others;
-- ``moved``: the heaviest is moved to the measured range, the others stay, and the bearing does its
-  three things to all.
+- ``anew``: replace the ray by a new landmark at range and bearing;
+- ``heaviest``: keep only the heaviest hypothesis, moved to the measured range with its covariance,
+  and update it with the bearing;
+- ``reset``: as ``heaviest``, with the covariance of a new landmark there;
+- ``corrected``: keep only the heaviest, updated with range and bearing;
+- ``bearing``: ignore the range, and treat the bearing as above;
+- ``others``: to the letter, remove the heaviest, and treat the bearing as above for the others;
+- ``moved``: move the heaviest to the measured range, keep the others, and treat the bearing as
+  above for all.
 
-Which to take? ``paper`` settings reproduce the paper; ``aggregated`` weights, or a power n of 3
-to 8, make the filter far more consistent: members that are certainly wrong then no longer pull
-the vehicle.
+``paper`` settings reproduce the paper. ``aggregated`` weights, or a power n of 3 to 8, are far more
+consistent, as wrong hypotheses no longer pull the vehicle.
 
-A member is a Gaussian in x and y, and a bearing is linear in them only nearly. Seen at a right
-angle a member's far end is nearer by its share :math:`\alpha` than its middle, so its bearing is
-off by some :math:`\alpha^2/2`, 0.045 rad for 0.3: nothing beside the paper's R, all there is
-beside a bearing good to 0.003 rad. ``spacing = "auto"`` therefore lets bearings more precise than
-that wait until another crosses them (`estimation.ekf.delayed_initialization`). Finer members alone
-did not do: with :math:`\alpha` of 0.05 to 0.2 the filters still diverged on such bearings.
+**Limits.** Bearings are only nearly linear in x and y: seen from the side, a hypothesis has a
+linearisation error of :math:`\alpha^2/2`, 0.045 rad for 0.3. It is small against the paper's R, but
+dominates precise bearings (0.003 rad), and filters diverge even with :math:`\alpha` of 0.05 to 0.2.
+``spacing = "auto"`` therefore stores bearings more precise than that until another crosses them
+(`estimation.ekf.delayed_initialization`).
 
-Departures from the printed page: the paper prints :math:`\sigma_j = \alpha s_{j-1}`, which
-contradicts its own :math:`\alpha = \sigma/s` and leaves gaps between the members. Members of one
-ray are correlated through the pose; the cross-covariance of the bearing noise that they share is
-left out, as in Sola's implementation.
+Departures from the paper: it prints :math:`\sigma_j = \alpha s_{j-1}`, which contradicts its
+:math:`\alpha = \sigma/s` and leaves gaps between hypotheses. The correlation of hypotheses through
+the noise of their common bearing is neglected, as in Sola's implementation.
 
 Sources: Bradley & Abaid, Eqs. (17) to (21); Sola, Monin, Devy & Lemaire (2005).
 """
@@ -98,32 +92,18 @@ UNDERFLOW = 1e-200
 FEDERATED, AS_PRINTED, EXACT, FITTED = range(4)
 ANEW, HEAVIEST, RESET, CORRECTED, BEARING, OTHERS, MOVED = range(7)
 RANGED = {name: k for k, name in enumerate(get_args(RayConfig.model_fields["ranged"].annotation))}
-"""Numbers of the readings of ``rays.ranged``, in its order; from BEARING on a ray stays a ray."""
+"""Codes of the values of ``rays.ranged``, in their order; a ray stays a ray from BEARING on."""
 _SHARING = {
     ("paper", "normal"): FEDERATED, ("paper", "printed"): AS_PRINTED, ("auto", "normal"): FITTED,
 }  # fmt: skip
 
 
 def ray_members(rays: RayConfig) -> tuple[Float[np.ndarray, " h"], Float[np.ndarray, " h"]]:
-    """Return the ranges of a new ray's members and their standard deviations.
+    """Return the ranges of a new ray's hypotheses and their standard deviations, (h) each [m].
 
-    Parameters
-    ----------
-    rays : RayConfig
+    Ranges s_j rise; sigma_j = alpha s_j. Source: Bradley & Abaid, Eq. (17), with sigma_j corrected
+    (see the module docstring).
 
-    Returns
-    -------
-    range : (h) [m]
-        s_j, rising.
-    range_std : (h) [m]
-        sigma_j = alpha s_j.
-
-    Notes
-    -----
-    Bradley & Abaid, Eq. (17), with sigma_j mended (see the module's head).
-
-    Examples
-    --------
     >>> range, range_std = ray_members(RayConfig())
     >>> range.round(2)
     array([ 0.71,  2.14,  6.43, 19.29])
@@ -137,27 +117,26 @@ def ray_members(rays: RayConfig) -> tuple[Float[np.ndarray, " h"], Float[np.ndar
 
 
 class UpdateParams(NamedTuple):
-    """What kernels need to know of gates and rays."""
+    """Parameters of gates and rays for kernels."""
 
     passive_bound: float  # largest squared Mahalanobis distance of a bearing
-    active_bound: float  # the same of range and bearing
+    active_bound: float  # largest squared Mahalanobis distance of range and bearing
     ray_ranges: Float[np.ndarray, " h"]  # [m], read-only
     ray_stds: Float[np.ndarray, " h"]  # [m], read-only
     power: float
     prune: float
     merge: float
     aggregated: bool
-    ranged: int  # what a range does to a ray: a number of `RANGED`
+    ranged: int  # effect of a range on a ray: a code of `RANGED`
     sharing: int
-    """How members take a bearing: FEDERATED, AS_PRINTED (federated, by the other reading of the
-    likelihood), EXACT (each takes all of it, as in a Gaussian mixture) or FITTED (federated, and
-    ``spacing = "auto"``). One number for all, as a shorter record makes the filter faster."""
-    robust: bool  # whether Huber's rule is used (`estimation.ekf.huber`)
+    """Update of hypotheses by a bearing: FEDERATED, AS_PRINTED (federated, other reading of the
+    likelihood), EXACT (Gaussian mixture) or FITTED (federated, with ``spacing = "auto"``)."""
+    robust: bool  # whether Huber's rule is used (`estimation.ekf.gaussian`)
 
 
 @lru_cache(maxsize=16)
 def gate_bounds(gate: float) -> tuple[float, float]:
-    """Return the chi-square quantiles of one and two degrees of freedom; infinite of a gate of 1.
+    """Return the chi-square quantiles of one and two degrees of freedom; infinite for a gate of 1.
 
     >>> [round(bound, 2) for bound in gate_bounds(0.999)]
     [10.83, 13.82]
@@ -171,13 +150,10 @@ def gate_bounds(gate: float) -> tuple[float, float]:
 def update_params(
     rays: RayConfig, gate: float, *, robust: bool = False, exact: bool = False
 ) -> UpdateParams:
-    """Gather what kernels need to know of gates and rays, once per filter.
-
-    With ``exact`` a bearing corrects every member by R itself, as in a Gaussian mixture (FastSLAM).
-    """
+    """Return the parameters of gates and rays for kernels; ``exact``: Gaussian mixture."""
     passive_bound, active_bound = gate_bounds(gate)
     ray_ranges, ray_stds = ray_members(rays)
-    ray_ranges.setflags(write=False)  # all who ask for the same share them
+    ray_ranges.setflags(write=False)  # shared by all estimators with the same settings
     ray_stds.setflags(write=False)
     return UpdateParams(
         passive_bound=passive_bound,
@@ -196,10 +172,7 @@ def update_params(
 
 @kernel
 def log_likelihood(innovation: float, variance: float, printed: bool) -> float:
-    """Log of N(innovation; 0, variance) without its constant, or of Eq. (19) as printed.
-
-    In logs, for a product of many likelihoods underflows.
-    """
+    """Return log N(innovation; 0, variance) without constant, or of Eq. (19) as printed."""
     squared = innovation * innovation / variance
     if printed:
         return -0.5 * squared / math.sqrt(2.0 * math.pi * variance)
@@ -210,7 +183,7 @@ def log_likelihood(innovation: float, variance: float, printed: bool) -> float:
 def _weigh_in_logs(
     log_likelihoods: Float[np.ndarray, " m"], weights: Float[np.ndarray, " h"], count: Whole
 ) -> float:
-    """Multiply weights by likelihoods whose products underflow; return the log of their sum."""
+    """Multiply weights by likelihoods with underflow protection; return the log of their sum."""
     largest, total = -np.inf, 0.0
     for j in range(count):
         log_weight = math.log(weights[j]) if weights[j] > 0.0 else -np.inf
@@ -236,7 +209,7 @@ def heaviest_member(weights: Float[np.ndarray, " h"], count: Whole) -> Whole:
 
 @no_alloc
 def renormalise(weights: Float[np.ndarray, " h"], count: Whole) -> None:
-    """Make the first weights sum to one; all equal where their sum has underflown."""
+    """Normalise the first weights to sum 1; equal weights if their sum has underflown."""
     total = 0.0
     for j in range(count):
         total += weights[j]
@@ -253,10 +226,10 @@ def weigh_and_share(
     aggregated: bool,
     share: Float[np.ndarray, " m"],
 ) -> float:
-    """Multiply the members' weights by their likelihoods and divide the measurement among them.
+    """Multiply the hypotheses' weights by their likelihoods and compute their shares.
 
-    ``weights`` (Lambda) and ``share`` (rho) are written; a share of zero means: skip the member.
-    Returns the log of the ray's likelihood, the sum of Lambda lambda, without its constant.
+    ``weights`` (Lambda) and ``share`` (rho) are written; hypotheses with a share of zero are not
+    updated. Returns the log of the ray's likelihood, the sum of Lambda lambda, without constant.
     Bradley & Abaid, Eqs. (18) and (19).
     """
     largest = log_likelihoods[0]
@@ -291,10 +264,9 @@ def weigh_and_share(
 def survivors(
     weights: Float[np.ndarray, " h"], count: Whole, prune: float, keep: Bool[np.ndarray, " m"]
 ) -> Whole:
-    """Mark the members that stay, renormalise their weights in place and return their number.
+    """Mark the hypotheses that survive pruning, renormalise their weights and return their number.
 
-    A member goes when its weight is under prune / count; the heaviest (the first of equals)
-    always stays. Bradley & Abaid, Eq. (21).
+    Pruned are weights under prune / count, but not the heaviest. Bradley & Abaid, Eq. (21).
     """
     strongest = heaviest_member(weights, count)
     kept, total = 0, 0.0

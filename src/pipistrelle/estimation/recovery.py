@@ -1,30 +1,29 @@
-r"""Recovery from a failure of the odometry: a skid, a slip, a push that it does not report.
+r"""Recovery from odometry failures, such as an unreported skid, slip or push.
 
-The gate tests measurements one by one against the predicted pose. After a skid all of them are
-improbable there, all would be rejected, and the vehicle would stay lost. So the odometry is tested,
-too. Each measurement is normal or an outlier, and the negative log likelihood of a pose x is, up to
-constants, the truncated sum of squares
+The gate tests measurements individually against the predicted pose. After a skid it would reject
+all, and the vehicle would stay lost, so the odometry is also tested. Each measurement is normal or
+an outlier, and the negative log likelihood of a pose x is, up to constants, the truncated sum of
+squares
 
 .. math:: c(x) = \sum_i \min(d_i^2(x), b_i)
 
 with :math:`d_i^2` the squared residual over its variance S (of the measurement and, given the pose,
-of the map). An outlier has a uniform density u: any bearing, any range up to the reach of the
-sensor. So :math:`b_i = -2 \ln u - \ln |2 \pi S|`: the less sure a measurement is, the less it
-counts.
+of the map). Outliers have a uniform density u (any bearing, any range up to the sensor's reach), so
+:math:`b_i = -2 \ln u - \ln |2 \pi S|`.
 
-Where the odometry is discarded, the pose has a wide prior of information :math:`\Lambda_0`, and the
-scan costs by Laplace's approximation
+Without odometry, the pose has a wide prior of information :math:`\Lambda_0`, and the cost of the
+scan is by Laplace's approximation
 
 .. math:: c_1 = \min_x c(x) + \ln \frac{|\Lambda|}{|\Lambda_0|}
 
-with :math:`\Lambda` the information of the measurements that fit. So few measurements, which some
-pose always fits, are no evidence. The gain :math:`c(\hat x) - c_1` over the pose :math:`\hat x`
-that the filter found is summed over scans (Page's cumulative sum), and the odometry since the last
-scan is discarded once the sum exceeds the bound of three degrees of freedom. The minimum is found
-by graduated non-convexity.
+with :math:`\Lambda` the information of the inliers, so that few measurements, which some pose
+always fits, are no evidence. The gain :math:`c(\hat x) - c_1` over the filter's pose
+:math:`\hat x` is summed over scans (Page's cumulative sum), and the odometry since the last scan is
+discarded if the sum exceeds the bound for three degrees of freedom. The minimum is found by
+graduated non-convexity.
 
-Page, Biometrika 41 (1954); Yang, Antonante, Tzoumas & Carlone, IEEE Robotics and Automation
-Letters 5 (2020).
+Page, Biometrika 41 (1954); Yang, Antonante, Tzoumas & Carlone, IEEE Robotics and Automation Letters
+5 (2020).
 """
 
 import math
@@ -54,40 +53,40 @@ from pipistrelle.geometry import wrap_angle
 from pipistrelle.jit import Whole, kernel, no_alloc
 
 DEGREES = 3
-"""Numbers of a pose."""
+"""Degrees of freedom of a pose."""
 FASTER = 1.4
-"""Factor by which the cost is made less convex at each pass, Yang et al.'s."""
+"""Factor of the convexity parameter per pass (Yang et al.)."""
 UNTOLD = 1e-6
-"""Least cost of an outlier: a measurement that is less sure than none tells nothing."""
+"""Least cost of an outlier, so that very uncertain measurements have no effect."""
 SINGULAR = 1e-12
 """Least variance of a predicted pose [m^2, rad^2]."""
 
 
 class Recoverable(Belief, Protocol):
-    """A belief that can lose its odometry."""
+    """A belief that supports recovery from odometry failures."""
 
     @property
     def doubt(self) -> float:
-        """Sum of what discarding the odometry would have gained in the last scans."""
+        """Cumulative gain of discarding the odometry in the last scans."""
         ...
 
     def joint(self, among: Int[np.ndarray, " n"] | None = None) -> JointGaussian:
-        """Return pose and landmarks together, or only the landmarks among some labels."""
+        """Return the joint Gaussian of pose and landmarks, optionally only of given labels."""
         ...
 
     def freed(self, pose: Float[np.ndarray, "3"], stds: Float[np.ndarray, "3"]) -> Self:
-        """Return the belief with the vehicle at a pose, with an independent error more."""
+        """Move the vehicle to a pose, with an independent error added."""
         ...
 
 
 B = TypeVar("B", bound=Recoverable)
 Fit = tuple[Float[np.ndarray, "3"], float, Bool[np.ndarray, "2 m"]]
-"""A pose, its cost, and of each row whether bearing with range and whether excess path fit."""
+"""A pose, its cost, and inlier masks of bearings with ranges and of excess paths."""
 
 
 @cache
 def odometry_bound(gate: float) -> float:
-    """Return the cost of odometry that is an outlier: the quantile of three degrees of freedom.
+    """Return the cost of an odometry outlier: the chi-square quantile of three degrees of freedom.
 
     >>> round(odometry_bound(0.999), 2)
     16.27
@@ -100,10 +99,7 @@ def odometry_bound(gate: float) -> float:
 def corrected(
     correct: Callable[[B, Scan], B], belief: B, scan: Scan, gate: float, reach: float
 ) -> B:
-    """Correct a belief with a scan, without the odometry before it if that failed (`recovered`).
-
-    ``correct``: the correction of an estimator.
-    """
+    """Update a belief with a scan, discarding the previous odometry if it failed (`recovered`)."""
     after: Any = correct(belief, scan)
     if gate >= 1.0:
         return after
@@ -117,22 +113,10 @@ def corrected(
 def recovered(before: B, after: B, scan: Scan, gate: float, reach: float) -> tuple[B, Scan] | float:
     """Test whether the odometry before a scan failed.
 
-    Parameters
-    ----------
-    before, after : Recoverable
-        Before and after the correction by the scan.
-    scan : Scan
-    gate : float
-        Share of a predicted distribution that is accepted.
-    reach : [m]
-        Standard deviation of each coordinate of the pose where odometry is discarded; that of the
-        heading is half a turn.
-
-    Returns
-    -------
-    tuple of Belief and Scan, or float
-        The belief before the scan without the odometry, and the measurements that fit it; or the
-        sum of gains, where the odometry is kept.
+    ``before`` and ``after`` the update by the scan; ``gate``: accepted share of a predicted
+    distribution; ``reach``: std [m] of the position without odometry (heading: half a turn).
+    Returns the belief before the scan without the odometry, and the inlier measurements; or the
+    cumulative gain, if the odometry is kept.
     """
     if after.gated == before.gated:
         return 0.0
@@ -142,7 +126,7 @@ def recovered(before: B, after: B, scan: Scan, gate: float, reach: float) -> tup
     stds = np.array([reach, reach, math.pi])
     kept = _cost(problem, after.pose().mean, reach)[0]
     pose, cost, fits = _fitted(problem, joint.mean[:3], stds)
-    doubt = max(0.0, before.doubt + kept - cost)  # 0 where a cost is not a number
+    doubt = max(0.0, before.doubt + kept - cost)  # 0 if a cost is NaN
     if doubt <= odometry_bound(gate):
         return doubt
     timed = np.where(fits[1], scan.excess_path, np.nan)
@@ -152,12 +136,12 @@ def recovered(before: B, after: B, scan: Scan, gate: float, reach: float) -> tup
 
 
 Problem = tuple[Float[np.ndarray, "8 m"], Int[np.ndarray, "2 m"], np.ndarray, np.ndarray]
-"""Numbers of a scan's rows, where landmark and caller of each stand in the joint mean (-1:
-nowhere), this mean, and its covariance given the pose."""
+"""Numbers of a scan, indices of landmarks and callers in the joint mean (-1: absent), this mean,
+and its covariance given the pose."""
 
 
 def _problem(joint: JointGaussian, scan: Scan) -> Problem:
-    """Return a scan and the map as kernels take them."""
+    """Return a scan and the map as arrays for kernels."""
     at = {label: 3 + 2 * n for n, label in enumerate(joint.landmark.tolist())}
     calls = [scan.callers[n] if n < scan.callers.size else UNLABELLED for n in scan.caller]
     landmarks = [at.get(label, -1) for label in scan.landmark.tolist()]
@@ -184,7 +168,7 @@ def _fitted(
     predicted: Float[np.ndarray, "3"],
     stds: Float[np.ndarray, "3"],
 ) -> Fit:
-    """Return the pose that costs least, by graduated non-convexity from the predicted one."""
+    """Return the pose of least cost, by graduated non-convexity from the predicted pose."""
     pose, (_, ratios) = predicted.copy(), _cost(problem, predicted, stds[0])
     largest = max(ratios.max(), 1.0)
     convexity = 1.0 / (2.0 * largest - 1.0)
@@ -216,9 +200,9 @@ def _fitted(
 def _cost(
     problem: Problem, pose: Float[np.ndarray, "3"], reach: float
 ) -> tuple[float, Float[np.ndarray, "2 m"]]:
-    """Return the cost of a pose, and of each measurement the squared residual over its bound.
+    """Return the cost of a pose, and the ratio of squared residual to bound for each measurement.
 
-    The first row is of bearings with ranges, the second of excess paths; 0 where there is none.
+    The first row is for bearings with ranges, the second for excess paths; 0 if not measured.
     """
     ratios, cost = np.zeros(problem[1].shape), 0.0
     A, g = np.zeros((3, 3)), np.zeros(3)
@@ -234,7 +218,7 @@ def _cost(
 
 @no_alloc
 def _outlier(spread: float, det: float, size: Whole) -> float:
-    """Return the cost of an outlier, uniform over a spread, beside a normal measurement's."""
+    """Return the cost of an outlier, uniform over a spread, relative to a normal measurement."""
     return max(2.0 * math.log(spread) - math.log((2.0 * math.pi) ** size * det), UNTOLD)
 
 
@@ -246,10 +230,7 @@ def _step(
     predicted: Float[np.ndarray, "3"],
     stds: Float[np.ndarray, "3"],
 ) -> float:
-    """Take a step of Gauss and Newton with weighted measurements, in place.
-
-    Returns the logarithm of the determinant of the information.
-    """
+    """Take a Gauss-Newton step with weighted measurements, in place; return log det information."""
     information, A, g = 0.0, np.zeros((3, 3)), np.zeros(3)
     for a in range(3):
         off = predicted[a] - pose[a]
@@ -283,10 +264,10 @@ def _direction(
     A: Float[np.ndarray, "3 3"],
     g: Float[np.ndarray, "3"],
 ) -> tuple[float, float, Whole]:
-    """Return the squared residual of a bearing, with its range if any, |S| and their number.
+    """Return the squared residual of a bearing (with its range), det S and their number.
 
-    Weighted, they are added to the normal equations. A row without a bearing, or of a landmark that
-    is not on the map, has residual 0.
+    Adds them, weighted, to the normal equations. Without bearing or mapped landmark, the residual
+    is 0.
     """
     numbers, ends, mean, C = problem
     i = ends[0, m]
@@ -303,7 +284,7 @@ def _direction(
     off = numbers[RANGE, m] - distance
     rr = c * c * xx + 2.0 * c * s * xy + s * s * yy + numbers[RANGE_STD, m] ** 2
     br = (-s * c * xx + (c * c - s * s) * xy + c * s * yy) * k
-    # The range by itself, then the bearing given the range: two independent numbers.
+    # The range, then the bearing given the range: two independent numbers.
     share = br / rr
     rest, left = nu - share * off, bb - share * br
     _add(A, g, (-c, -s, 0.0), weight / rr, off)
@@ -346,7 +327,7 @@ def _add(
     weight: float,
     residual: float,
 ) -> None:
-    """Add a number with its slopes to the normal equations."""
+    """Add a residual with its derivatives to the normal equations."""
     for a in range(3):
         g[a] += weight * slopes[a] * residual
         for b in range(3):

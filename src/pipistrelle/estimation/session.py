@@ -1,7 +1,7 @@
-"""An estimator at work: it is carried by controls, and corrected by scans as they come.
+"""Session: runs an estimator over control steps and scans, with optional data association.
 
-Beliefs are never changed, so an association may change its mind: the session remembers the last
-`REMEMBERED` scans with the beliefs before them, goes back and hears them again.
+Beliefs are immutable, so data association may revise its decisions: the session stores the last
+`REMEMBERED` scans with the beliefs before them, returns to these beliefs and repeats the scans.
 """
 
 from collections import deque
@@ -34,72 +34,70 @@ from pipistrelle.estimation.beliefs import (
 from pipistrelle.estimation.checking import usable_scan
 
 REMEMBERED = 40
-"""How many scans an association may think of again."""
+"""Number of scans that data association may revise."""
 MOST_STEPS = 64
-"""How many steps are predicted at once: an EKF's last bits hang on it."""
+"""Most steps of a prediction, fixed as the EKF's rounding depends on it."""
 Leg = tuple[Float[np.ndarray, "k c"], Float[np.ndarray, " k"]]
-"""Control steps and how long they take [s]."""
+"""Control steps and their durations [s]."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class _Heard:
-    """A scan that an association may think of again."""
+    """A scan stored for re-association, with the belief before it."""
 
     number: int
     legs: Sequence[Leg]
-    """The way since the scan before."""
+    """Control steps since the scan before."""
     belief: Any
-    """Before the scan, after the way."""
+    """Belief before the scan, after these steps."""
     memory: Any
-    """The association's, before the scan."""
+    """The association's memory before the scan."""
     came: Scan
     scan: Scan
-    """As the association stated it (`Assignment.scan`)."""
+    """The scan as changed by the association (`Assignment.scan`)."""
     label: Int[np.ndarray, " m"]
     merge: tuple[tuple[int, int], ...]
 
 
 class SessionState(NamedTuple):
-    """All that a session knows."""
+    """Snapshot of a session, with all it needs to continue."""
 
     belief: Any
     draws: Mapping[str, Any]
     """State of the random generator."""
     memory: Any
-    """The association's."""
+    """Memory of the association."""
     past: Sequence[_Heard]
     legs: Sequence[Leg]
     open: Any
-    """Belief and random state before the last leg, while steps may still join it."""
+    """Belief and random state before the last control steps, if further steps may join them."""
     dropped: Collection[int]
     labels: Sequence[Int[np.ndarray, " m"]]
     first: int
-    """Number of the scan whose labels are the first of `labels`."""
+    """Number of the scan with the first entry of `labels`."""
 
 
 class Session(Generic[B]):
-    """A vehicle's estimate while it drives and listens.
+    """Online estimation of a vehicle's pose and map.
 
     Parameters
     ----------
     estimator : Estimator
     start : Gaussian
-        The first pose, (3) and (3, 3).
+        Initial pose, (3) and (3, 3).
     rng : Generator
-        Of what the estimator draws.
+        Random generator of the estimator.
     known : Landmarks, optional
-        What is on the map beforehand, for an estimator that accepts it (`AcceptsMap`).
+        Known landmarks of the initial map, for an estimator that accepts them (`AcceptsMap`).
     callers : (c), optional
-        The label of each caller as a landmark, by its number: those on the map beforehand are known
-        to an association that has ``knowing``, too.
+        Label of each caller as a landmark, by its number, for callers on the initial map.
     association : Association, optional
-        Labels the rows of scans; without one they bear labels already.
+        Labels the measurements of scans; by default they are labelled already.
     noise : ConstantNoise, optional
-        The noise of rows that state none, or for the estimator of all that an association has
-        merged.
+        Default noise of measurements; with ``instead``, the estimator gets it for all.
     live : bool
-        Steps come one by one, to the same bits as all of them since a scan at once; labels are kept
-        of the last `REMEMBERED` scans alone.
+        Whether steps arrive singly, with the results of joint prediction between scans. Only the
+        labels of the last `REMEMBERED` scans are kept.
 
     Examples
     --------
@@ -119,9 +117,9 @@ class Session(Generic[B]):
     """
 
     belief: B
-    """The present belief of the estimator."""
+    """Current belief of the estimator."""
     labels: list[Int[np.ndarray, " m"]]
-    """Of each scan that is kept the labels of its rows, as an association has them now."""
+    """Current labels of the measurements of each kept scan by data association."""
 
     def __init__(
         self,
@@ -151,10 +149,7 @@ class Session(Generic[B]):
                 self._memory = association.knowing(self._memory, known, callers)
 
     def move(self, controls: Float[np.ndarray, "k c"], dt: Float[np.ndarray, " k"]) -> Gaussian:
-        """Predict through control steps and return the pose after each, (k, 3) and (k, 3, 3).
-
-        `controls`: as the estimator's motion model has them; `dt` [s].
-        """
+        """Predict through control steps; return the pose after each, (k, 3) and (k, 3, 3)."""
         if not self._live and len(dt) <= MOST_STEPS:
             if self._association:
                 self._legs.append((controls, dt))
@@ -167,7 +162,7 @@ class Session(Generic[B]):
         return joined_poses(poses)
 
     def hear(self, scan: Scan) -> Scan:
-        """Associate a scan's rows and correct the belief; return the scan as it was used."""
+        """Associate a scan and update the belief with it; return the scan as used."""
         self._open = None
         if self._association is None:
             self._legs = []
@@ -179,7 +174,7 @@ class Session(Generic[B]):
         return self._hear(scan, memory, assignment)
 
     def landmarks(self) -> Landmarks:
-        """Return the map, without what the association holds for tentative."""
+        """Return the map, without the association's tentative landmarks."""
         landmarks = self.belief.landmarks()
         if not hasattr(self._association, "tentative"):
             return landmarks
@@ -187,7 +182,7 @@ class Session(Generic[B]):
         return some_of(landmarks, ~is_among(landmarks.landmark, tentative))
 
     def state(self) -> SessionState:
-        """Return all that the session knows now; what it hears later does not change it."""
+        """Return a snapshot of the session."""
         return SessionState(
             belief=self.belief,
             draws=self._rng.bit_generator.state,
@@ -201,7 +196,7 @@ class Session(Generic[B]):
         )
 
     def go_on_from(self, state: SessionState) -> None:
-        """Know what a session of the same settings knew."""
+        """Restore a snapshot (`state`) of a session with the same settings."""
         self.belief, self._memory, self._first = state.belief, state.memory, state.first
         self._rng.bit_generator.state = state.draws
         self._past = deque(state.past, maxlen=REMEMBERED)
@@ -219,7 +214,7 @@ class Session(Generic[B]):
         return poses
 
     def _go_on(self, controls: Float[np.ndarray, "k c"], dt: Float[np.ndarray, " k"]) -> Gaussian:
-        """Predict through a leg once more that has become longer; return its last k poses."""
+        """Predict again through the last, extended control steps; return the new steps' poses."""
         if self._open:
             self.belief, self._rng.bit_generator.state = self._open
             before, took = self._legs.pop()
@@ -233,7 +228,7 @@ class Session(Generic[B]):
         return replace(poses, mean=poses.mean[new], covariance=poses.covariance[new])
 
     def _correct(self, scan: Scan) -> Scan:
-        """Correct the belief with a scan that is labelled."""
+        """Update the belief with a labelled scan."""
         used = usable_scan(scan)
         belief = self._estimator.update(self.belief, used, self._rng)
         if not hasattr(belief, "pose"):
@@ -242,7 +237,7 @@ class Session(Generic[B]):
         return used
 
     def _associate(self, scan: Scan) -> tuple[Any, Assignment]:
-        """Return the association's memory after a scan, and what it decides."""
+        """Return the association's memory after a scan, and its assignment."""
         assert self._association is not None, "hear asks only where there is one"
         stated = self._noise(scan) if self._noise else scan
         answer = self._association.associate(self._memory, self.belief, stated)
@@ -253,7 +248,7 @@ class Session(Generic[B]):
         return answer
 
     def _hear(self, scan: Scan, memory: Any, assignment: Assignment) -> Scan:
-        """Correct the belief with a scan, as an association labels it."""
+        """Update the belief with a scan and its assignment."""
         if assignment.remove:
             self._take_back(assignment.remove)
         if assignment.earlier:
@@ -277,10 +272,7 @@ class Session(Generic[B]):
         return used
 
     def _use(self, heard: _Heard, since: int = 0) -> Scan:
-        """Correct the belief with a scan that an association has labelled.
-
-        ``since``: from which scan on its merging has not changed labels yet.
-        """
+        """Update the belief with a stored scan; merges change labels from scan ``since`` on."""
         self.labels[heard.number - self._first :] = [heard.label]
         for kept, gone in heard.merge:
             labels = self.labels[since:]
@@ -291,7 +283,7 @@ class Session(Generic[B]):
         return self._correct(self._noise(merged) if self._noise else merged)
 
     def _take_back(self, labels: tuple[int, ...]) -> None:
-        """Remove landmarks, with all of their rows that are remembered."""
+        """Remove landmarks, with all of their measurements in memory."""
         past = [*self._past]
         labels = (*labels, *(gone for one in past for kept, gone in one.merge if kept in labels))
         named = np.array(labels)
@@ -304,14 +296,14 @@ class Session(Generic[B]):
         once = sum(rows) == len(labels) and len(heard) == 1
         if heard and not (once and not _held(past[heard[0]].belief, labels)):
             self._go_again(past, heard[0])
-        else:  # What was heard once has told nothing of anything else.
+        else:  # An object measured only once has not affected anything else.
             self.belief = edited(self.belief, remove=_held(self.belief, labels))
             for n in heard:
                 self.labels[past[n].number - self._first] = past[n].label
         self._past = deque(past, maxlen=REMEMBERED)
 
     def _state_again(self, earlier: Mapping[int, Scan]) -> None:
-        """Hear scans that are remembered as an association states them now."""
+        """Repeat stored scans with the association's changes to them."""
         past = [*self._past]
         changed = [n for n, one in enumerate(past) if one.number in earlier]
         if not changed:
@@ -324,7 +316,7 @@ class Session(Generic[B]):
         self._past = deque(past, maxlen=REMEMBERED)
 
     def _go_again(self, past: list[_Heard], first: int) -> None:
-        """Go back to before one of the scans that are remembered, and hear what came since."""
+        """Return to the belief before a stored scan, and repeat all scans since."""
         before = past[first].belief
         self.belief = edited(before, remove=_held(before, [*self._dropped]))
         since = past[first].number - self._first
@@ -336,7 +328,7 @@ class Session(Generic[B]):
         self._go(self._legs)
 
     def _as_held(self, heard: _Heard) -> _Heard:
-        """Return a scan to be heard after the present belief; what that lacks is not merged."""
+        """Return a stored scan for the current belief, without merges of absent landmarks."""
         merge = heard.merge
         if merge:
             held = _held(self.belief, [label for pair in merge for label in pair])
@@ -344,7 +336,7 @@ class Session(Generic[B]):
         return replace(heard, belief=self.belief, merge=merge)
 
     def _hear_again(self, news: Any) -> None:
-        """Associate all scans that are remembered anew, by what has become known."""
+        """Associate all stored scans again, with new information."""
         informed = getattr(self._association, "informed", None)
         if informed is None:
             raise InputError(
@@ -356,7 +348,7 @@ class Session(Generic[B]):
         del self.labels[past[0].number - self._first :]
         dropped = _held(past[0].belief, [*self._dropped])
         self.belief = edited(past[0].belief, remove=dropped)
-        self._dropped = set()  # a label may be given again
+        self._dropped = set()  # labels may be reused
         self._memory = informed(past[0].memory, news)
         for one in past:
             if one is not past[0]:
@@ -367,7 +359,7 @@ class Session(Generic[B]):
         self._legs = legs
 
     def _go(self, legs: Sequence[Leg]) -> None:
-        """Predict through what was gone already."""
+        """Predict through earlier control steps again."""
         for controls, dt in legs:
             self._move(controls, dt)
 
@@ -375,7 +367,7 @@ class Session(Generic[B]):
 def _joined_steps(
     one: Float[np.ndarray, "k c"], other: Float[np.ndarray, "n d"]
 ) -> Float[np.ndarray, "k+n e"]:
-    """Return steps one after the other; those that say no covariance have NaN where others do."""
+    """Concatenate control steps; missing covariances become NaN."""
     width = max(one.shape[1], other.shape[1])
     parts = [
         np.pad(part, ((0, 0), (0, width - part.shape[1])), constant_values=np.nan)
@@ -387,7 +379,7 @@ def _joined_steps(
 
 
 def joined_poses(parts: Sequence[Gaussian]) -> Gaussian:
-    """Return poses one after the other."""
+    """Concatenate poses."""
     if len(parts) == 1:
         return parts[0]
     mean = np.concatenate([poses.mean for poses in parts])
@@ -397,13 +389,13 @@ def joined_poses(parts: Sequence[Gaussian]) -> Gaussian:
 
 
 def _held(belief: Belief, labels: Sequence[int]) -> list[int]:
-    """Return which of some landmarks a belief holds; all, where it does not say."""
+    """Return the given labels that a belief contains; all, if it has no ``labels``."""
     held = {*belief.labels()} if hasattr(belief, "labels") else {*labels}
     return [label for label in labels if label in held]
 
 
 def _without(heard: _Heard, labels: Int[np.ndarray, " n"]) -> _Heard:
-    """Return a scan without some labels, of its rows and of its callers."""
+    """Remove labels from a stored scan's measurements and callers."""
     label, callers = (
         np.where(is_among(of, labels), UNLABELLED, of) for of in (heard.label, heard.scan.callers)
     )
@@ -411,7 +403,7 @@ def _without(heard: _Heard, labels: Int[np.ndarray, " n"]) -> _Heard:
 
 
 def check_poses(method: str, poses: Gaussian, size: int) -> None:
-    """Refuse poses of an estimator's method that are not so many, or lack their covariances."""
+    """Raise InputError unless an estimator method's poses and covariances have the right shapes."""
     found = np.shape(poses.mean), np.shape(poses.covariance)
     expected = (size, 3), (size, 3, 3)
     if found != expected:
@@ -423,7 +415,7 @@ def check_poses(method: str, poses: Gaussian, size: int) -> None:
 
 
 def _wrong_return(part: object, method: str, found: object, expected: str) -> InputError:
-    """Say what a method from outside returned in place of what is expected."""
+    """Return an InputError for a wrong return value of an external method."""
     name = f"{type(part).__module__}.{type(part).__qualname__}.{method}"
     fix = "does it lack its return?" if found is None else "correct it"
     return InputError(f"{name}: found {type(found).__name__} returned, expected {expected}; {fix}")

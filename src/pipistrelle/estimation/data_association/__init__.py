@@ -1,1 +1,1 @@
-"""Data association, as the package does it: `sequential` is the stage, the others are its steps."""
+"""Data association: `sequential` matches scan by scan; the other files are its steps."""

@@ -1,42 +1,26 @@
-r"""The search for a caller's place by excess paths over landmarks that are not known either.
+r"""Find the position of a caller that is not on the map, and label early scans by a later map.
 
-Given the caller's place, a row's bearing and excess path are a point; those of one landmark are one
-point at all times only where the caller truly is. The search takes a grid of ranges and bearings
-about the direct call, for each place the misfit of all tracks (`misfit`: points as robust means of
-what their rows say, headings as medians over tracks, residuals that count no more than
-:math:`3 \sigma`), goes downhill from the best, and believes it if what is at another range fits
-clearly worse.
+**Search** (`searched`). Given the caller's position, bearing and excess path of a measurement fix a
+point, and the points of a landmark coincide over time only for the true position. A grid of ranges
+and bearings about the direct call is scored by the robust misfit of all tracks (`misfit`: points as
+weighted means, heading errors as medians over tracks, residuals capped at :math:`3 \sigma`), and
+the best node is refined by a pattern search. It is accepted if every position at another range fits
+much worse. For a moving caller, the begin, middle and end of a parabolic trajectory are searched:
+bearings alone locate fixed landmarks as the vehicle moves, so that excess paths determine the
+caller's velocity and acceleration.
 
-A caller that stands is searched for twice, in windows that have little in common (`searched`).
+**Turns** (`turned`). Estimators model a caller's velocity as a random walk, and lag behind a sharp
+turn. Where few of its measurements match the map, positions about its direct call are tried.
 
-Of a caller that moves the places at the begin, in the middle and at the end of the window are
-looked for, which a parabola joins. A landmark that stands is told by its bearings alone, as the
-vehicle goes by, and its excess path then tells of the caller at each scan: velocity and
-acceleration can be observed, too.
-
-Callers that turn: where one is whose rows do not fit where it was expected to be.
-
-An estimator takes velocities for random walks; of a caller that turns at once it knows too late,
-and its rows, held against where it was expected, are of no landmark. So where few of them fit, the
-places about its direct call are tried: on the map its rows fit together at one place alone.
-
-Scans from before there was a map, labelled by the map that came of them.
-
-Excess paths say where landmarks are once their caller is on the map, and that it is from the scan
-after the one in which its range is stated. Until then a vehicle that only listens has no landmark,
-and one whose beam is narrow has few; but at the start the heading is known best, and what was heard
-there says how the map lies. So these rows are held against the map when that has settled. Before,
-map and vehicle are turned against each other as all rows fit best (`_turn`): their headings are
-off by more than bearings are. A bearing alone places no landmark: with it comes the range that the
-map has for it, stated so unsurely that little is said twice.
-
-**The turn.** With the mean bearing of all landmarks :math:`\beta = a^T x` of the variance
-:math:`a^T P a`, a turn by :math:`\delta` moves the mean to
+**Early scans** (`labelled_by_map`). Excess paths determine landmarks only after the scan in which
+the caller's range is first given. Earlier scans are matched later to the settled map; they fix its
+rotation, as the heading is known best at the start. The map is first rotated relative to the
+vehicle to the best common fit (`_turn`), as the heading error exceeds that of bearings. With the
+mean bearing of all landmarks :math:`\beta = a^T x` of the variance :math:`a^T P a`, a rotation by
+:math:`\delta` changes mean and covariance to
 
 .. math:: x + \frac{P a}{a^T P a}\, \delta, \qquad
           P - \frac{P a a^T P}{a^T P a}
-
-being the covariance of what is left.
 """
 
 import math
@@ -65,52 +49,49 @@ from pipistrelle.geometry import wrap_angle
 from pipistrelle.jit import kernel, no_alloc
 
 SCANS, SIGHTINGS, LEAST_TRACKS = 14, 4, 8
-"""Scans that are looked at, sightings that make a track count, and how many of them it takes."""
+"""Scans of the window, sightings that make a track count, and tracks required."""
 RANGES = np.geomspace(2.5, 45.0, 22)
-"""[m]"""
+"""Ranges of the grid [m]."""
 BEARINGS = np.array([-0.1, -0.05, 0.0, 0.05, 0.1])
-"""Off the direct call [rad]."""
+"""Bearings of the grid relative to the direct call [rad]."""
 ANOTHER, CLEARLY, WELL = math.log(1.5), 25.0, 2.6
-"""Factor of another range, by how much it must fit worse, and the most that a row may misfit."""
+"""Log ratio of distinct ranges, margin of misfit between them, largest misfit per measurement."""
 DIRECT_STD, LEAST_BEARING_STD, LEAST_WAY_STD = 0.05, 0.01, 0.05
-"""Least deviations: of the direct call, of other bearings [rad], and of excess paths [m]."""
+"""Floors of standard deviations: direct call [rad], other bearings [rad], excess paths [m]."""
 FARTHEST, NEAREST = 80.0, 0.05
-"""Largest range of a landmark, and least distance from the caller [m]."""
+"""Largest range of a landmark and least distance from the caller [m]."""
 FASTEST = 2.0
-"""Largest speed of a caller that moves [m/s]."""
+"""Largest speed of a moving caller [m/s]."""
 CAP = 9.0
-"""A row's misfit counts no more."""
+"""Cap of the misfit of a measurement [squared standard deviations]."""
 PASSES, WEIGHINGS = 3, 2
 FIRST, FIRST_MOVING = 8, 10
-"""Scans after which a caller that stands, and one that moves, is searched for, at every second."""
+"""Scans before the search for a stationary or a moving caller, repeated every second scan."""
 SECOND, LAST, APART, WIDELY = 20, 30, 0.15, math.log(2.0)
-"""Scans after which one that stands is searched for once more, until it is found; logarithms of the
-factor by which its two ranges must differ for the mean of both places to be taken, and for the
-second alone."""
+"""For a stationary caller, scans before the second search and before it ends; log ratios of the two
+ranges from which their mean is taken, and from which only the second counts."""
 
 
 class Found(NamedTuple):
-    """A caller's place."""
+    """Result of a search for a caller."""
 
     place: CallerPlace
     misfit: float
-    """Per row."""
+    """Misfit per measurement."""
     ahead: float
-    """By how much places at other ranges misfit more."""
+    """Margin by which positions at other ranges fit worse."""
     tracks: int
 
     @property
     def sure(self) -> bool:
-        """Whether it is to be believed."""
+        """Whether the position is accepted."""
         return self.ahead > CLEARLY and self.misfit < WELL and self.tracks >= LEAST_TRACKS
 
 
 def searched(caller: Caller, moves: bool) -> tuple[Caller, CallerPlace | None]:
-    """Search for a caller by its tracks, if it is time; return it, and its place if that is news.
+    """Search for a caller if it is due; return its record, and its position if this is new.
 
-    One that stands is searched for twice. What the two windows tell is nearly independent, so where
-    they differ their mean is the better place; where they differ widely the first, of the shorter
-    way, is wrong.
+    A second result is averaged with the first, or replaces it where they differ widely.
     """
     tracks, first, scans = caller.tracks, caller.place, len(caller.tracks.poses)
     begin = SECOND if first is not None else FIRST_MOVING if moves else FIRST
@@ -133,12 +114,12 @@ def searched(caller: Caller, moves: bool) -> tuple[Caller, CallerPlace | None]:
 
 
 def _agreed(caller: Caller, place: CallerPlace) -> Caller:
-    """Return a caller that is at a place, and not searched for any more."""
+    """Fix a caller at a position and end its search."""
     return replace(caller, place=place._replace(agreed=True), tracks=Tracks())
 
 
 def find_caller(tracks: Tracks) -> Found | None:
-    """Return where a caller is by its tracks; None where they are too few, or it was not heard."""
+    """Find a stationary caller's position from its tracks; None without enough data."""
     table, poses, direct = in_window(tracks, SCANS, SIGHTINGS)
     heard = direct[~np.isnan(direct)]
     if len(table) < LEAST_TRACKS or not heard.size:
@@ -156,11 +137,7 @@ def find_caller(tracks: Tracks) -> Found | None:
 
 
 def find_moving_caller(tracks: Tracks) -> Found | None:
-    """Return where a caller is that moves, and how; None as `find_caller`.
-
-    The ends of its way in the window are looked for on a grid of ranges, then its middle, too. What
-    fits best is held against what fits best at another range.
-    """
+    """Find a moving caller's position and motion from its tracks; None without enough data."""
     table, poses, direct = in_window(tracks, SCANS, SIGHTINGS)
     heard, times = np.flatnonzero(~np.isnan(direct)), tracks.times[-len(poses) :]
     if len(table) < LEAST_TRACKS or heard.size < 2:
@@ -203,11 +180,7 @@ def _bent(
     seen: tuple[np.ndarray, ...],
     within: Callable[[np.ndarray], bool],
 ) -> tuple[Float[np.ndarray, "3 2"], float]:
-    """Return begin, middle and end of the way that fits best near a straight one, and its misfit.
-
-    ``begun``: begin and end of that, its misfit, and the first step [m]; ``share``: of it that is
-    gone at each scan.
-    """
+    """Fit a parabola near a straight trajectory; return begin, middle and end, and the misfit."""
     node, least, step = begun
     line = np.stack([1.0 - share, share], axis=1)
     node, least = _downhill(node, least, step, line, seen, within)
@@ -218,7 +191,7 @@ def _bent(
 
 
 def _at_end(node: Float[np.ndarray, "3 2"], time: float, took: float) -> CallerPlace:
-    """Return place and motion at the end of a way by its begin, middle and end."""
+    """Return position, velocity and acceleration at the end of a parabola through three points."""
     velocity = (node[0] - 4.0 * node[1] + 3.0 * node[2]) / took
     acceleration = 4.0 * (node[0] - 2.0 * node[1] + node[2]) / took**2
     (x, y), (vx, vy), (ax, ay) = (of.tolist() for of in (node[2], velocity, acceleration))
@@ -226,24 +199,24 @@ def _at_end(node: Float[np.ndarray, "3 2"], time: float, took: float) -> CallerP
 
 
 def _another(ranges: Float[np.ndarray, " n"], distance: float) -> Bool[np.ndarray, " n"]:
-    """Return a mask of ranges that are others than a distance."""
+    """Return whether each range differs clearly from a distance."""
     return np.abs(np.log(ranges / distance)) > ANOTHER
 
 
 def seen_from(pose: Float[np.ndarray, "3"], far: float, angle: float) -> Float[np.ndarray, "2"]:
-    """Return the point at a range [m] and a bearing in the world [rad] from a pose."""
+    """Return the point at a range [m] and a world bearing [rad] from a pose."""
     return pose[:2] + far * np.array([math.cos(angle), math.sin(angle)])
 
 
 def _rows(table: Float[np.ndarray, "t k 4"]) -> int:
-    """Return how many rows tracks have."""
+    """Count the measurements of a table of tracks."""
     return int(np.count_nonzero(~np.isnan(table[..., 0])))
 
 
 def _misfits(
     nodes: list[np.ndarray], weights: Float[np.ndarray, "k n"], seen: tuple[np.ndarray, ...]
 ) -> Float[np.ndarray, " g"]:
-    """Return the misfit of each of several ways; arguments as those of `_downhill`."""
+    """Return the misfit of each candidate trajectory; arguments as in `_downhill`."""
     return np.array([misfit(weights @ node, *seen) for node in nodes])
 
 
@@ -255,10 +228,7 @@ def _downhill(
     seen: tuple[np.ndarray, ...],
     within: Callable[[np.ndarray], bool] = lambda nodes: True,
 ) -> tuple[Float[np.ndarray, "n 2"], float]:
-    """Return the nodes of the least misfit near others, by a pattern search, and its misfit.
-
-    ``weights``: of the nodes in the caller's place at each scan; ``within``: which nodes may be.
-    """
+    """Minimise the misfit over trajectory nodes by a pattern search; return nodes and misfit."""
     end, size = step / 12.0, len(nodes)
     which = [np.ones((size, 1)), *(np.eye(size)[:, :, np.newaxis] if size > 1 else ())]
     angles = np.arange(8) * np.pi / 4.0
@@ -282,7 +252,7 @@ def misfit(
     table: Float[np.ndarray, "t k 4"],
     direct: Float[np.ndarray, " k"],
 ) -> float:
-    """Return the misfit of all rows, were the caller at these places [squared deviations]."""
+    """Return the total misfit of caller positions to all measurements [squared stds]."""
     tracks, scans = table.shape[0], table.shape[1]
     turn, off = np.zeros(scans), np.full((tracks, scans), np.nan)
     points, total = np.empty((scans, 6)), 0.0
@@ -312,10 +282,7 @@ def _write_off(
     points: Float[np.ndarray, "k 6"],
     off: Float[np.ndarray, " k"],
 ) -> tuple[float, float]:
-    """Return the point of a track; write how far its bearings are off.
-
-    ``points``: room for each row's point, its direction and its variances along and across.
-    """
+    """Fit the point of a track and write its bearing residuals; ``points`` is workspace."""
     x, y, weight = 0.0, 0.0, 0.0
     for k in range(rows.shape[0]):
         _write_point(places[k], poses[k], rows[k], turn[k], points[k])
@@ -340,7 +307,7 @@ def _of_track(
     off: Float[np.ndarray, " k"],
     point: tuple[float, float],
 ) -> float:
-    """Return the misfit of a track at its point."""
+    """Return the misfit of a track to its point."""
     total, (x, y) = 0.0, point
     for k in range(rows.shape[0]):
         if math.isnan(rows[k, 0]):
@@ -359,7 +326,7 @@ def _of_track(
 
 @no_alloc
 def _weighed(points: Float[np.ndarray, "k 6"], x: float, y: float) -> tuple[float, float]:
-    """Return the mean of points, of which those far from another mean count less."""
+    """Return a weighted mean of points, less weight for points far from the previous mean."""
     sx, sy, weight = 0.0, 0.0, 0.0
     for k in range(points.shape[0]):
         if math.isnan(points[k, 0]):
@@ -381,7 +348,7 @@ def _write_point(
     turn: float,
     point: Float[np.ndarray, "6"],
 ) -> None:
-    """Write a row's point, direction and variances along and across; NaN where there is none."""
+    """Write a measurement's point, direction, and variances along and across; NaN if unsolvable."""
     point[0], angle = math.nan, row[0] + turn
     if math.isnan(row[0]):
         return
@@ -405,7 +372,7 @@ def _write_point(
 
 @kernel
 def _correct_headings(off: Float[np.ndarray, "t k"], turn: Float[np.ndarray, " k"]) -> None:
-    """Turn each scan by the median of what its bearings are off, the last one by nothing."""
+    """Correct each scan's heading by its median bearing residual, relative to the last scan."""
     scans = turn.size
     medians = np.zeros(scans)
     for k in range(scans):
@@ -417,29 +384,25 @@ def _correct_headings(off: Float[np.ndarray, "t k"], turn: Float[np.ndarray, " k
 
 
 FITTING_SHARE, LEAST_ROWS = 0.5, 6
-"""A caller may have turned if less than this share of its rows fits, of so many."""
+"""Share of matching measurements below which a caller may have turned, and their least number."""
 BETTER = 30.0
-"""By how much all rows together must fit better elsewhere."""
+"""Margin by which the total cost must fall for a caller to be moved."""
 LEAST_REACH, REACH, LEAST_RANGE = 4.0, 3.0, 0.5
-"""Ranges are tried that are off the expected one by so much [m], or by so many deviations of the
-place, and none nearer than the last [m]."""
+"""Searched interval of ranges: floor [m], and multiple of the position's std; least range [m]."""
 SHARES, TURN_BEARINGS = np.linspace(-1.0, 1.0, 21), np.linspace(-0.06, 0.06, 7)
-"""Parts of that, and bearings off the direct call [rad]."""
+"""Search grid: shares of the interval, and bearings relative to the direct call [rad]."""
 
 Costs = Callable[[Float[np.ndarray, " d"]], Float[np.ndarray, "r n"]]
-"""Costs of rows and landmarks (`pairs.pair_costs`) by the joint mean."""
+"""Pair costs (`pairs.pair_costs`) as a function of the joint mean."""
 
 
 def may_have_turned(fitting: int, rows: int) -> bool:
-    """Tell whether too few of a caller's rows fit where it was expected."""
+    """Return whether too few of a caller's measurements match at its expected position."""
     return rows >= LEAST_ROWS and fitting < FITTING_SHARE * rows
 
 
 def turned(joint: JointGaussian, at: int, bearing: float, costs: Costs) -> JointGaussian:
-    """Return a joint Gaussian in which a caller is where its rows fit.
-
-    ``at``: where the caller stands in the mean; ``bearing``: of its direct call.
-    """
+    """Move a caller in the joint mean to where its measurements match, if it may have turned."""
     mean, spread = joint.mean, np.diag(joint.covariance)[at : at + 2].sum()
     least, fitting = fit(costs(mean))
     if not may_have_turned(int(fitting.sum()), fitting.size):
@@ -458,25 +421,25 @@ def turned(joint: JointGaussian, at: int, bearing: float, costs: Costs) -> Joint
 
 
 def fit(costs: Float[np.ndarray, "r n"]) -> tuple[float, Bool[np.ndarray, " r"]]:
-    """Return what rows cost together, each as clutter at most, and which are none."""
+    """Return the total cost, clutter counting 0, and whether each measurement has a match."""
     least = costs.min(axis=1, initial=0.0)
     return float(least.sum()), least < 0.0
 
 
 FEW = 3
-"""A scan is early if fewer landmarks are known at its end, and no caller was on the map before."""
+"""A scan is early if it ends with fewer landmarks and no caller was on the map before it."""
 MOST, SETTLED = 16, 12
-"""How many early scans are remembered, and after how many more the map is taken to have settled."""
+"""Most early scans kept, and scans after them until the map counts as settled."""
 TURNS = np.linspace(-3.5, 3.5, 141)
-"""Turns that are tried, in standard deviations."""
+"""Rotations tried [standard deviations]."""
 SEPARATION, CLEARER = 0.04, 10.0
-"""All turns that are so far from the best [rad] must cost so much more."""
+"""Rotations farther than the first [rad] from the best must cost more by the second."""
 RANGE_SHARE = 0.2
-"""Deviation of a range that is taken from the map, as a share of it."""
+"""Standard deviation of a range taken from the map, as a share of it."""
 
 
 def direct_row(direct: Int[np.ndarray, " c"], number: int) -> int:
-    """Return the row of a caller's direct call, or -1, of the rows of all direct calls."""
+    """Return the index of a caller's direct call in a scan, or -1."""
     return int(direct[number]) if number < direct.size else -1
 
 
@@ -488,11 +451,10 @@ def labelled_by_map(
     match: Match,
     chances: PlainChances,
 ) -> Scan:
-    """Return an early scan, its callers' rows with labels by a map that is known now.
+    """Label the callers' measurements in an early scan by a later map.
 
-    In place of the pose of ``joint`` comes that of the early scan, as if the errors of map and
-    pose had nothing in common. ``sure``: labels of landmarks that are some; ``callers``: where
-    callers stand in the mean, by number, or UNPLACED of those that were elsewhere.
+    The early pose replaces that of ``joint``, as if uncorrelated with the map. ``callers``: index
+    of each caller in the mean, UNPLACED if it was elsewhere.
     """
     mean, covariance = joint.mean.copy(), joint.covariance.copy()
     mean[:3], covariance[:3], covariance[:, :3] = early.pose.mean, 0.0, 0.0
@@ -523,7 +485,7 @@ def _matched(
     match: Match,
     chances: PlainChances,
 ) -> Int[np.ndarray, " r"]:
-    """Return which landmark each row is of, NOTHING of all if they fit at more than one turn."""
+    """Match measurements after the best map rotation; NOTHING for all if this is ambiguous."""
     (mean, _), (spread, variance, left) = gaussian, _turn(*gaussian, there)
     turns = math.sqrt(variance) * TURNS
     means = [mean + spread * (turn / variance) for turn in turns]
@@ -541,7 +503,7 @@ def _turn(
     covariance: Float[np.ndarray, "d d"],
     there: Int[np.ndarray, " n"],
 ) -> tuple[Float[np.ndarray, " d"], float, Float[np.ndarray, "d d"]]:
-    """Return P a, a^T P a, and the covariance without the turn."""
+    """Return P a, a^T P a, and the covariance without the rotation."""
     dx, dy = mean[there] - mean[0], mean[there + 1] - mean[1]
     squared = there.size * (dx * dx + dy * dy)
     slope = np.zeros(mean.size)

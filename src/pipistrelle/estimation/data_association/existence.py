@@ -1,30 +1,23 @@
-r"""Whether a landmark exists: by how often it was heard, and was not where it should have been.
+r"""Log odds of existence of landmarks, and the detection of duplicates.
 
-Each landmark has log odds. They rise when it is heard, the more the surer the row's bearing: what
-is between two echoes that overlap comes back, too, but seldom as surely as one echo. They fall when
-the landmark is not heard, though it should have been: its level, as it was heard before, is
-expected at its present distance (spherical spreading, there and back of the vehicle's own call)
-well above what is detected, and the vehicle's own call was sent towards it as before. They fall
-less where something as loud came at the same time, or a row that fits is another's: a landmark may
-be hidden, but what is hidden for forty scans is none. Of a sensor that tells no levels, a lidar
-or a camera, a landmark is expected within its range and field of view, if these are known, unless
-something nearer stands before it or a row fits it.
+**Existence** (`judged`). The log odds rise with each detection, more for a precise bearing, as the
+interference of overlapping echoes recurs, but rarely with precise bearings. They fall when an
+expected landmark is not detected: its former level, corrected for spherical spreading, is well
+above the threshold, and the vehicle's call is aimed as before. They fall less if a loud measurement
+of the same delay, or the match of another landmark, may hide it; yet a landmark hidden for forty
+scans is removed. For sensors without levels (lidar, camera), a landmark is expected within range
+and field of view, if known, unless a nearer measurement occludes it.
 
-Landmarks that are on the map twice: a few wrong rows make one, a closed loop a whole group.
-
-Two landmarks a and b are one at a cost
+**Duplicates** (`doubles`). Wrong labels cause single duplicates, a loop closure a whole group.
+Merging landmarks a and b costs
 
 .. math:: c = d^2 + \ln |2 \pi S| + 2 \ln \lambda, \qquad d^2 = (l_a - l_b)^T S^{-1} (l_a - l_b)
 
-with the covariance S of their difference, of the whole map's, and the density :math:`\lambda` of
-landmarks. Of a group each pair is judged given those before it: where the pose is lost to a metre
-the first pair of a closed loop tells little, those after it, which the same drift has moved, tell
-all. So from each pair a group is grown by what costs least, and the group that costs least is
-believed, if it is ahead of all that contradict it. Landmarks of which one caller was heard in one
-scan are two (`existence.Known.together`).
-
-Neira & Tardos, IEEE Transactions on Robotics and Automation 17 (2001), test rows jointly in this
-way.
+with the covariance S of their difference in the joint map, and the density :math:`\lambda` of
+landmarks. Each further pair of a group is tested given the pairs before, which the same drift has
+moved. Groups grow greedily, and the group of least cost is accepted if clearly better than all
+contradicting groups. Landmarks detected in a scan of the same caller are distinct
+(`Known.together`). Source: Neira & Tardos, IEEE Transactions on Robotics and Automation 17 (2001).
 """
 
 import math
@@ -42,67 +35,65 @@ from pipistrelle.geometry import wrap_angle
 from pipistrelle.jit import Whole, kernel, no_alloc
 
 HEARD, MISSED = 2.0, 1.3
-"""Rise of the log odds when a landmark is heard, and their fall when it should have been: a
-detection probability of 0.75, and a chance of 0.1 that clutter is where it is."""
+"""Change of the log odds by a detection and by a miss, for detection probability 0.75 and clutter
+probability 0.1."""
 MOST, CONFIRMED, GONE = 8.0, 3.0, -2.0
-"""Odds rise no further; a landmark is one; a landmark is none."""
+"""Log odds: upper limit, confirmation, removal."""
 LEAST_SCANS, PATIENCE = 3, 25
-"""In how many scans it takes a landmark to be one; scans of silence after which a landmark that is
-not yet one is none."""
+"""Detections that confirm a landmark; scans without detection that remove an unconfirmed landmark.
+"""
 LASTING = 12
-"""A landmark that was heard in at least this many scans, and at least once by the vehicle's own
-call, is never removed, only unconfirmed. The place of one that was heard by other callers alone
-depends on where they are, so that it may be wrong."""
+"""Detections from which a landmark that the vehicle's own call detected is unconfirmed, but not
+removed. If detected only by other callers, its position depends on theirs and may be wrong."""
 FAINTEST = 18.0
-"""A landmark is expected from this level on [dB]."""
+"""Least expected level of a landmark that should be detected [dB]."""
 HIDDEN = 0.2
-"""Share of the fall where something may hide the landmark."""
+"""Share of the fall if the landmark may be hidden."""
 AS_LOUD = 3.0
-"""A row may hide a landmark that is at most so much louder [dB]."""
+"""A measurement hides landmarks at most this much louder [dB]."""
 TOGETHER = 1.0
-"""A row hides a landmark whose path differs by less: the length of a call [m]."""
+"""A measurement hides landmarks whose path length differs by less: the length of a call [m]."""
 AIMED = 0.1
-"""The vehicle's own call is as loud up to so much from the bearing at which it was heard [rad]."""
+"""The vehicle's call has its former level up to this change of bearing [rad]."""
 WITHIN, BEFORE = 0.9, 0.05
-"""Without levels a landmark is expected within this share of the sensor's range, so far inside its
-field of view, and where no nearer row is within such a bearing of it [rad]."""
+"""Without levels, a landmark is expected within this share of the range, this far inside the field
+of view, and with no nearer measurement within this bearing [rad]."""
 NEAR = 0.3
-"""Sound spreads from so far on [m]."""
+"""Least distance for spherical spreading [m]."""
 FORGETTING = 0.2
-"""Share of the newest level in the mean."""
+"""Weight of the newest level in the mean."""
 OFTEN = 255
-"""Scans in which two landmarks were heard together are counted up to so many."""
+"""Largest count of joint detections."""
 
 
 class Known(NamedTuple):
-    """Landmarks as the association knows them, l of them."""
+    """State of the l tracked landmarks."""
 
     label: Int[np.ndarray, " l"]
     born: Int[np.ndarray, " l"]
-    """Number of the first scan, and of the last."""
+    """Scan of the first detection; ``heard``: of the last."""
     heard: Int[np.ndarray, " l"]
     count: Int[np.ndarray, " l"]
-    """Scans in which it was heard."""
+    """Number of scans with a detection."""
     odds: Float[np.ndarray, " l"]
     confirmed: Bool[np.ndarray, " l"]
     source: Float[np.ndarray, "l c"]
-    """Level that it would have at 1 m, by caller [dB], or NaN; of one that moves: at 1 m from the
-    caller, too."""
+    """Level at 1 m from the landmark (and from a moving caller), by caller [dB], or NaN."""
     aim: Float[np.ndarray, " l"]
-    """Bearing at which the vehicle's own call was last heard of it [rad]."""
+    """Bearing of the landmark at its last echo of the vehicle's own call [rad]."""
     together: UInt8[np.ndarray, "l l"]
-    """Scans in which one caller was heard of two landmarks: then they are two."""
+    """Number of scans in which both landmarks were detected by the same caller."""
 
 
 def nobody(callers: int) -> Known:
-    """Return no landmarks."""
+    """Return a state without landmarks."""
     whole, number = np.empty(0, np.int64), np.empty(0)
     none, together = np.empty((0, callers)), np.empty((0, 0), np.uint8)
     return Known(whole, whole, whole, whole, number, np.empty(0, np.bool_), none, number, together)
 
 
 def with_new(known: Known, labels: list[int], scan: int, callers: int) -> Known:
-    """Return known landmarks with new ones, that are heard in a scan for the first time."""
+    """Append new landmarks, first detected in this scan."""
     callers = max(callers, known.source.shape[1])
     if not labels and callers == known.source.shape[1]:
         return known
@@ -113,7 +104,7 @@ def with_new(known: Known, labels: list[int], scan: int, callers: int) -> Known:
 def _with_new(
     columns: tuple[np.ndarray, ...], labels: Int[np.ndarray, " n"], scan: Whole, callers: Whole
 ) -> tuple[np.ndarray, ...]:
-    """Return the columns of known landmarks with new ones."""
+    """Return the columns of tracked landmarks extended by new ones."""
     known, none = Known(*columns), np.zeros(labels.size, np.int64)
     old, size = known.label.size, known.label.size + labels.size
     source, together = np.full((size, callers), np.nan), np.zeros((size, size), np.uint8)
@@ -133,13 +124,13 @@ def _with_new(
 
 
 def some(known: Known, kept: Bool[np.ndarray, " l"]) -> Known:
-    """Return some of the known landmarks."""
+    """Select tracked landmarks by a mask."""
     left = Known(*(column[kept] for column in known))
     return left._replace(together=left.together[:, kept])
 
 
 def merged(known: Known, pairs: Sequence[tuple[int, int]]) -> Known:
-    """Return known landmarks in which the second of each pair of labels is the first, too."""
+    """Merge pairs of landmarks: the second label of each pair into the first."""
     if not pairs:
         return known
     after = Known(*(column.copy() for column in known))
@@ -162,14 +153,14 @@ Heard = tuple[
     Float[np.ndarray, " m"],
     Float[np.ndarray, " m"],
 ]
-"""Label, caller, range or excess path, level, bearing and surety (from 0 to 1) of each row."""
+"""Columns of a scan: label, caller, range or excess path, level, bearing and surety (0 to 1)."""
 Sight = tuple[float, float]
-"""Range [m] and field of view [rad] of a sensor that tells no levels; a range of 0: not known."""
+"""Range [m] and field of view [rad] of a sensor without levels; range 0 if unknown."""
 Place = tuple[
     Float[np.ndarray, " d"], Int[np.ndarray, " l"], Int[np.ndarray, " c"], Bool[np.ndarray, " c"]
 ]
-"""Joint mean, where each known landmark stands in it, and each caller (-1: nowhere), and whether
-the caller moves."""
+"""Joint mean, indices in it of landmarks and callers (-1: absent), and whether each caller moves.
+"""
 
 
 def judged(
@@ -180,10 +171,7 @@ def judged(
     scan: int,
     sight: Sight = (0.0, 0.0),
 ) -> Known:
-    """Return landmarks after a scan, as known by what was heard and what was not.
-
-    ``near``: whether a row may have been of the landmark; then it was hidden at most.
-    """
+    """Update log odds, counts and levels of landmarks after a scan; ``near``: maybe hidden."""
     after = _copied(tuple(known))
     _judge(after, rows, place, near, scan, sight)
     return Known(*after)
@@ -191,7 +179,7 @@ def judged(
 
 @kernel
 def _copied(columns: tuple[np.ndarray, ...]) -> tuple[np.ndarray, ...]:
-    """Return the columns of `Known`, of which those that a scan changes are copies."""
+    """Return the columns of `Known`, with copies of the columns that a scan changes."""
     label, born, heard, count, odds, confirmed, source, aim, together = columns
     counts = heard.copy(), count.copy(), odds.copy(), confirmed.copy()
     return (label, born, *counts, source.copy(), aim.copy(), together.copy())
@@ -206,7 +194,7 @@ def _judge(
     scan: Whole,
     sight: Sight,
 ) -> None:
-    """Write odds, counts and levels after a scan."""
+    """Update log odds, counts and levels in place after a scan."""
     known, (mean, at, callers, _) = Known(*columns), there
     label, caller, _, level, _, surety = rows
     place = np.full(label.size, -1)
@@ -244,7 +232,7 @@ def _judge(
 
 @no_alloc
 def _lower(known: Known, n: Whole, fall: float, scan: Whole) -> None:
-    """Lower the odds of a landmark that was not heard."""
+    """Lower the log odds of a landmark that was not detected."""
     known.odds[n] -= fall
     if known.count[n] >= LASTING and not math.isnan(known.source[n, OWN]):
         if known.odds[n] < GONE:
@@ -259,7 +247,7 @@ def _count_together(
     place: Int[np.ndarray, " m"],
     caller: Int[np.ndarray, " m"],
 ) -> None:
-    """Count landmarks of which one caller was heard in a scan; of each row where its own stands."""
+    """Count joint detections by the same caller; ``place``: landmark of each measurement, or -1."""
     for a in range(place.size):
         for b in range(place.size):
             i, j = place[a], place[b]
@@ -269,10 +257,10 @@ def _count_together(
 
 @no_alloc
 def _spreading(caller: Whole, far: float, i: Whole, place: Place) -> float:
-    """Return what a level loses by the way of an echo from the landmark that stands at i [dB].
+    """Return the spreading loss of an echo from the landmark at index i [dB].
 
-    That is there and back of the vehicle's own call, and from the landmark of another caller's, but
-    of one that moves the way to the landmark, too.
+    It is two-way for own calls, and for moving callers via the landmark, else from the landmark
+    only.
     """
     loss = (40.0 if caller == OWN else 20.0) * math.log10(max(far, NEAR))
     mean, _, callers, moves = place
@@ -295,7 +283,7 @@ def _missed(
     hidden: bool,
     sight: Sight,
 ) -> float:
-    """Return how surely a caller's call should have been heard of a landmark: 1, `HIDDEN` or 0."""
+    """Weigh a missed detection of a caller's call: 1, `HIDDEN`, or 0 if none was expected."""
     (_, caller, way, level, _, _), (mean, at, callers, _) = rows, place
     if math.isnan(far):
         return 0.0
@@ -330,7 +318,7 @@ def _missed(
 
 @no_alloc
 def _in_sight(far: float, bearing: float, rows: Heard, sight: Sight) -> bool:
-    """Tell whether a sensor without levels should have seen a landmark, and nothing hides it."""
+    """Return whether a sensor without levels should have detected an unoccluded landmark."""
     _, caller, way, level, seen, _ = rows
     if far > WITHIN * sight[0] or abs(bearing) > 0.5 * sight[1] - BEFORE:
         return False
@@ -343,23 +331,24 @@ def _in_sight(far: float, bearing: float, rows: Heard, sight: Sight) -> bool:
 
 
 DENSEST = 0.05
-"""Landmarks per square metre, at most: of a few the map's extent tells nothing."""
+"""Largest density of landmarks [1/m^2]: the extent of a small map is no estimate of it."""
 GAIN = 1.0
-"""How much less at least each further pair makes its group cost."""
+"""Least cost reduction by each further pair of a group."""
 SURE = (8.0, 15.0, 6.0)
-"""A pair by itself, a group of two and a larger one are believed if they cost less than minus
-this."""
+"""Cost reductions required of a pair, a group of two pairs, and a larger group."""
 AHEAD = 5.0
-"""By how much a group must cost less than what makes its first landmark one with another."""
+"""Margin over groups that match the first landmark with another."""
 GATE = 13.8
-"""Largest squared distance of a pair: 1 in 1000 is beyond."""
+"""Gate on the squared distance of a pair, exceeded by 1 in 1000."""
 LEAST_STD = 0.15
-"""Least deviation of a difference along each axis [m]: how far filters are off that are sure."""
+"""Least standard deviation of a difference along each axis [m], to allow for overconfident filters.
+"""
 
 ASKED = (4, 6, 8, 12, 16, 24, 32, 64)
-"""In how many scans a landmark was heard when it is asked whether it is on the map twice."""
+"""Numbers of detections at which a landmark is tested for duplicates."""
 BOTH = 0.1
-"""Two landmarks are two if in more than this share of the scans of either both were heard."""
+"""Two landmarks are distinct if both were detected in more than this share of the scans of either.
+"""
 
 Pairs = list[tuple[int, int]]
 
@@ -368,11 +357,7 @@ Pairs = list[tuple[int, int]]
 def asked_of(
     columns: tuple[np.ndarray, ...], at: Int[np.ndarray, " l"], now: Whole
 ) -> tuple[Int[np.ndarray, " o"], Bool[np.ndarray, "o o"], Int[np.ndarray, " a"]]:
-    """Return known landmarks that stand on the map, which of them are two, and who is asked now.
-
-    ``columns``: of `existence.Known`; ``at``: where each stands in the joint mean, or -1; ``now``:
-    number of the scan. Who is asked is told as numbers of those that stand.
-    """
+    """Return landmarks on the map, which pairs are distinct, and which are due for a test."""
     known = Known(*columns)
     old = np.flatnonzero((at >= 0) & (known.born < now))
     asked, apart = np.zeros(old.size, np.bool_), np.ones((old.size, old.size), np.bool_)
@@ -392,17 +377,9 @@ def doubles(
     apart: Bool[np.ndarray, "l l"],
     asked: Int[np.ndarray, " a"],
 ) -> Pairs:
-    """Return pairs of landmarks that are one, as numbers of `at`, the lower first.
+    """Find duplicate landmarks; return pairs of positions in ``at``, the lower first.
 
-    Parameters
-    ----------
-    joint : JointGaussian
-    at : (l)
-        Where the landmarks stand in the joint mean.
-    apart : (l, l)
-        Which pairs are surely two.
-    asked : (a)
-        Numbers of landmarks of which a pair must hold one, for a group to be grown from it.
+    ``apart``: pairs known to be distinct; ``asked``: landmarks from which groups may grow.
     """
     best: tuple[float, list[list[int]]] = 0.0, []
     prior = 2.0 * math.log(_density(joint, at))
@@ -419,7 +396,7 @@ def doubles(
 
 
 def _density(joint: JointGaussian, at: Int[np.ndarray, " l"]) -> float:
-    """Return landmarks per square metre of the map."""
+    """Return the number of landmarks per square metre of the map."""
     area = float(np.ptp(joint.mean[at]) * np.ptp(joint.mean[at + 1]))
     return at.size / max(area, at.size / DENSEST)
 
@@ -431,7 +408,7 @@ def _groups(
     number: int,
     prior: float,
 ) -> list[tuple[float, list[list[int]]]]:
-    """Return the cost and the pairs of each group that grows from a pair of one landmark."""
+    """Grow a group of duplicates from each candidate pair of a landmark; return costs and pairs."""
     mean, covariance, pairs = joint.mean, joint.covariance, np.empty((at.size, 2), np.int64)
     groups = []
     for first in begun(mean, covariance, at, apart, number).tolist():
@@ -448,7 +425,7 @@ def begun(
     apart: Bool[np.ndarray, "l l"],
     number: Whole,
 ) -> Int[np.ndarray, "p 2"]:
-    """Return the pairs of one landmark that a group may grow from, the higher number first."""
+    """Return a landmark's candidate duplicates within the gate, as pairs, higher index first."""
     pairs, size = np.empty((at.size, 2), np.int64), 0
     for other in range(at.size):
         a, b = max(number, other), min(number, other)
@@ -458,7 +435,7 @@ def begun(
 
 
 def _lower_first(pairs: list[list[int]]) -> Pairs:
-    """Return pairs with the lower number first, each after what the pairs before have made one.
+    """Sort each pair, with indices replaced by their landmark after the merges before.
 
     >>> _lower_first([[7, 3], [7, 5]])
     [(3, 7), (3, 5)]
@@ -482,10 +459,7 @@ def grown(
     prior: float,
     pairs: Int[np.ndarray, "l 2"],
 ) -> tuple[float, Whole]:
-    """Write the group that grows from a pair; return what it costs and how many pairs it has.
-
-    ``prior``: what the density adds to the cost of each pair.
-    """
+    """Grow a group greedily from a pair; write its pairs, and return its cost and size."""
     a, b = pair
     cost = _cost(mean, covariance, at[a], at[b], prior)
     mean, P, apart = mean.copy(), covariance.copy(), apart.copy()
@@ -510,7 +484,7 @@ def grown(
 def _cost(
     mean: Float[np.ndarray, " d"], P: Float[np.ndarray, "d d"], a: Whole, b: Whole, prior: float
 ) -> float:
-    """Return what it costs that the landmarks at two indices are one; infinite beyond the gate."""
+    """Return the cost of equating the landmarks at two indices; infinite beyond the gate."""
     dx, dy, least = mean[a] - mean[b], mean[a + 1] - mean[b + 1], LEAST_STD * LEAST_STD
     xx = P[a, a] + P[b, b] - 2.0 * P[a, b] + least
     yy = P[a + 1, a + 1] + P[b + 1, b + 1] - 2.0 * P[a + 1, b + 1] + least
@@ -526,7 +500,7 @@ def _cost(
 
 @kernel
 def _equate(mean: Float[np.ndarray, " d"], P: Float[np.ndarray, "d d"], i: Whole, j: Whole) -> None:
-    """Correct mean and covariance by the measurement that the points at two indices are one."""
+    """Update mean and covariance by the constraint that two points coincide."""
     u, v = P[:, i] - P[:, j], P[:, i + 1] - P[:, j + 1]
     xx, xy = u[i] - u[j] + LEAST_STD * LEAST_STD, u[i + 1] - u[j + 1]
     yy = v[i + 1] - v[j + 1] + LEAST_STD * LEAST_STD
@@ -540,7 +514,7 @@ def _equate(mean: Float[np.ndarray, " d"], P: Float[np.ndarray, "d d"], i: Whole
 
 @no_alloc
 def _take_over(apart: Bool[np.ndarray, "l l"], a: Whole, b: Whole) -> None:
-    """Set apart from the first of a pair what was apart from either, and all from the second."""
+    """Combine the exclusions of a merged pair in its first landmark; exclude the second."""
     for k in range(apart.shape[0]):
         apart[a, k] = apart[k, a] = apart[a, k] or apart[b, k]
     for k in range(apart.shape[0]):

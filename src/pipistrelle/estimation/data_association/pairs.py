@@ -1,50 +1,40 @@
-r"""Rows of a scan against landmarks of the map: how far off, and how surely.
+r"""Match the measurements of a scan with landmarks: pair costs and three matching methods.
 
-A row of the vehicle's own call has a bearing and a range, one of another caller a bearing and, once
-the caller is on the map, an excess path. Of each pair of a row and a landmark
+**Costs** (`pair_costs`). Own calls give bearing and range, another caller's bearing and, with the
+caller on the map, excess path. A measurement and a landmark have the squared distance
 
 .. math:: d^2 = \nu^T S^{-1} \nu, \qquad S = H P H^T + R
 
-with the joint covariance P of pose, landmark and caller. The cost of a pair compares what the row
-would be of that landmark with what it would be of clutter of a density :math:`\lambda`, less for a
-row with a sure bearing (`rows`):
+with the joint covariance P of pose, landmark and caller. The cost compares the landmark with
+clutter of the density :math:`\lambda`, which is lower for precise bearings (`rows`):
 
 .. math:: c = d^2 + \ln |2 \pi S| + 2 \ln (\lambda / p_D)
 
-A pair of a cost below 0 is likelier than clutter. After a long way among other landmarks pose and
-landmark may be so unsure of each other that a row of the vehicle's own call tells nothing of the
-pair, however well it fits (`Chances.vague`): such a row is of something new, until it is seen to be
-one with what is known (`doubles`).
+A cost below 0 is likelier than clutter. After a long trajectory the relative position may be so
+uncertain that a good fit is no evidence (`Chances.vague`): such a measurement begins a new
+landmark, which may be merged later (`existence.doubles`).
 
-Joint compatibility: the largest set of pairs of rows and landmarks that fits as a whole.
+**Nearest** (`nearest`): the assignment of least total cost, each landmark at most once.
 
-All rows of a scan share the error of the pose, so pairs that are each within the gate may
-contradict each other. Of a set of pairs with the joint innovation :math:`\nu` and its covariance
-S = L L^T
+**Joint compatibility** (`jointly_compatible`): the largest set of pairs of negative cost that is
+consistent as a whole, as all share the error of the pose. With the joint innovation :math:`\nu` and
+its covariance S = L L^T
 
 .. math:: d^2 = |y|^2, \qquad L y = \nu,
 
-and the set is compatible while :math:`d^2` is within the quantile of :math:`\chi^2` for its
-numbers. A pair more adds two rows to L and two numbers to y. The search goes row by row, each row's
-likeliest landmark first and no landmark last. It leaves a branch that cannot have more pairs than
-the best set so far, or as many that fit better, and it ends after `MOST_NODES`: then the best set
-so far is taken.
+and the set is compatible while :math:`d^2` is within the quantile of :math:`\chi^2`. Each further
+pair appends two rows to L and two numbers to y. The branch-and-bound search tries the likeliest
+landmark of each measurement first and clutter last, and ends after `MOST_NODES` with the best set
+so far. Neira & Tardos, IEEE Transactions on Robotics and Automation 17 (2001).
 
-Neira & Tardos, IEEE Transactions on Robotics and Automation 17 (2001).
-
-From costs of pairs to decisions: which row is of which landmark.
-
-`nearest` takes the assignment that costs least, each landmark once. `marginal` takes what is sure
-over all assignments: the probability that a row is of a landmark, by message passing. With
-:math:`w_{ij} = e^{-c_{ij} / 2}` messages between rows i and landmarks j are
+**Marginal** (`marginal`): pairs of high marginal probability over all assignments, by messages
+between measurements i and landmarks j until convergence. With :math:`w_{ij} = e^{-c_{ij} / 2}`
 
 .. math:: \mu_{ij} = \frac{w_{ij}}{1 + \sum_{k \ne j} w_{ik} \nu_{ki}}, \qquad
           \nu_{ji} = \frac{1}{1 + \sum_{k \ne i} \mu_{kj}}
 
-until they stay, and the probability is
-:math:`w_{ij} \nu_{ji} / (1 + \sum_k w_{ik} \nu_{ki})`.
-
-Williams & Lau, IEEE Transactions on Aerospace and Electronic Systems 50 (2014).
+and the probability is :math:`w_{ij} \nu_{ji} / (1 + \sum_k w_{ik} \nu_{ki})`. Williams & Lau, IEEE
+Transactions on Aerospace and Electronic Systems 50 (2014).
 """
 
 import math
@@ -61,34 +51,32 @@ from pipistrelle.geometry import wrap_angle
 from pipistrelle.jit import Whole, kernel, no_alloc
 
 NOTHING = -1
-"""A row of no landmark."""
+"""Index of a measurement without landmark."""
 Innovations = tuple[Float[np.ndarray, " e"], Float[np.ndarray, "e e"], Int[np.ndarray, " p"]]
-"""Of pairs, two numbers each: their innovation, its covariance, and how many of the two count."""
+"""Innovation of pairs (two numbers each), its covariance, and numbers measured for each pair."""
 Innovate = Callable[[tuple[Int[np.ndarray, " p"], Int[np.ndarray, " p"]]], Innovations]
-"""From rows and landmarks of pairs to their innovations together (`pairs.pair_innovations`)."""
+"""Function from pairs to their joint innovation (`pair_innovations`)."""
 Match = Callable[[Float[np.ndarray, "m n"], Innovate | None], Int[np.ndarray, " m"]]
-"""From costs of rows and landmarks to the landmark of each row, or NOTHING."""
+"""Function from pair costs to the landmark of each measurement, or NOTHING."""
 LIKELY, SURE = 0.9, 0.99
-"""Probabilities from which on a row is taken to be of a landmark, and, if it is, of which."""
+"""Least probability of any landmark, and least share of the best landmark in it."""
 MESSAGES, STAY = 50, 1e-6
-"""How often messages are passed, at most, and by how much they may still change."""
+"""Most message passes, and change of messages at convergence."""
 LARGEST = 30.0
-"""Largest logarithm of a weight: beyond it a pair is as sure, and sums would lose digits."""
+"""Largest logarithm of a weight, so that sums keep their digits."""
 FARTHEST = 1e6
-"""In place of an infinite cost."""
+"""Finite substitute for an infinite cost."""
 
 
 def nearest(
     costs: Float[np.ndarray, "m n"], innovate: Innovate | None = None
 ) -> Int[np.ndarray, " m"]:
-    """Return the landmark of each row by the assignment that costs least, or NOTHING.
-
-    ``innovate``: what all methods are given, and only joint compatibility needs.
+    """Return the landmark of each measurement by the assignment of least cost, or NOTHING.
 
     >>> nearest(np.array([[-5.0, -4.0], [-4.5, np.inf], [3.0, np.inf]]))
     array([ 1,  0, -1])
     """
-    from scipy.optimize import linear_sum_assignment  # a quarter of a second, if not needed
+    from scipy.optimize import linear_sum_assignment  # deferred: costs a quarter of a second
 
     rows, landmarks = costs.shape
     bare = np.full((rows, rows), FARTHEST)
@@ -102,9 +90,7 @@ def nearest(
 def marginal(
     costs: Float[np.ndarray, "m n"], innovate: Innovate | None = None
 ) -> Int[np.ndarray, " m"]:
-    """Return the landmark of each row where that is sure, or NOTHING.
-
-    Here the first row is of either (`LIKELY`), but neither is sure (`SURE`).
+    """Return the landmark of each measurement if its marginal probability is high, or NOTHING.
 
     >>> marginal(np.array([[-9.0, -9.0], [np.inf, np.inf]]))
     array([-1, -1])
@@ -116,7 +102,7 @@ def marginal(
 
 @kernel
 def _what_is_sure(costs: Float[np.ndarray, "m n"]) -> Int[np.ndarray, " m"]:
-    """Return the landmark of each row where that is sure, or NOTHING."""
+    """Return the landmark of each measurement if its marginal probability is high, or NOTHING."""
     rows, landmarks, shares = _shares(costs)
     found, first = np.full(costs.shape[0], NOTHING), 0
     while first < rows.size:
@@ -134,7 +120,7 @@ def _what_is_sure(costs: Float[np.ndarray, "m n"]) -> Int[np.ndarray, " m"]:
 
 @kernel
 def probabilities(costs: Float[np.ndarray, "m n"]) -> Float[np.ndarray, "m n"]:
-    """Return the probability of each pair, of clutter what is left to 1.
+    """Return the probability of each pair; the remainder of each row is for clutter.
 
     >>> probabilities(np.array([[0.0]]))
     array([[0.5]])
@@ -149,7 +135,7 @@ def probabilities(costs: Float[np.ndarray, "m n"]) -> Float[np.ndarray, "m n"]:
 def _shares(
     costs: Float[np.ndarray, "m n"],
 ) -> tuple[Int[np.ndarray, " p"], Int[np.ndarray, " p"], Float[np.ndarray, " p"]]:
-    """Return the pairs that are within the gate, row by row, and the probability of each."""
+    """Return the pairs within the gate, sorted by measurement, and their probabilities."""
     (m, n), (rows, landmarks) = costs.shape, np.nonzero(costs < np.inf)
     size, beyond = rows.size, np.full(n, m)
     weight, to_row, to_landmark = np.empty(size), np.ones(size), np.empty(size)
@@ -170,7 +156,7 @@ def _shares(
             moved = max(moved, abs(message - to_row[p]))
             to_row[p] = message
         for j in range(n):
-            if beyond[j] > 0:  # rows of which this landmark is beyond the gate
+            if beyond[j] > 0:  # measurements for which the landmark is beyond the gate
                 moved = max(moved, abs(1.0 / total[j] - to_others[j]))
                 to_others[j] = 1.0 / total[j]
         if moved < STAY:
@@ -186,22 +172,21 @@ def _sum_up(
     weight: Float[np.ndarray, " p"],
     to_row: Float[np.ndarray, " p"],
 ) -> None:
-    """Write one and the weighted messages to each row."""
+    """Write 1 plus the sum of weighted messages to each measurement."""
     sums[:] = 1.0
     for p in range(rows.size):
         sums[rows[p]] += weight[p] * to_row[p]
 
 
 CONFIDENCE = 0.999
-"""Share of right sets that are within the gate."""
+"""Share of correct sets within the gate."""
 MOST_NODES, MOST_ROWS = 3000, 100
-"""How many pairs are tried at most, and how many rows are tested together: the work grows with the
-cube of their number. Of each row only so many landmarks take part as can be tried."""
+"""Most pairs tried, and most measurements tested jointly, as the work grows with their cube."""
 
 
 @cache
 def gates(numbers: int) -> Float[np.ndarray, " g"]:
-    """Return the largest squared distance of 0, 1, ... numbers.
+    """Return the gates on the squared distance for 0, 1, ... degrees of freedom.
 
     >>> gates(2).round(2)
     array([ 0.  , 10.83, 13.82])
@@ -214,10 +199,7 @@ def gates(numbers: int) -> Float[np.ndarray, " g"]:
 def jointly_compatible(
     costs: Float[np.ndarray, "m n"], innovate: Innovate | None
 ) -> Int[np.ndarray, " m"]:
-    """Return the landmark of each row by the largest compatible set of pairs, or NOTHING.
-
-    Pairs that are likelier than clutter take part.
-    """
+    """Return each measurement's landmark by the largest compatible set of pairs, or NOTHING."""
     found = np.full(len(costs), NOTHING)
     row, landmark = np.nonzero(costs < 0.0)
     if not row.size or innovate is None:
@@ -231,7 +213,7 @@ def jointly_compatible(
     row, landmark = row[likely], landmark[likely]
     for first in range(0, rows.size, MOST_ROWS):
         part = (row >= rows[first]) & (row <= rows[first : first + MOST_ROWS][-1])
-        part &= ~np.isin(landmark, found)  # what rows before have taken
+        part &= ~np.isin(landmark, found)  # taken by earlier measurements
         _match_together(found, row[part], landmark[part], innovate)
     return found
 
@@ -242,7 +224,7 @@ def _match_together(
     landmark: Int[np.ndarray, " p"],
     innovate: Innovate,
 ) -> None:
-    """Write the landmarks of rows by the largest compatible set of some pairs, row by row."""
+    """Write the landmarks of measurements by the largest compatible set of candidate pairs."""
     options = np.append(np.flatnonzero(np.diff(row, prepend=-1)), row.size)
     pairs = _search(options, landmark, innovate((row, landmark)), gates(2 * (options.size - 1)))
     found[row[pairs]] = landmark[pairs]
@@ -255,7 +237,7 @@ def _search(
     innovations: Innovations,
     gate: Float[np.ndarray, " g"],
 ) -> Int[np.ndarray, " c"]:
-    """Return the pairs of the largest compatible set; options: where each row's pairs begin."""
+    """Return the largest compatible set of pairs; ``options``: first pair of each measurement."""
     levels, numbers = options.size - 1, innovations[2]
     L, y = np.zeros((2 * levels, 2 * levels)), np.zeros(2 * levels)
     chosen, best = np.empty(levels, np.int64), np.empty(levels, np.int64)
@@ -294,7 +276,7 @@ def _search(
 def _is_taken(
     landmark: Int[np.ndarray, " p"], chosen: Int[np.ndarray, " c"], k: Whole, option: Whole
 ) -> bool:
-    """Tell whether one of the first k chosen pairs has the landmark of a pair."""
+    """Return whether the landmark of a pair is taken by the first k chosen pairs."""
     taken = False
     for n in range(k):
         taken |= landmark[chosen[n]] == landmark[option]
@@ -309,7 +291,7 @@ def _extended(
     k: Whole,
     innovations: Innovations,
 ) -> float:
-    """Write the rows of the k-th chosen pair; return by how much the squared distance grows."""
+    """Write the rows of L and y for chosen pair k; return the growth of the squared distance."""
     nu, S, _ = innovations
     for a in (2 * k, 2 * k + 1):
         whole = 2 * chosen[k] + a - 2 * k
@@ -326,39 +308,38 @@ def _extended(
 
 
 class Rows(NamedTuple):
-    """Rows of one caller."""
+    """Measurements of one caller."""
 
     bearing: Float[np.ndarray, " m"]
     bearing_std: Float[np.ndarray, " m"]
     way: Float[np.ndarray, " m"]
-    """Range of the vehicle's own call, excess path of another's [m], or NaN."""
+    """Range for the vehicle's own call, excess path for another's [m], or NaN."""
     way_std: Float[np.ndarray, " m"]
     clutter: Float[np.ndarray, " m"]
-    """Density of clutter with a way over that of `Chances`."""
+    """Clutter density relative to `Chances.clutter`."""
 
 
 class Chances(NamedTuple):
-    """What is assumed of detections."""
+    """Gate, clutter densities and detection probability of data association."""
 
     gate: float
-    """Largest squared distance."""
+    """Gate on the squared distance."""
     clutter: float
-    """Rows of clutter per radian and metre."""
+    """Density of clutter measurements [1/(rad m)]."""
     bearing_clutter: float
-    """The same of rows that have a bearing alone, per radian."""
+    """Density of clutter measurements without range or excess path [1/rad]."""
     detection: float
-    """Probability that a landmark which can be heard is."""
+    """Detection probability of a landmark in range."""
     vague: float
-    """Largest root of the determinant of H P H^T, of bearing and range [rad m]."""
+    """Largest square root of the determinant of H P H^T, for bearing and range [rad m]."""
 
 
 PlainChances = tuple[float, float, float, float, float]
-"""`Chances` as kernels take them."""
+"""`Chances` as a tuple for kernels."""
 BARELY = 2.0
-"""Nobody knows a landmark better that was heard once: the least that is vague, over the deviations
-of bearing and range of the row itself."""
+"""Least `vague` of a measurement, relative to the product of its bearing and range stds."""
 OWN_CALL, UNPLACED = -1, -2
-"""In place of a caller's index in the joint mean: the vehicle, and one that is not on the map."""
+"""Substitutes for a caller's index in the joint mean: the vehicle, and an unmapped caller."""
 
 
 @kernel
@@ -370,10 +351,7 @@ def pair_costs(
     caller: Whole,
     chances: PlainChances,
 ) -> Float[np.ndarray, "m n"]:
-    """Return the cost of each pair of a row and a landmark; infinite beyond the gate, or if vague.
-
-    ``at``: where the landmarks stand in the mean; ``caller``: where that of the rows stands.
-    """
+    """Return the cost of each pair of measurement and landmark; infinite if gated or vague."""
     heard, made = Rows(*rows), Chances(*chances)
     costs = np.full((heard.bearing.size, at.size), np.inf)
     H, index = np.zeros((2, 7)), np.zeros(7, np.int64)
@@ -397,7 +375,7 @@ def pair_costs(
                 det = a * c - b * b
                 squared = (c * nu * nu - 2.0 * b * nu * off + a * off * off) / det
                 size, density = (2.0 * math.pi) ** 2 * det, made.clutter * heard.clutter[m]
-            if squared < made.gate and size > 0.0:  # else lost to rounding
+            if squared < made.gate and size > 0.0:  # determinant may be lost to rounding
                 costs[m, n] = squared + math.log(size) + 2.0 * math.log(density / made.detection)
     return costs
 
@@ -411,10 +389,9 @@ def pair_innovations(
     caller: Whole,
     pairs: tuple[Int[np.ndarray, " p"], Int[np.ndarray, " p"]],
 ) -> tuple[Float[np.ndarray, " e"], Float[np.ndarray, "e e"], Int[np.ndarray, " p"]]:
-    """Return the joint innovation of pairs of a row and a landmark, and its covariance.
+    """Return the joint innovation of pairs of measurement and landmark, and its covariance.
 
-    Each pair has two numbers, bearing and way, and how many of them count is returned, too: what a
-    row does not have is 0 of variance 1, and correlated with nothing.
+    Each pair has two numbers, and a count of measured numbers; missing numbers are 0 of variance 1.
     """
     heard, (row, landmark) = Rows(*rows), pairs
     nu, S, numbers = np.zeros(2 * row.size), np.zeros((2 * row.size, 2 * row.size)), row.copy()
@@ -450,7 +427,7 @@ def _expected(
     H: Float[np.ndarray, "2 7"],
     index: Int[np.ndarray, "7"],
 ) -> tuple[float, float]:
-    """Return bearing and way of a landmark; write the slopes, and by what they are."""
+    """Return predicted bearing and range or excess path; write Jacobian H and its state indices."""
     x, y = mean[0], mean[1]
     distance, bearing, c, s, k = observe(x, y, mean[2], mean[i], mean[i + 1])
     for e, column in enumerate((0, 1, 2, i, i + 1, max(caller, 0), max(caller, 0) + 1)):
@@ -475,7 +452,7 @@ def _spread(
     index: Int[np.ndarray, "7"],
     size: Whole,
 ) -> tuple[float, float, float]:
-    """Return the three numbers of H P H^T."""
+    """Return the entries (bearing variance, covariance, range variance) of H P H^T."""
     across, both, along = 0.0, 0.0, 0.0
     for a in range(size):
         for b in range(size):
@@ -489,9 +466,9 @@ def _spread(
 def with_points(
     joint: JointGaussian, labels: list[int], points: tuple[Float[np.ndarray, " n"], ...]
 ) -> JointGaussian:
-    """Return a joint Gaussian with new landmarks, each measured by bearing and range.
+    """Append landmarks, each measured by bearing and range, to a joint Gaussian.
 
-    ``points``: bearings [rad], ranges [m], and the standard deviations of both.
+    ``points``: bearings [rad], ranges [m], and their standard deviations.
 
     >>> here = JointGaussian(
     ...     landmark=np.empty(0, int), mean=np.zeros(3), covariance=np.diag([0.0, 0.0, 0.01]))
@@ -511,7 +488,7 @@ def _with_points(
     covariance: Float[np.ndarray, "d d"],
     points: tuple[Float[np.ndarray, " n"], ...],
 ) -> tuple[Float[np.ndarray, " e"], Float[np.ndarray, "e e"]]:
-    """Return mean and covariance with new points: bearings, ranges and their deviations."""
+    """Append points, given by bearings, ranges and their stds, to a mean and covariance."""
     bearing, distance, bearing_std, range_std = points
     size, whole = mean.size, mean.size + 2 * bearing.size
     more, P = np.empty(whole), np.empty((whole, whole))

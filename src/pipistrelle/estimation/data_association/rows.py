@@ -1,11 +1,9 @@
-"""A scan's rows as an association uses them, and what becomes of those of one caller.
+"""Measurements of a scan as data association uses them, and its memory between scans.
 
-They are held against all landmarks (`compared`); how they are matched is the method's
-(`matching`). Sure rows that are near no landmark begin one, but not beside a louder row, nor where
-one may be two echoes that overlap: from these comes one row, with the bearing of one and the way
-of the other (`settled`).
-
-What the association remembers from scan to scan.
+`compared` computes the costs of a caller's measurements against all landmarks; a method of `pairs`
+matches them, and `settled` applies the matches. Precise measurements near no landmark begin new
+landmarks, except close to a louder measurement or where two echoes may have merged (bearing of the
+first, delay of the second).
 """
 
 import math
@@ -42,36 +40,36 @@ from pipistrelle.geometry import wrap_angle
 from pipistrelle.jit import Flag, Whole, kernel, no_alloc
 
 BESIDE, ASIDE = 0.96, 0.5
-"""A row begins no landmark beside a louder one, within such a way [m] and bearing [rad]."""
+"""A measurement begins no landmark within this range [m] and bearing [rad] of a louder measurement.
+"""
 OVERLAP_STD, OVERLAP_GATE = 0.7, 9.0
-"""Deviation of the way of an echo that overlaps with another [m], and largest squared distance."""
+"""Standard deviation of the path of an overlapping echo [m], and gate on the squared distance."""
 SURE_SHARE, ASSUMED = 0.65, 0.75
-"""A row is as sure as any up to this share of the limit of its bearing's deviation; how sure one is
-whose deviation is only assumed."""
+"""Share of the bearing limit up to which surety is 1, and surety of a default standard deviation.
+"""
 RARE_SHARE, RAREST = 0.4, 0.01
-"""Below this share of that limit rows are clutter more rarely, by the square of the deviation, and
-at most so rarely."""
+"""Share of the bearing limit below which clutter is rarer, by the squared std, and least factor."""
 
 
 class ScanRows(NamedTuple):
-    """Rows of a scan."""
+    """Measurements of a scan."""
 
     caller: Int[np.ndarray, " m"]
     bearing: Float[np.ndarray, " m"]
     bearing_std: Float[np.ndarray, " m"]
     way: Float[np.ndarray, " m"]
-    """Range of the vehicle's own call, excess path of another's [m], or NaN."""
+    """Range for the vehicle's own call, excess path for another's [m], or NaN."""
     way_std: Float[np.ndarray, " m"]
     level_db: Float[np.ndarray, " m"]
     usable: Bool[np.ndarray, " m"]
     with_way: Bool[np.ndarray, " m"]
-    """Usable, and with a way."""
+    """Usable, and with range or excess path."""
     sure: Bool[np.ndarray, " m"]
-    """Whether the way is sure enough to begin a landmark."""
+    """Whether range or excess path is precise enough to begin a landmark."""
     surety: Float[np.ndarray, " m"]
-    """How sure a bearing is, from 0 to 1."""
+    """Weight of a detection by its bearing's precision, from 0 to 1."""
     clutter: Float[np.ndarray, " m"]
-    """As in `pairs.Rows`."""
+    """Relative clutter density, as in `pairs.Rows`."""
 
 
 Joint = tuple[Int[np.ndarray, " n"], Float[np.ndarray, " d"], Float[np.ndarray, "d d"]]
@@ -81,10 +79,10 @@ Joint = tuple[Int[np.ndarray, " n"], Float[np.ndarray, " d"], Float[np.ndarray, 
 def rows_of_scan(
     scan: Scan, limits: tuple[float, float, float], assumed: tuple[float, ...]
 ) -> ScanRows:
-    """Return a scan's rows.
+    """Convert a scan to `ScanRows`; ``assumed``: default stds, exempt from all limits.
 
-    ``limits``: largest deviations of bearing and way, and of the way of what begins a landmark;
-    ``assumed``: deviations that are assumed of rows which state none: no limit holds for these.
+    ``limits``: largest stds of bearing, of range or excess path, and of the latter for new
+    landmarks.
     """
     numbers = np.ascontiguousarray(scan.numbers)
     return ScanRows(*_read(scan.caller, numbers, limits, np.array(assumed, float)))
@@ -112,7 +110,7 @@ def _read(
         sure[m] = _within(way_std[m], birth_limit, assumed)
         if not _is_assumed(bearing_std[m], assumed):
             share = SURE_SHARE * limit / bearing_std[m]
-            surety[m] = share if share < 1.0 else 1.0  # of none stated, too
+            surety[m] = share if share < 1.0 else 1.0  # also for NaN
             rare = bearing_std[m] / (RARE_SHARE * limit)
             clutter[m] = max(rare * rare, RAREST) if rare < 1.0 else 1.0
     bearing, told = numbers[BEARING], (usable, with_way, sure, surety, clutter)
@@ -121,13 +119,13 @@ def _read(
 
 @no_alloc
 def _within(std: float, limit: float, assumed: Float[np.ndarray, " a"]) -> Flag:
-    """Tell whether a deviation is within a limit, or was only assumed."""
+    """Return whether a standard deviation is within a limit or is a default."""
     return std <= limit or _is_assumed(std, assumed)
 
 
 @no_alloc
 def _is_assumed(std: float, assumed: Float[np.ndarray, " a"]) -> Flag:
-    """Tell whether a deviation was only assumed."""
+    """Return whether a standard deviation is one of the assumed defaults."""
     found = False
     for one in assumed:
         found |= std == one
@@ -136,7 +134,7 @@ def _is_assumed(std: float, assumed: Float[np.ndarray, " a"]) -> Flag:
 
 @kernel
 def place_of(label: Whole, landmark: Int[np.ndarray, " n"]) -> int:
-    """Return where a landmark stands in the joint mean, or -1."""
+    """Return the index of a landmark in the joint mean, or -1."""
     for n in range(landmark.size):
         if landmark[n] == label:
             return 3 + 2 * n
@@ -147,7 +145,7 @@ def place_of(label: Whole, landmark: Int[np.ndarray, " n"]) -> int:
 def places_of(
     labels: Int[np.ndarray, " l"], landmark: Int[np.ndarray, " n"], near: Bool[np.ndarray, " k"]
 ) -> tuple[Int[np.ndarray, " l"], Bool[np.ndarray, " l"]]:
-    """Return where landmarks stand in the joint mean, -1: nowhere; and whether a row is near."""
+    """Return each label's index in the joint mean (-1: absent), and whether it is near."""
     at, close = np.empty(labels.size, np.int64), np.zeros(labels.size, np.bool_)
     for n in range(labels.size):
         at[n] = place_of(labels[n], landmark)
@@ -165,11 +163,11 @@ def compared(
     chances: PlainChances,
     telling: float,
 ) -> tuple[Int[np.ndarray, " r"], Float[np.ndarray, "r n"], Bool[np.ndarray, " r"]]:
-    """Return the usable rows of a caller, their costs, and whether any landmark is near each.
+    """Return a caller's usable measurements, their pair costs, and whether each is near a landmark.
 
-    ``moving``: labels of landmarks that no row is of; ``near``: is set of those near a row with a
-    deviation up to ``telling``; ``caller``: its number, the row of its direct call, and where it
-    stands in the mean.
+    ``moving``: labels excluded from matching; ``near``: set for landmarks near a measurement with a
+    bearing std up to ``telling``; ``caller``: number, index of its direct call, and of its
+    position.
     """
     heard, (landmark, mean, covariance), (number, direct, at) = ScanRows(*rows), joint, caller
     used = np.flatnonzero(heard.caller == number)
@@ -203,7 +201,7 @@ def bearing_fits(
     at: Whole,
     chances: PlainChances,
 ) -> bool:
-    """Tell whether the bearing of a row may be of the landmark that stands at a place."""
+    """Return whether the bearing of a measurement is within the gate of a landmark."""
     (_, mean, covariance), part = joint, part_of(ScanRows(*rows), np.full(1, row), 0.0)
     costs = pair_costs(part, mean, covariance, np.full(1, at), UNPLACED, chances)
     return math.isfinite(costs[0, 0])
@@ -211,7 +209,7 @@ def bearing_fits(
 
 @kernel
 def part_of(heard: ScanRows, rows: Int[np.ndarray, " r"], spread: float) -> tuple[np.ndarray, ...]:
-    """Return columns of some rows (`pairs.Rows`); ``spread``: more deviation of the way."""
+    """Return columns of `pairs.Rows` for selected measurements; ``spread``: extra path std [m]."""
     way_std = heard.way_std[rows]
     for k in range(rows.size):
         way_std[k] = math.hypot(way_std[k], spread)
@@ -229,10 +227,9 @@ def settled(
     caller: tuple[Whole, Whole, Whole],
     chances: PlainChances,
 ) -> tuple[Int[np.ndarray, " b"], tuple[int, int]]:
-    """Label a caller's rows; return those that begin landmarks, the loudest first, and two counts.
+    """Label a caller's measurements; return the precise unmatched (loudest first), and counts.
 
-    ``confirmed``: labels of landmarks that are some; ``matched``: the rows, which landmark each is
-    of, and whether any is near. The counts are of sure rows: with a landmark, and all.
+    The counts are of precise measurements: matched, and all.
     """
     heard, (landmark, mean, covariance), (number, _, at) = ScanRows(*rows), joint, caller
     (used, found, near), stray = matched, np.empty(label.size, np.int64)
@@ -262,7 +259,7 @@ def settled(
 
 @no_alloc
 def _is_beside(heard: ScanRows, row: Whole) -> bool:
-    """Tell whether a row is beside a louder one of the same caller."""
+    """Return whether a measurement is close to a louder measurement of the same caller."""
     own = heard.caller[row]
     factor = 2.0 if own == OWN else 1.0
     for m in range(heard.caller.size):
@@ -277,7 +274,7 @@ def _is_beside(heard: ScanRows, row: Whole) -> bool:
 def _loudest_first(
     rows: Int[np.ndarray, " r"], level_db: Float[np.ndarray, " m"]
 ) -> Int[np.ndarray, " r"]:
-    """Return rows in the order of their levels; those of one level stay in theirs."""
+    """Sort measurements by level, loudest first; equal levels keep their order."""
     ordered = rows.copy()
     for k in range(1, ordered.size):
         row, n = ordered[k], k
@@ -288,19 +285,19 @@ def _loudest_first(
 
 
 class CallerPlace(NamedTuple):
-    """A caller's place and motion."""
+    """Position and motion of a caller."""
 
     x: float
     y: float
     """Position [m]."""
     motion: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 0.0)
-    """Velocity [m/s], then acceleration [m/s^2], along x and y; 0 of one that stands."""
+    """Velocity [m/s], then acceleration [m/s^2], along x and y; 0 if stationary."""
     time: float = 0.0
-    """Time at which the caller is there [s]."""
+    """Time of the position [s]."""
     since: float = -math.inf
-    """Time from which on place and motion hold [s]."""
+    """First time at which position and motion are valid [s]."""
     agreed: bool = False
-    """Whether it is not searched for once more."""
+    """Whether the search is finished."""
 
     def at(self, time: float) -> tuple[float, float]:
         """Return the position at a time [m]."""
@@ -310,41 +307,41 @@ class CallerPlace(NamedTuple):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Caller:
-    """What is known of a caller."""
+    """State of a caller in data association."""
 
     label: int
     place: CallerPlace | None = None
-    """Where it was found."""
+    """Position found by the search."""
     told: bool = False
     tracks: Tracks = field(default_factory=Tracks)
     trial: tuple[tuple[int, int], ...] = ()
-    """Rows that were of landmarks, and all, of the scans since it is on the map."""
+    """Matched and total counts of its measurements, for each scan since it is on the map."""
     since: int = 0
-    """Number of the scan in which it was placed."""
+    """Number of the scan in which it was put on the map."""
 
 
 class EarlyScan(NamedTuple):
-    """A scan from before there was a map (`early_scans`)."""
+    """A scan from before the first map, kept for `labelled_by_map`."""
 
     number: int
     scan: Scan
-    """As it was stated."""
+    """The scan as received."""
     rows: ScanRows
     direct: Int[np.ndarray, " c"]
-    """Row of each caller's direct call, or -1."""
+    """Index of each caller's direct call, or -1."""
     pose: Gaussian
-    """The vehicle's pose as it was predicted before the scan corrected it."""
+    """Vehicle pose predicted for the scan, before its update."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Memory:
-    """What the association remembers."""
+    """State of data association between scans."""
 
     scan: int = 0
     labels: int = 0
-    """Labels given so far."""
+    """Number of labels issued."""
     known: Known = field(default_factory=lambda: nobody(1))
     callers: Mapping[int, Caller] = field(default_factory=dict)
-    """By number."""
+    """Callers by number."""
     early: tuple[EarlyScan, ...] = ()
-    """To be labelled by the map."""
+    """Scans that wait for a settled map."""

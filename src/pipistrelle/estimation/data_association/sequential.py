@@ -1,17 +1,11 @@
-"""The package's association: scan by scan, with births, deaths, callers and changes of mind.
+"""Data association scan by scan, with new, deleted and merged landmarks and a search for callers.
 
-A row is held against the landmarks of the map with the joint covariance of pose and map (`pairs`),
-the rows of each caller by themselves, and is given to one of them or to none (`matching`). A sure
-row that is near none begins a landmark at once, with all that it says, so that nothing of the first
-scans is lost; whether there is one is told later, by how often it is heard (`existence`). What was
-none is removed, and its rows are taken back; what turns out to be on the map twice is merged
-(`doubles`).
-
-A caller is known by its direct call, and its place is found by the excess paths themselves
-(`caller_search`). Until then its rows are followed, and not used; then the session hears again all
-that it remembers. What came before there was a map is labelled by the map (`early_scans`).
-
-The methods of association by name.
+The measurements of each caller are matched with landmarks by the joint covariance of pose and map
+(`pairs`). A precise measurement near no landmark begins a new landmark at once, so that the first
+scans are used in full; repeated detection confirms it (`existence`). Landmarks of low odds are
+deleted with their measurements, duplicates merged. A caller is identified by its direct call and
+located by excess paths (`caller_search`). Until then its measurements are tracked, but not used;
+afterwards the session repeats all scans in its memory.
 """
 
 import math
@@ -86,40 +80,37 @@ from pipistrelle.estimation.data_association.rows import (
 from pipistrelle.estimation.data_association.tracks import Tracks, followed
 
 PLACE_SHARE, MOVING_SHARE = 0.12, 0.2
-"""Deviation of the range at which a caller that stands was found, and one that moves, as a share of
-it."""
+"""Std of the range of a found caller, stationary or moving, relative to the range."""
 DIRECT_GATE = 9.0
-"""Largest squared distance of a caller's direct call."""
+"""Gate on the squared distance of a caller's direct call."""
 PROBATION = 40
-"""Scans in which a caller may turn out not to be where it was found."""
+"""Scans within which a caller's position may be rejected."""
 TRIAL, SETTLING, LEAST_SHARE, LEAST_ROWS = 9, 3, 0.4, 10
-"""A caller is where it was found if of the sure rows of so many scans, the first left out, this
-share is of landmarks, new ones not counted; at least so many rows must tell."""
+"""Scans over which a caller's position is tested, and skipped first; least share and number of
+precise measurements that match old landmarks."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Limits:
-    """How sure a row must be to be used, and to begin a landmark."""
+    """Largest standard deviations of measurements that are used, and that begin landmarks."""
 
     bearing_std: float = 0.05
-    """[rad]"""
+    """Bearing [rad]."""
     way_std: float = 0.35
-    """Of range or excess path [m]."""
+    """Range or excess path [m]."""
     birth_way_std: float = 0.25
-    """The same of a row that begins a landmark [m]."""
+    """Range or excess path of a measurement that begins a landmark [m]."""
     assumed: tuple[float, ...] = ()
-    """Deviations that are assumed of rows which state none: no limit holds for these."""
+    """Default standard deviations, exempt from all limits."""
     sight: tuple[float, float] = (0.0, 0.0)
-    """`existence.Sight`."""
+    """Range and field of view of a sensor without levels (`existence.Sight`)."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Sequential:
-    """An association that works scan by scan.
+    """Data association that works scan by scan.
 
-    Examples
-    --------
-    Two rows of an empty map are two landmarks; the next scan's are the same.
+    Two measurements on an empty map become two landmarks, which the next scans match.
 
     >>> from pipistrelle.config import Config
     >>> from pipistrelle.detection.scans import make_scan
@@ -142,9 +133,9 @@ class Sequential:
     """
 
     match: Match
-    """How rows are matched with landmarks (`matching`, `compatibility`)."""
+    """Matching method, from `METHODS`."""
     chances: PlainChances
-    """`pairs.Chances`."""
+    """`pairs.Chances` as a tuple."""
     limits: Limits = Limits()
 
     def start(self) -> Memory:
@@ -152,7 +143,7 @@ class Sequential:
         return Memory()
 
     def informed(self, memory: Memory, news: Mapping[int, CallerPlace]) -> Memory:
-        """Return a memory that knows where callers are, by their numbers."""
+        """Return a memory that contains the positions of found callers, given by number."""
         known = dict(memory.callers)
         for number, place in news.items():
             label = known[number].label if number in known else memory.labels + 1
@@ -161,10 +152,7 @@ class Sequential:
         return replace(memory, callers=known)
 
     def knowing(self, memory: Memory, known: Landmarks, callers: Int[np.ndarray, " c"]) -> Memory:
-        """Return a memory of callers that stand on the map from the beginning, by their numbers.
-
-        They are not searched for, and cannot turn out to be elsewhere.
-        """
+        """Return a memory with callers on the initial map; they are not searched for."""
         numbers = {label: number for number, label in enumerate(callers.tolist())}
         rows = zip(known.landmark.tolist(), known.mean.tolist(), strict=True)
         stated = {
@@ -177,11 +165,11 @@ class Sequential:
         return replace(memory, callers={**memory.callers, **stated})
 
     def tentative(self, memory: Memory) -> list[int]:
-        """Return the labels of what may be no landmark."""
+        """Return the labels of unconfirmed landmarks."""
         return memory.known.label[~memory.known.confirmed].tolist()
 
     def associate(self, memory: Memory, belief: Belief, scan: Scan) -> tuple[Memory, Assignment]:
-        """Return the memory after a scan, and what is decided."""
+        """Associate a scan; return the new memory and the assignment."""
         work = _Work(self, memory, belief, scan)
         if news := work.search_callers():
             return memory, Assignment(label=work.label, again=news)
@@ -191,7 +179,7 @@ class Sequential:
 
 
 class _Work:
-    """The association of one scan."""
+    """Association of a single scan."""
 
     def __init__(self, stage: Sequential, memory: Memory, belief: Belief, scan: Scan) -> None:
         self.stage, self.memory, self.scan = stage, memory, scan
@@ -209,7 +197,7 @@ class _Work:
         self.near = np.zeros(self.joint.landmark.size + scan.landmark.size, np.bool_)
 
     def search_callers(self) -> dict[int, CallerPlace]:
-        """Follow the rows of callers that are searched for, and return where some are found."""
+        """Track the callers still searched for; return newly found positions by caller number."""
         news: dict[int, CallerPlace] = {}
         for number, row in enumerate(self.scan.direct.tolist()):
             if number == OWN or (row < 0 and number not in self.callers):
@@ -223,14 +211,14 @@ class _Work:
         return news
 
     def _followed(self, number: int, caller: Caller, row: int) -> Caller:
-        """Return a caller with this scan's rows among its tracks."""
+        """Add the measurements of this scan to a caller's tracks."""
         rows = self._some(self.rows.with_way & (self.scan.caller == number))
         direct = self.scan.bearing[row] if row >= 0 else math.nan
         tracks = followed(caller.tracks, self.scan.time, self.pose, direct, rows)
         return replace(caller, tracks=tracks)
 
     def match(self, number: int) -> None:
-        """Label the rows of one caller, and begin landmarks with those that are near no other."""
+        """Label a caller's measurements; begin landmarks with precise unmatched measurements."""
         at = OWN_CALL if number == OWN else self._heard_from(number)
         if at is None:
             return
@@ -251,17 +239,14 @@ class _Work:
         self._begin(number, begun)
 
     def _is_elsewhere(self, number: int, count: tuple[int, int]) -> bool:
-        """Tell whether a caller must be elsewhere than expected: few of its rows are of landmarks.
-
-        It was heard of as many before, and the vehicle hears of its own call where it is itself.
-        """
+        """Return whether a moving caller is misplaced: few of its measurements match landmarks."""
         known, own = self.memory.known, self.label[self.scan.caller == OWN]
         before = known.confirmed & ~np.isnan(known.source[:, number])
         often = int(before.sum()) >= count[1]
         return often and may_have_turned(*count) and bool((own != UNLABELLED).any())
 
     def _follow_turn(self, number: int, at: int) -> None:
-        """Take a caller that moves for where its rows fit, if they do not where it was expected."""
+        """Move a moving caller to where its measurements match the map, if it may have turned."""
         direct, rows = self._direct(number), self.rows.with_way & (self.scan.caller == number)
         if direct < 0:
             return
@@ -275,7 +260,7 @@ class _Work:
         self.joint = turned(joint, at, float(self.scan.bearing[direct]), costs)
 
     def _heard_from(self, number: int) -> int | None:
-        """Return where a caller stands in the joint mean; None where its rows have to wait."""
+        """Return a caller's index in the joint mean, or None if its measurements are unusable."""
         caller = self.callers.get(number)
         if caller is None:
             return UNPLACED
@@ -318,7 +303,7 @@ class _Work:
         )
 
     def _without(self, known: Known, gone: set[int]) -> tuple[Known, tuple[int, ...]]:
-        """Take labels from rows and callers; return the others, and which of them are not new."""
+        """Delete labels from scan and landmarks; return the other landmarks, and the old labels."""
         memory, left = self.memory, np.array([*gone])
         for labels in (self.label, self.named):
             labels[is_among(labels, left)] = UNLABELLED
@@ -326,7 +311,7 @@ class _Work:
         return some(known, ~is_among(known.label, left)), tuple(sorted(gone & before))
 
     def _early(self, scan: Scan) -> tuple[EarlyScan, ...]:
-        """Return the scans from before there was a map, this one among them if it is one."""
+        """Return the stored early scans, with this scan if it is early."""
         early, number = self.memory.early, self.memory.scan
         placed = any(caller.told and caller.since < number for caller in self.callers.values())
         landmarks = self.memory.known.label.size + len(self.new)
@@ -336,7 +321,7 @@ class _Work:
         return *early, EarlyScan(number, scan, self.rows, self.scan.direct, pose)
 
     def _labelled_by_map(self, early: tuple[EarlyScan, ...], known: Known) -> dict[int, Scan]:
-        """Return early scans with labels, by their numbers; none before a caller is on the map."""
+        """Label early scans by the map; return them by number, or none if no caller is mapped."""
         joint, stage, places = self.joint, self.stage, {}
         sure = known.label[known.confirmed].tolist()
         for number, caller in self.callers.items():
@@ -353,10 +338,7 @@ class _Work:
         }
 
     def _judged(self) -> tuple[Known, Int[np.ndarray, " l"]]:
-        """Return all landmarks, new ones too, after what was heard of them and what was not.
-
-        And where they stand in the joint mean; -1: nowhere.
-        """
+        """Return all landmarks with updated log odds, and their joint-mean indices (-1: absent)."""
         memory, scan, rows = self.memory, self.scan, self.rows
         size = max(1 + scan.caller.max(initial=0), scan.direct.size, memory.known.source.shape[1])
         known = with_new(memory.known, self.new, memory.scan, size)
@@ -370,7 +352,7 @@ class _Work:
         return judged(known, heard, place, near, memory.scan, self.stage.limits.sight), at
 
     def _doubles(self, known: Known, at: Int[np.ndarray, " l"]) -> tuple[tuple[int, int], ...]:
-        """Return pairs of landmarks that are one, the older first; asked now and then."""
+        """Return duplicate landmarks that are due for a test, as (older, newer) labels."""
         old, apart, asked = asked_of(tuple(known), at, self.memory.scan)
         if not asked.size:
             return ()
@@ -378,7 +360,7 @@ class _Work:
         return tuple((label[a], label[b]) for a, b in doubles(self.joint, at[old], apart, asked))
 
     def _another(self) -> int:
-        """Return a new label, which no caller has."""
+        """Return a new label that no caller has."""
         taken = {caller.label for caller in self.callers.values()}
         self.labels += 1
         while self.labels in taken:
@@ -386,23 +368,23 @@ class _Work:
         return self.labels
 
     def _where(self, label: int) -> int:
-        """Return where a landmark stands in the joint mean, or -1."""
+        """Return the index of a landmark in the joint mean, or -1."""
         return place_of(label, self.joint.landmark)
 
     def _direct(self, number: int) -> int:
-        """Return the row of a caller's direct call, or -1."""
+        """Return the index of a caller's direct call in the scan, or -1."""
         return direct_row(self.scan.direct, number)
 
     def _joint(self) -> Joint:
-        """Return what kernels take of the joint Gaussian."""
+        """Return the joint Gaussian as a tuple for kernels."""
         return self.joint.landmark, self.joint.mean, self.joint.covariance
 
     def _some(self, rows: Bool[np.ndarray, " m"]) -> Rows:
-        """Return some rows."""
+        """Select measurements by a mask."""
         return Rows(*part_of(self.rows, np.flatnonzero(rows), 0.0))
 
     def _tell(self, number: int, caller: Caller) -> None:
-        """State the place of a caller that was found as a range of its direct call."""
+        """Set the range of a found caller's direct call, which puts the caller on the map."""
         row = self._direct(number)
         if caller.place is None or row < 0 or self.scan.time < caller.place.since:
             return
@@ -416,7 +398,7 @@ class _Work:
         self.callers[number] = told
 
     def _match_direct(self, number: int, label: int, at: int) -> None:
-        """Label a caller's direct call, where its bearing agrees."""
+        """Label a caller's direct call if its bearing is within the gate."""
         row = self._direct(number)
         if row < 0:
             return
@@ -427,7 +409,7 @@ class _Work:
         self.label[row] = label
 
     def _begin(self, number: int, begun: Int[np.ndarray, " b"]) -> None:
-        """Begin a landmark with each of some rows."""
+        """Begin a landmark with each given measurement."""
         labels, rows = [self._another() for _ in begun], self.rows
         self.label[begun] = labels
         self.new += labels
@@ -437,14 +419,14 @@ class _Work:
             self.joint = with_points(self.joint, labels, points)
 
     def _judge_caller(self, number: int, count: tuple[int, int]) -> None:
-        """Remember how many of a caller's sure rows are of landmarks, and how many there are."""
+        """Record how many of a caller's precise measurements match, and their number."""
         caller = self.callers.get(number)
         if caller is not None and self._where(caller.label) >= 0:
             trial = (*caller.trial[1 - TRIAL :], count)
             self.callers[number] = replace(caller, trial=trial)
 
     def _lost(self, known: Known) -> list[int]:
-        """Return callers that are not where they were found, with what they alone have placed."""
+        """Delete misplaced callers and the landmarks that depend on them; return all labels."""
         lost: list[int] = []
         for number, caller in [*self.callers.items()]:
             if len(caller.trial) < TRIAL or self.memory.scan > caller.since + PROBATION:
@@ -458,19 +440,19 @@ class _Work:
 
 
 METHODS = {"nearest": nearest, "joint": jointly_compatible, "marginal": marginal}
-"""How rows of a scan are matched with landmarks, by ``association.method``."""
+"""Matching methods by the name in ``association.method``."""
 GATE = 25.0
-"""Largest squared distance of a row from its landmark: 0.5 to 1 % of right rows are beyond."""
+"""Gate on the squared distance of a measurement, exceeded by 0.5 to 1 % of correct matches."""
 
 VAGUE = 0.0012
-"""The clutter that a pair may cover: `Chances.vague` times the clutter per radian and metre."""
+"""Most clutter expected within the uncertainty of a pair: `Chances.vague` times the clutter
+density."""
 
 
 def left_out(config: Config, scans: Iterable[Scan]) -> dict[str, Float[np.ndarray, " n"]]:
-    """Return the deviations of rows that an association leaves out as too unsure.
+    """Return the standard deviations of measurements that association discards, by setting.
 
-    By the setting that decides it, ``bearing_std`` [rad] or ``way_std`` [m]; no entry where no row
-    is left out. `scans` have the deviations that the estimator is given where none is stated.
+    Keys are ``bearing_std`` [rad] and ``way_std`` [m]; a setting that discards nothing is absent.
     """
     if config.association.method not in METHODS:
         return {}
@@ -487,25 +469,24 @@ def left_out(config: Config, scans: Iterable[Scan]) -> dict[str, Float[np.ndarra
 
 
 def _assumed(config: Config) -> tuple[float, float, float]:
-    """Return the deviations that are assumed of rows which state none."""
+    """Return the default standard deviations of bearing, range and excess path."""
     told = config.filter
     return told.bearing_std, told.range_std, told.excess_path_std
 
 
 def association_of(config: Config) -> Association | None:
-    """Return the association that ``association.method`` names; None for known labels.
+    """Build the association that ``association.method`` names; None for known labels.
 
-    A class from outside, ``module:Class``, is built by its ``from_config(config)`` where it has
-    one; else it is a dataclass, and may have a field ``config``, all settings.
-
-    It raises InputError for a class that is not there, is no `Association` or cannot be built.
+    A class from outside, ``module:Class``, is built by its ``from_config(config)``, or as a
+    dataclass with an optional field ``config`` for all settings. Raises InputError if it is
+    missing, is no `Association` or cannot be built.
     """
     name, settings = config.association.method, config.association
     if name == KNOWN:
         return None
     if name in METHODS:
         told, vague = config.filter, VAGUE / settings.clutter
-        if told.noise == "constant":  # the estimator knows no more of what was heard once
+        if told.noise == "constant":  # no landmark is known better after one detection
             vague = max(vague, BARELY * told.bearing_std * told.range_std)
         chances = Chances(
             gate=GATE,

@@ -1,8 +1,8 @@
-"""Rows of one caller, followed from scan to scan before it is known where the caller is.
+"""Tracks of a caller's measurements while its position is unknown.
 
-Bearing (in the world) and excess path of a landmark change little from scan to scan, and evenly. A
-row goes on with the track that it continues best (`matching.nearest`); a sure row that continues
-none begins one.
+World bearing and excess path of a landmark change slowly and evenly between scans. A measurement
+continues the track of least cost (`pairs.nearest`); a precise measurement that continues none
+begins a track.
 """
 
 from dataclasses import dataclass, field, replace
@@ -14,41 +14,38 @@ from pipistrelle.estimation.data_association.pairs import NOTHING, Rows, nearest
 from pipistrelle.geometry import wrap
 
 SIGHTINGS = 3
-"""How many of the last sightings say how a track goes on."""
+"""Last sightings kept per track, for its extrapolation."""
 SCAN, BEARING, WAY, BEARING_STD, WAY_STD, LEVEL, X, Y = range(8)
-"""Numbers of a sighting; the bearing is one in the world, x and y are the vehicle's."""
+"""Columns of a sighting; the bearing is in the world, and x and y are the vehicle's."""
 SILENT, EVEN = 4, 6
-"""Scans after which a track has ended, and over which its last sightings are taken for even."""
+"""Scans without sightings that end a track, and scans over which its change counts as linear."""
 TURN = 0.03
-"""How much dead reckoning loses of the heading from scan to scan [rad]."""
+"""Drift of the dead-reckoned heading per scan [rad]."""
 CLUTTER, NEW_BEARING_STD, NEW_WAY_STD, GATE, LEVEL_STD = 0.075, 0.05, 0.3, 12.0, 5.0
-"""Clutter per rad and m over the probability of detection; least certainty of a first sighting
-[rad, m]; largest squared distance; of levels [dB]."""
+"""Clutter per rad and m over the detection probability; largest stds of a first sighting [rad, m];
+gate on the squared distance; std of levels [dB]."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Tracks:
-    """All that was heard of a caller that is not on the map."""
+    """Measurements of a caller that is not on the map."""
 
     poses: Float[np.ndarray, "k 3"] = field(default_factory=lambda: np.empty((0, 3)))
-    """Of the vehicle at each scan, as it was believed then."""
+    """Predicted vehicle pose at each scan."""
     times: Float[np.ndarray, " k"] = field(default_factory=lambda: np.empty(0))
-    """[s]"""
+    """Times of the scans [s]."""
     direct: Float[np.ndarray, " k"] = field(default_factory=lambda: np.empty(0))
-    """World bearing of the caller itself, or NaN."""
+    """World bearing of the direct call [rad], or NaN."""
     rows: tuple[Float[np.ndarray, "r 5"], ...] = ()
-    """Of each scan number of the track, world bearing, excess path, and their deviations."""
+    """For each scan: track number, world bearing, excess path, and their standard deviations."""
     last: Float[np.ndarray, "t 3 8"] = field(default_factory=lambda: np.empty((0, SIGHTINGS, 8)))
-    """Last sightings of each track, the newest first; NaN before the first."""
+    """Last sightings of each track, newest first; NaN before the first."""
 
 
 def followed(
     tracks: Tracks, time: float, pose: Float[np.ndarray, "3"], direct: float, rows: Rows
 ) -> Tracks:
-    """Return tracks with one scan more.
-
-    ``direct``: bearing of the caller's own call, or NaN.
-    """
+    """Extend tracks by the measurements of a scan; ``direct``: direct bearing, or NaN."""
     now, (x, y, heading) = len(tracks.poses), pose
     ones = np.ones(len(rows.bearing))
     seen = np.column_stack(
@@ -80,14 +77,11 @@ def _costs(
     last: Float[np.ndarray, "t 3 8"],
     here: tuple[int, float, float],
 ) -> Float[np.ndarray, "m t"]:
-    """Return what it costs that a row continues a track; infinite where it does not.
-
-    ``here``: number of the scan, and where the vehicle is.
-    """
+    """Return the cost of continuing each track by each measurement; infinite beyond the gate."""
     latest, earlier, (now, x, y) = last[:, 0], last[:, -1], here
     scans = now - latest[:, SCAN]
     gone = np.hypot(x - latest[:, X], y - latest[:, Y])
-    even = now - earlier[:, SCAN] <= EVEN  # not where NaN
+    even = now - earlier[:, SCAN] <= EVEN  # False where NaN
     share = np.where(even, scans / (latest[:, SCAN] - earlier[:, SCAN]), 0.0)
     turned = wrap(latest[:, BEARING] - earlier[:, BEARING])
     bearing = latest[:, BEARING] + np.where(even, share * turned, 0.0)
@@ -106,10 +100,7 @@ def _costs(
 def in_window(
     tracks: Tracks, scans: int, sightings: int
 ) -> tuple[Float[np.ndarray, "t k 4"], Float[np.ndarray, "k 3"], Float[np.ndarray, " k"]]:
-    """Return the last scans of the tracks that were seen so often in them, poses and direct calls.
-
-    A track has NaN where it was not seen.
-    """
+    """Return tracks with enough recent sightings (NaN if missed), poses and direct bearings."""
     window = tracks.rows[-scans:]
     table = np.full((len(tracks.last), len(window), 4), np.nan)
     for k, rows in enumerate(window):

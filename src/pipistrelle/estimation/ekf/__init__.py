@@ -1,1 +1,1 @@
-"""EKF-SLAM: `filter` corrects one Gaussian over pose and map; `gaussian` holds its kernels."""
+"""EKF-SLAM: `filter` updates a Gaussian over pose and map; `gaussian` holds its kernels."""

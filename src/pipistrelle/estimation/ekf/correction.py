@@ -1,19 +1,16 @@
-r"""Correction of one Gaussian over a pose and the members of all landmarks by a scan.
+r"""EKF update of a joint Gaussian over pose and hypotheses by the measurements of a scan.
 
-Measurements are used one by one, each at the current mean. Landmarks of the map come first, in
-the order of the scan. New landmarks are then placed from the corrected pose. Last, excess paths
-correct what is placed and weigh the members of rays (`tdoa_frame`). A bearing that has placed a
-landmark together with an excess path is not used a second time.
+Measurements are applied in sequence, each linearised at the current mean: first mapped landmarks,
+then new landmarks from the updated pose, last the excess paths (`tdoa`). A bearing that initialised
+a landmark together with an excess path is not used again.
 
-Merging of ray members that agree.
-
-Bearings may draw two members of a ray to the same place. They then explain all that follows alike:
-neither is ever pruned, and the landmark stays a ray. So neighbours whose distance d is within a
-limit of their mean covariance P,
+**Merging of hypotheses** (`merge_members`). Hypotheses of a ray that converge to a point fit all
+further bearings equally, and would never be pruned. Neighbours at a distance d within a limit of
+their mean covariance P,
 
 .. math:: d^T P^{-1} d \le \text{limit}^2,
 
-become one, with mean and covariance of their mixture and its covariances with all else:
+are replaced by the mean and covariance of their mixture, and its covariances with the state x:
 
 .. math:: m = w_a m_a + w_b m_b, \quad
           P_{mx} = w_a P_{ax} + w_b P_{bx}, \quad
@@ -92,8 +89,8 @@ from pipistrelle.jit import Flag, Whole, kernel, no_alloc, no_alloc_inlined
 
 @no_alloc
 def merge_members(state: State, first: Whole, count: Whole, limit: float, scratch: Scratch) -> None:
-    """Merge neighbours of a ray that agree, from near to far."""
-    kept, last = 0, 0  # the member that is kept last, into which the next may go
+    """Merge neighbouring hypotheses of a ray that agree, from near to far."""
+    kept, last = 0, 0  # last: hypothesis into which the next may be merged
     for j in range(count):
         scratch.keep[j] = j == 0 or not _agree(state, first + last, first + j, limit)
         if scratch.keep[j]:
@@ -106,7 +103,7 @@ def merge_members(state: State, first: Whole, count: Whole, limit: float, scratc
 
 @no_alloc
 def _agree(state: State, one: Whole, other: Whole, limit: float) -> Flag:
-    """Tell whether the distance of two members is within the limit of their mean covariance."""
+    """Return whether the distance of two hypotheses is within a limit of their mean covariance."""
     joint, size = state.joint, 3 + 2 * state.members[0]
     i, j = 3 + 2 * one, 3 + 2 * other
     ax, ay = point_rows(joint, size, i)
@@ -118,7 +115,7 @@ def _agree(state: State, one: Whole, other: Whole, limit: float) -> Flag:
 
 @no_alloc
 def _merge(state: State, one: Whole, other: Whole) -> None:
-    """Replace the first of two members by their mixture."""
+    """Replace the first of two hypotheses by their mixture."""
     joint, weight, size = state.joint, state.weight, 3 + 2 * state.members[0]
     flush(joint, size)
     mean, P, i, j = joint.mean, joint.covariance, 3 + 2 * one, 3 + 2 * other
@@ -142,7 +139,7 @@ def _merge(state: State, one: Whole, other: Whole) -> None:
 def _correct_ray(
     state: State, first: Whole, count: Whole, row: Row, params: UpdateParams, scratch: Scratch
 ) -> Whole:
-    """Weigh a ray's members by a bearing and share it among them; GATED if outside all gates."""
+    """Weigh a ray's hypotheses by a bearing and share it among them; GATED if outside all gates."""
     joint, mean, size = state.joint, state.joint.mean, 3 + 2 * state.members[0]
     weight, outcome = state.weight[first:], GATED
     bearing, variance = row.bearing, row.bearing_variance
@@ -170,7 +167,7 @@ def _correct_ray(
 def _leave_one(
     state: State, first: Whole, count: Whole, row: Row, params: UpdateParams, scratch: Scratch
 ) -> None:
-    """Give a ray its range, by a reading of `rays.ranged` that leaves one member."""
+    """Reduce a ray to a single hypothesis by its first range, as ``rays.ranged`` selects."""
     left = 0 if params.ranged == ANEW else heaviest_member(state.weight[first:], count)
     for j in range(count):
         scratch.keep[j] = j == left
@@ -195,7 +192,7 @@ def _leave_one(
 
 @no_alloc
 def _move_to_range(joint: Joint, i: Whole, distance: float) -> None:
-    """Move the mean of the member at state index i to a range, in its present direction."""
+    """Move the hypothesis at state index i to a range, keeping its bearing."""
     mean = joint.mean
     _, _, c, s, _ = observe(mean[0], mean[1], mean[2], mean[i], mean[i + 1])
     mean[i], mean[i + 1] = mean[0] + distance * c, mean[1] + distance * s
@@ -205,7 +202,7 @@ def _move_to_range(joint: Joint, i: Whole, distance: float) -> None:
 def _correct_ranged_ray(
     state: State, first: Whole, count: Whole, row: Row, params: UpdateParams, scratch: Scratch
 ) -> Whole:
-    """Correct a ray with range and bearing as `rays.ranged` says; return GATED or APPLIED."""
+    """Update a ray with range and bearing as ``rays.ranged`` selects; return GATED or APPLIED."""
     if params.ranged < BEARING:
         _leave_one(state, first, count, row, params, scratch)
         return APPLIED
@@ -226,7 +223,7 @@ def _correct_ranged_ray(
 def _correct_partial(
     state: State, first: Whole, count: Whole, row: Row, params: UpdateParams, scratch: Scratch
 ) -> Whole:
-    """Correct a ray with a bearing, prune and merge it; return GATED or APPLIED."""
+    """Update a ray with a bearing, prune and merge it; return GATED or APPLIED."""
     if _correct_ray(state, first, count, row, params, scratch) == GATED:
         return GATED
     kept = survivors(state.weight[first:], count, params.prune, scratch.keep)
@@ -241,11 +238,7 @@ def _correct_partial(
 def _correct_precisely(
     state: State, first: Whole, count: Whole, row: Row, params: UpdateParams, scratch: Scratch
 ) -> Whole:
-    """Cross a waiting bearing, or correct a ray with a precise one; return GATED or APPLIED.
-
-    An earlier, coarser bearing made the ray: its members are not linear enough for the new one,
-    whose variance is raised to what they allow.
-    """
+    """Cross a stored bearing, or update a ray, with a precise bearing; return GATED or APPLIED."""
     if state.weight[first] != WAITING_WEIGHT:
         variance = member_linearity(params) ** 2
         coarse = Row(row.landmark, row.bearing, row.range, variance, row.range_variance)
@@ -260,7 +253,7 @@ def _correct_precisely(
 def _correct_placed(
     state: State, first: Whole, row: Row, params: UpdateParams, scratch: Scratch
 ) -> Whole:
-    """Correct a placed landmark and add up its innovations; return GATED or APPLIED."""
+    """Update an initialised landmark and accumulate its innovations; return GATED or APPLIED."""
     joint, size, i = state.joint, 3 + 2 * state.members[0], 3 + 2 * first
     distance, bearing, variance = row.range, row.bearing, row.bearing_variance
     if math.isnan(distance):
@@ -281,7 +274,7 @@ def _correct_placed(
 
 @no_alloc
 def _correct_known(state: State, row: Row, params: UpdateParams, scratch: Scratch) -> Whole:
-    """Correct with one measurement of a mapped landmark; return GATED or APPLIED."""
+    """Update with a measurement of a mapped landmark; return GATED or APPLIED."""
     first, count = members_of(state.landmark, state.members[0], row.landmark)
     if params.robust and state.weight[first] != WAITING_WEIGHT:
         row = inflated(state, first, count, row)
@@ -297,10 +290,9 @@ def _correct_known(state: State, row: Row, params: UpdateParams, scratch: Scratc
 
 @no_alloc
 def _add_new(state: State, row: Row, params: UpdateParams, moves: bool) -> None:
-    """Append a measurement's landmark: one member, or a ray (Eqs. (16) to (18)).
+    """Append a measurement's landmark: one hypothesis, or a ray (Eqs. (16) to (18)).
 
-    Bearings of a moving caller come from different places, so it becomes a ray, however precise
-    they are.
+    A moving caller becomes a ray even by a precise bearing, as its bearings do not cross.
     """
     joint, passive, across = state.joint, math.isnan(row.range), row.bearing_variance
     if passive and is_precise(row, params):
@@ -328,10 +320,7 @@ def _take_in(
     params: UpdateParams,
     scratch: Scratch,
 ) -> Whole:
-    """Correct with landmarks of the map, then append new ones; return how many rows were gated.
-
-    Where a scan has excess paths, they place landmarks first, and the others are used last.
-    """
+    """Update mapped landmarks, then append new landmarks; return the number of gated rows."""
     gated = 0
     for m in range(heard.landmark.size):
         if known[m]:
@@ -368,10 +357,9 @@ def corrected(
     params: UpdateParams,
     turns: float,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, Whole, float, float]:
-    """Correct, prune and extend a copy of an `EkfBelief`.
+    """Update, prune and extend a copy of the arrays of an `EkfBelief`.
 
-    Returns its four arrays, how many rows were gated, and the two numbers of `beliefs.Innovations`.
-    ``turns`` is LINEAR or INVARIANT, as in `Joint`.
+    Returns its arrays, the number of gated measurements, and the numbers of `beliefs.Innovations`.
     """
     heard = measurements(columns)
     members, rows = old_landmark.size, heard.landmark.size

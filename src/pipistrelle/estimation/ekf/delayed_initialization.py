@@ -1,28 +1,25 @@
-r"""Delayed initialization: precise bearings wait until a second one crosses them.
+r"""Delayed initialization: store precise bearings until a second bearing crosses them.
 
-**A bearing waits.** A landmark that is first heard by a bearing too precise for the members of a
-ray (`is_precise`) enters the state as two points: :math:`p_0`, from which it was heard, and q, a
-point in its direction. The filter keeps both, correlated with all else, like any other points. No
-range is guessed. When a later bearing, in the direction u from p, crosses the line,
+**Stored bearings.** A landmark first measured by a bearing too precise for ray hypotheses
+(`is_precise`) enters the state as two points: :math:`p_0`, the position of the vehicle, and q, a
+point in the direction of the bearing, both correlated with the state. When a later bearing, in the
+direction u from p, crosses this line,
 
 .. math:: l = p + r u, \quad r = \frac{n \cdot (p_0 - p)}{n \cdot u}, \quad n \perp q - p_0,
 
-the landmark is placed there, if the crossing is in front of both poses and the standard deviation
-of r is at most a fifth of r: the position of a farther landmark would be no Gaussian. Until then
-its bearings are not used. The covariance of l follows from the derivative
+the landmark is initialised there, if the crossing is in front of both poses and the standard
+deviation of r is at most r / 5, beyond which the position is not Gaussian. Bearings before that are
+not used. The covariance of l follows from
 
 .. math:: n \cdot u\, dr = n \cdot \left( (1 - t) dp_0 + t\, dq - dp \right)
           - r (n \cdot u_\perp)(d\theta + d\phi)
 
-with t the crossing's place on the first ray in units of :math:`|q - p_0|`.
+with t the position of the crossing on the first ray in units of :math:`|q - p_0|`.
 
 **Second order.** Let :math:`P_{aa}, P_{cc}, P_{ac}` be the covariance of a landmark relative to
-the vehicle, along and across the line of sight. To second order its bearing is off by
-:math:`-P_{ac}/r^2`, with the additional variance :math:`(P_{aa} P_{cc} + P_{ac}^2)/r^4`
-(Bar-Shalom, Li & Kirubarajan 2001, Sec. 10.3.2). A precise bearing is corrected by the first, and
-its R is increased by the second.
-
-The members of one landmark: their place in the state, and arrays to work on them.
+the vehicle, along and across the line of sight. Its bearing then has a bias of
+:math:`-P_{ac}/r^2` and the additional variance :math:`(P_{aa} P_{cc} + P_{ac}^2)/r^4`
+(Bar-Shalom, Li & Kirubarajan 2001, Sec. 10.3.2), for which precise bearings are corrected.
 """
 
 import math
@@ -38,18 +35,18 @@ from pipistrelle.jit import Whole, kernel, no_alloc
 
 
 class Scratch(NamedTuple):
-    """Arrays to work on the members of one landmark, and on the order of the state's numbers."""
+    """Workspace for the hypotheses of a landmark and the order of the state."""
 
     likelihood: Float[np.ndarray, " m"]
     share: Float[np.ndarray, " m"]
     keep: Bool[np.ndarray, " m"]
     source: Int[np.ndarray, " n"]
-    innovations: Float[np.ndarray, "2"]  # adds up the two numbers of `beliefs.Innovations`
+    innovations: Float[np.ndarray, "2"]  # accumulates the two numbers of `beliefs.Innovations`
 
 
 @kernel
 def scratch_for(members: Whole) -> Scratch:
-    """Allocate arrays for so many members."""
+    """Allocate a workspace for a number of hypotheses."""
     return Scratch(
         np.empty(members),
         np.empty(members),
@@ -63,7 +60,7 @@ def scratch_for(members: Whole) -> Scratch:
 def members_of(
     landmark: Int[np.ndarray, " h"], members: Whole, label: Whole
 ) -> tuple[Whole, Whole]:
-    """Return the index of a landmark's first member, and how many it has (0: not in the map)."""
+    """Return the index of a landmark's first hypothesis, and their number (0: not in the map)."""
     for first in range(members):
         if landmark[first] == label:
             last = first + 1
@@ -74,32 +71,32 @@ def members_of(
 
 
 WAITING_WEIGHT = -1.0
-"""Weight of the two points of a bearing that waits."""
+"""Weight that marks the two points of a stored bearing."""
 MAX_RELATIVE_RANGE_STD = 0.2
-"""A landmark is placed if its range has at most this standard deviation, divided by the range."""
+"""Largest standard deviation of the range of a crossing, relative to the range."""
 PARALLEL_SINE = 1e-9
-"""Two bearings with a smaller sine of their angle do not cross."""
+"""Sine of the angle below which two bearings count as parallel."""
 MIN_CROSSING_SINE = 0.35
-"""The same where bearings may be off by more than they say, by degrees at times: of many bearings
-such ones would seem to cross first."""
+"""Least sine of a crossing angle with the robust setting, where bearings may have gross errors:
+many bearings of small angle would seem to cross at once."""
 
 
 @no_alloc
 def member_linearity(params: UpdateParams) -> float:
-    """Return the error [rad] of the linearised bearing of a ray's member seen from the side."""
+    """Return the linearisation error [rad] of the bearing of a ray hypothesis from the side."""
     share = params.ray_stds[0] / params.ray_ranges[0]
     return 0.5 * share * share
 
 
 @no_alloc
 def is_precise(row: Row, params: UpdateParams) -> bool:
-    """Tell whether a bearing is too precise for ray members, if such bearings are to wait."""
+    """Return whether a bearing is too precise for ray hypotheses and must be stored."""
     return params.sharing == FITTED and row.bearing_variance < member_linearity(params) ** 2
 
 
 @no_alloc
 def second_order_bearing(joint: Joint, size: Whole, i: Whole, row: Row) -> tuple[float, float]:
-    """Return the bearing of the member at i without second-order bias, and its larger variance."""
+    """Return a bearing without second-order bias, and its larger variance, for the point at i."""
     mean = joint.mean
     _, _, c, s, k = observe(mean[0], mean[1], mean[2], mean[i], mean[i + 1])
     xx, xy, yy = relative_covariance(joint, size, i)
@@ -113,7 +110,7 @@ def second_order_bearing(joint: Joint, size: Whole, i: Whole, row: Row) -> tuple
 
 @no_alloc
 def add_waiting_bearing(state: State, row: Row, params: UpdateParams) -> None:
-    """Append two points: where a bearing was heard from, and a point in its direction."""
+    """Append the two points of a stored bearing: vehicle position, and a point in its direction."""
     through = params.ray_ranges[params.ray_ranges.size // 2]
     for ahead in (0.0, through):
         member = state.members[0]
@@ -127,10 +124,9 @@ def add_waiting_bearing(state: State, row: Row, params: UpdateParams) -> None:
 def _from_vehicle(
     joint: Joint, i: Whole, direction: float
 ) -> tuple[float, float, float, float, float]:
-    """Cross a direction from the vehicle with the ray through the points at i and i + 2.
+    """Intersect a direction from the vehicle with the line through the points at i and i + 2.
 
-    Returns the normal (2) of that ray, the sine of the angle between them, r, and t in units of
-    |q - p0|.
+    Returns the line's normal (2), the sine of the angle, and r and t of the module docstring.
     """
     mean = joint.mean
     x, y = mean[i + 2] - mean[i], mean[i + 3] - mean[i + 1]
@@ -149,9 +145,9 @@ def _from_vehicle(
 def _range_row(
     joint: Joint, size: Whole, i: Whole, normal: tuple[float, float, float], t: float, lever: float
 ) -> float:
-    """Write covariances of r with the state into W[0]; return its variance without the bearing's.
+    """Write covariances of r with the state to W[0]; return its variance without the bearing's.
 
-    ``normal`` is n and n . u, ``lever`` is the derivative of r by the direction.
+    ``normal`` is n and n . u, ``lever`` the derivative of r by the direction.
     """
     P, w, (nx, ny, sine) = joint.covariance, joint.W[0], normal
     turn = lever * joint.turns
@@ -166,10 +162,9 @@ def _range_row(
 
 @no_alloc
 def place_at_crossing(state: State, first: Whole, row: Row, robust: bool) -> bool:
-    """Place a landmark where a bearing crosses the waiting one, if that is sure; tell if it was.
+    """Initialise a landmark at the crossing of two bearings; return False if it is too uncertain.
 
-    It replaces the first of the two points; the caller drops the second. With ``robust`` the two
-    bearings must cross at a larger angle.
+    It replaces the first stored point; the caller drops the second. ``robust``: larger angles only.
     """
     joint, size, i = state.joint, 3 + 2 * state.members[0], 3 + 2 * first
     mean, direction = joint.mean, joint.mean[2] + row.bearing
@@ -202,9 +197,9 @@ def _take_place(
     range_variance: float,
     bearing_variance: float,
 ) -> None:
-    """Write the rows of a landmark at p + r u over those of the point at index i.
+    """Write the covariances of a landmark at p + r u over the first stored point, at index i.
 
-    They follow dl = dp + u dr + r u' (turns dtheta + dphi), where u' is u turned left.
+    They follow dl = dp + u dr + r u' (turns dtheta + dphi), with u' perpendicular to u.
     """
     P, (ux, uy, r, lever) = joint.covariance, crossing
     w, x, y = joint.W[0], joint.W[1], joint.W[2]
@@ -212,7 +207,7 @@ def _take_place(
     for a in range(size):
         x[a] = P[0, a] + ux * w[a] + gx * P[2, a]
         y[a] = P[1, a] + uy * w[a] + gy * P[2, a]
-    rx = w[0] + ux * range_variance + gx * w[2]  # of r with the landmark
+    rx = w[0] + ux * range_variance + gx * w[2]  # covariance of r with the landmark
     ry = w[1] + uy * range_variance + gy * w[2]
     bx, by = ux * lever - r * uy, uy * lever + r * ux
     xx = x[0] + ux * rx + gx * x[2] + bx * bx * bearing_variance

@@ -1,34 +1,27 @@
-r"""EKF-SLAM with rays: one Gaussian over the pose and every landmark hypothesis.
+r"""EKF-SLAM and right-invariant EKF-SLAM with rays, moving callers, and removal of landmarks.
 
-The state is the pose and, two numbers each, the members of all landmarks,
+The state contains the pose and, two numbers each, the hypotheses of all landmarks,
 
 .. math:: \hat X = [\hat x_v, \hat y_v, \hat\theta_v, \hat x_1, \hat y_1, \dots,
           \hat x_h, \hat y_h]^T
    :label: eq-8
 
-(Eq. (8); the correspondence is constant and known, and no part of it). `correction` corrects it
-with a scan. A moving caller has its velocity there, too (`caller_motion`). The covariance is that
-of the linear or of the right-invariant error (`invariant_error`).
+(Eq. (8); the correspondence is known, and no part of it). `correction` updates it with a scan. The
+covariance is of the linear or the right-invariant error (`invariant_error`).
 
-Landmarks that are taken out of an EKF's state, and two that become one.
-
-Two placed landmarks that are one are a measurement: their difference :math:`d = l_k - l_g` is 0, up
+**Merging landmarks** (`merged`) is a measurement of their difference :math:`d = l_k - l_g` as 0, up
 to `MERGED_STD`. With :math:`H = (\dots, I, \dots, -I, \dots)` and S = H P H^T + R = L L^T,
 
 .. math:: W = P H^T L^{-T}, \qquad \hat X \leftarrow \hat X - W L^{-1} d, \qquad
           P \leftarrow P - W W^T ,
 
-and then the second is dropped. The invariant error has the same H: that d is 0 is true of the map
-however it is turned, so it says nothing of the heading, and the mean moves by the exponential.
-Where d is beyond what S admits (`FARTHEST`), wrong rows have placed one of the two: their
-difference then tells nothing of the rest, and the second is dropped alone.
+and the second landmark is dropped. The invariant error has the same H, without a heading column. If
+d exceeds the gate (`FARTHEST`), a wrong association has displaced a landmark, and the second is
+dropped without the update.
 
-Right-invariant EKF-SLAM: EKF-SLAM that keeps another error (`ekf.invariant_error`).
-
-Callers that move, in the state of an EKF: a place, or a ray of them, and a velocity.
-
-How a caller drives is not known. Its velocity is taken for a random walk of spectral density
-:math:`q = \sigma^2`, along each axis alike: in a time T
+**Moving callers** (`propagate_callers`) have a velocity in the state, under a separate label
+(`velocity_of`), common to all hypotheses of the caller. It is a random walk of spectral density
+:math:`q = \sigma^2` along each axis; in a time T
 
 .. math:: \begin{bmatrix} b \\ v \end{bmatrix} \leftarrow
           \begin{bmatrix} I & T I \\ 0 & I \end{bmatrix}
@@ -36,15 +29,10 @@ How a caller drives is not known. Its velocity is taken for a random walk of spe
           \operatorname{cov} w = q \begin{bmatrix} \tfrac13 T^3 I & \tfrac12 T^2 I \\
           \tfrac12 T^2 I & T I \end{bmatrix}
 
-(Bar-Shalom, Li & Kirubarajan 2001, Sec. 6.2.2: white noise acceleration). The velocity stands in
-the state as two numbers more, like a point, under a label of its own (`velocity_of`); all members
-of a caller's ray have it in common. It is never measured: what is heard of the caller's place
-tells it. So it begins as nothing but its spread.
-
-The right-invariant error treats it as it treats a point, and means the same: of
-:math:`v = R(\xi_\theta)\,\hat v + V(\xi_\theta)\,\xi_v` and the like for b follows
-:math:`\xi_b \leftarrow \xi_b + T \xi_v`, whatever the heading, and noise that is alike along both
-axes stays so when it is turned. Both EKFs share what is here.
+(Bar-Shalom, Li & Kirubarajan 2001, Sec. 6.2.2: white noise acceleration). The invariant error
+transforms velocities like points: from :math:`v = R(\xi_\theta)\,\hat v + V(\xi_\theta)\,\xi_v` and
+the like for b follows :math:`\xi_b \leftarrow \xi_b + T \xi_v` for any heading, and isotropic noise
+is invariant to rotation, so that both filters share this step.
 """
 
 import math
@@ -87,12 +75,12 @@ from pipistrelle.estimation.rays import update_params
 from pipistrelle.jit import Flag, Whole, kernel
 
 _NOBODY, _SUM = UNLABELLED, UNLABELLED - 1
-"""Labels are from 0 on; those of a caller and of its velocity add up to ``_SUM``."""
+"""Largest label of no landmark; sum of the labels of a caller and of its velocity."""
 
 
 @kernel
 def velocity_of(label: Whole) -> Whole:
-    """Label of the velocity of a caller; of a velocity's label, the caller's.
+    """Return the label of a caller's velocity, or of a velocity's caller.
 
     >>> velocity_of(51), velocity_of(velocity_of(51))
     (-53, 51)
@@ -101,13 +89,13 @@ def velocity_of(label: Whole) -> Whole:
 
 
 def is_velocity(landmark: Int[np.ndarray, " h"]) -> Bool[np.ndarray, " h"]:
-    """Return a mask of the rows of a state that are velocities, not places."""
+    """Return which entries of a state are velocities."""
     return landmark < _NOBODY
 
 
 @kernel
 def has_velocities(landmark: Int[np.ndarray, " h"]) -> Flag:
-    """Tell whether any row of a state is a velocity."""
+    """Return whether a state contains velocities."""
     least = 0
     for label in landmark:
         least = min(least, label)
@@ -115,7 +103,7 @@ def has_velocities(landmark: Int[np.ndarray, " h"]) -> Flag:
 
 
 def is_standing(landmark: Int[np.ndarray, " h"]) -> Bool[np.ndarray, " h"]:
-    """Return a mask of the rows that are neither callers that move nor their velocities.
+    """Return which entries of a state are neither moving callers nor their velocities.
 
     >>> is_standing(np.array([4, 51, -53]))
     array([ True, False, False])
@@ -129,7 +117,7 @@ def is_standing(landmark: Int[np.ndarray, " h"]) -> Bool[np.ndarray, " h"]:
 def missing_velocities(
     landmark: Int[np.ndarray, " h"], moving: Int[np.ndarray, " v"]
 ) -> Int[np.ndarray, " n"]:
-    """Return the labels of the velocities that the moving callers of a state still lack.
+    """Return the velocity labels that moving callers of a state still lack.
 
     >>> missing_velocities(np.array([51, 52, -53]), np.array([52]))
     array([-54])
@@ -146,7 +134,7 @@ def propagate_callers(
     seconds: float,
     walk_std: float,
 ) -> None:
-    """Move all callers through a time [s], in place; ``walk_std``: of a velocity after 1 s."""
+    """Predict moving callers over a time [s], in place; ``walk_std``: velocity std after 1 s."""
     q, size = walk_std * walk_std, mean.size
     for velocity in range(landmark.size):
         if landmark[velocity] >= _NOBODY:
@@ -175,9 +163,9 @@ def propagate_callers(
 
 
 MERGED_STD = 1e-3
-"""Standard deviation of the difference of two landmarks that are one, along each axis [m]."""
+"""Standard deviation of the difference of merged landmarks along each axis [m]."""
 FARTHEST = 100.0
-"""Largest squared distance of two that are one to be a measurement."""
+"""Largest squared distance of merged landmarks to update the state."""
 
 State = tuple[
     Float[np.ndarray, " d"],
@@ -185,26 +173,25 @@ State = tuple[
     Int[np.ndarray, " h"],
     Float[np.ndarray, " h"],
 ]
-"""Mean, covariance, and of each member its landmark's label and its weight, as `EkfBelief` has
-them."""
+"""Mean, covariance, and each hypothesis' label and weight, as in `EkfBelief`."""
 
 
 @kernel
 def is_placed(landmark: Int[np.ndarray, " h"]) -> Bool[np.ndarray, " h"]:
-    """Return a mask of the members that are a landmark's or a caller's only one.
+    """Return which hypotheses are their landmark's or caller's only hypothesis.
 
     >>> is_placed(np.array([4, 7, 7, 51, -53]))
     array([ True, False, False,  True, False])
     """
     placed = landmark >= 0
     for n in range(1, landmark.size):
-        if landmark[n] == landmark[n - 1]:  # the members of a landmark are neighbours
+        if landmark[n] == landmark[n - 1]:  # hypotheses of a landmark are contiguous
             placed[n - 1] = placed[n] = False
     return placed
 
 
 def removed(state: State, label: int) -> State:
-    """Return a state without the members of a landmark, and without its velocity if it moves."""
+    """Remove a landmark's hypotheses from a state, with its velocity if it moves."""
     return _left(*state, _present(state[2], label))
 
 
@@ -216,7 +203,7 @@ def _left(
     weight: Float[np.ndarray, " h"],
     label: Whole,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Return what is left of a state without a landmark."""
+    """Remove a landmark from the arrays of a state."""
     kept = np.flatnonzero((landmark != label) & (landmark != velocity_of(label)))
     left, P = np.empty(3 + 2 * kept.size), np.empty((3 + 2 * kept.size, 3 + 2 * kept.size))
     at = np.arange(left.size)
@@ -230,10 +217,9 @@ def _left(
 
 
 def merged(state: State, kept: int, gone: int, error: float) -> State:
-    """Return a state in which two landmarks that stand are one, under the label of the first.
+    """Merge two fixed landmarks of a state under the label of the first.
 
-    Of a placed one and a ray the placed one stays, of two rays the first. `error`: as in
-    `EkfBelief`.
+    An initialised landmark replaces a ray; of two rays the first remains.
     """
     landmark = state[2]
     standing = is_standing(landmark)
@@ -256,7 +242,7 @@ def merged(state: State, kept: int, gone: int, error: float) -> State:
 def _equated(
     mean: Float[np.ndarray, " d"], P: Float[np.ndarray, "d d"], k: Whole, g: Whole, error: float
 ) -> tuple[Float[np.ndarray, " d"], Float[np.ndarray, "d d"]]:
-    """Correct mean and covariance by the measurement that the points at two indices are one."""
+    """Update mean and covariance by the constraint that two points coincide."""
     w0, w1 = P[:, k] - P[:, g], P[:, k + 1] - P[:, g + 1]
     a = math.sqrt(w0[k] - w0[g] + MERGED_STD * MERGED_STD)
     b = (w0[k + 1] - w0[g + 1]) / a
@@ -279,7 +265,7 @@ def _equated(
 
 
 def _present(landmark: Int[np.ndarray, " h"], label: int) -> int:
-    """Return a label that is on the map; refuse any other."""
+    """Return a label that is on the map; raise InputError for others."""
     if label < 0 or label not in landmark:
         raise InputError(f"association: found landmark {label} to change, which is not on the map")
     return label
@@ -287,31 +273,31 @@ def _present(landmark: Int[np.ndarray, " h"], label: int) -> int:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class EkfBelief:
-    r"""A joint Gaussian over pose x and members m (Bradley & Abaid, Eqs. (8) and (9)).
+    r"""A joint Gaussian over pose x and landmark hypotheses m (Bradley & Abaid, Eqs. (8) and (9)).
 
     .. math:: P = \begin{bmatrix} P_{xx} & P_{xm} \\ P_{mx} & P_{mm} \end{bmatrix}
        :label: eq-9
     """
 
     mean: Float[np.ndarray, " d"]
-    """(3 + 2h): x, y [m] from the origin, heading [rad]; then x, y [m] of each member."""
+    """(3 + 2h): x, y [m] from the origin, heading [rad]; then x, y [m] of each hypothesis."""
     covariance: Float[np.ndarray, "d d"]
-    """Of the error that `error` names, in the same order."""
+    """Covariance of the error that `error` selects, in the same order."""
     landmark: Int[np.ndarray, " h"]
-    """Label of each member; the members of a ray stand together, near to far. A moving caller has a
-    member more, its velocity [m/s], with another label (`caller_motion.velocity_of`)."""
+    """Label of each hypothesis; a ray's are contiguous, near to far. A moving caller also has an
+    entry for its velocity [m/s], with another label (`velocity_of`)."""
     weight: Float[np.ndarray, " h"]
-    """Aggregated likelihood of each member within its landmark; `WAITING_WEIGHT` for the two points
-    of a bearing that waits to be crossed."""
+    """Aggregated likelihood of each hypothesis within its landmark; `WAITING_WEIGHT` for stored
+    bearings."""
     gated: int
-    """Measurements rejected so far."""
+    """Number of gated measurements so far."""
     innovations: Innovations = NO_INNOVATIONS
     error: float = LINEAR
-    """`gaussian.LINEAR` or `gaussian.INVARIANT`."""
+    """Error definition: `gaussian.LINEAR` or `gaussian.INVARIANT`."""
     doubt: float = 0.0
-    """Evidence that the odometry has failed (`estimation.recovery`)."""
+    """Evidence for failed odometry (`estimation.recovery`)."""
     origin: Float[np.ndarray, "2"] = field(default_factory=lambda: np.zeros(2))
-    """Where the vehicle started [m], for the invariant error; (0, 0) for the linear one."""
+    """Start position [m] for the invariant error; (0, 0) for the linear error."""
 
     def pose(self) -> Gaussian:
         """Return the vehicle's pose, (3) and (3, 3), with the covariance of the linear error."""
@@ -324,23 +310,20 @@ class EkfBelief:
         return Gaussian(mean=mean, covariance=linear, invariant=True)
 
     def landmarks(self) -> Landmarks:
-        """Return the map, one row per member."""
+        """Return the map of fixed landmarks, one row per hypothesis."""
         return self.rows(is_standing(self.landmark))
 
     def moving(self) -> Landmarks:
-        """Return the callers that move, one row per member."""
+        """Return the moving callers, one row per hypothesis."""
         return self.rows(~is_standing(self.landmark) & ~is_velocity(self.landmark))
 
     def rows(self, kept: Bool[np.ndarray, " h"]) -> Landmarks:
-        """Return some members with the covariance of the linear error, a landmark's together."""
+        """Return selected hypotheses with covariances of the linear error."""
         mean, covariance = self._linear(kept, with_pose=False)
         return _map_of(self.landmark[kept], self.weight[kept], mean.reshape(-1, 2), covariance)
 
     def joint(self, among: Int[np.ndarray, " n"] | None = None) -> JointGaussian:
-        """Return pose and placed landmarks together, callers that move among them.
-
-        ``among``: labels of the only landmarks that are returned.
-        """
+        """Return the joint Gaussian of pose, initialised landmarks and moving callers."""
         placed = is_placed(self.landmark)
         if among is not None:
             placed &= np.isin(self.landmark, among)
@@ -350,16 +333,16 @@ class EkfBelief:
     def _linear(
         self, kept: Bool[np.ndarray, " h"], *, with_pose: bool
     ) -> tuple[Float[np.ndarray, " k"], Float[np.ndarray, "k k"]]:
-        """Return mean and covariance of the linear error of some members (`linear_part`)."""
+        """Return mean and covariance of the linear error of selected hypotheses (`linear_part`)."""
         invariant = self.error == INVARIANT
         return linear_part(self.mean, self.covariance, self.origin, kept, with_pose, invariant)
 
     def labels(self) -> list[int]:
-        """Return the labels of all landmarks and callers, placed or not."""
+        """Return the labels of all landmarks and callers, initialised or not."""
         return sorted({*self.landmark[~is_velocity(self.landmark)].tolist()})
 
     def edited(self, remove: Sequence[int], merge: Sequence[tuple[int, int]]) -> "EkfBelief":
-        """Return the belief without some landmarks, and with others as one (`editing`)."""
+        """Return the belief with landmarks removed and merged."""
         state = (self.mean, self.covariance, self.landmark, self.weight)
         for kept, gone in merge:
             state = merged(state, kept, gone, self.error)
@@ -369,7 +352,7 @@ class EkfBelief:
         return replace(self, mean=mean, covariance=covariance, landmark=landmark, weight=weight)
 
     def freed(self, pose: Float[np.ndarray, "3"], stds: Float[np.ndarray, "3"]) -> "EkfBelief":
-        """Return the belief with the vehicle at a pose, with an independent error more."""
+        """Move the vehicle to a pose, with an independent error added."""
         here = np.append(pose[:2] - self.origin, pose[2])
         mean, P = np.append(here, self.mean[3:]), self.covariance.copy()
         noise = np.zeros((mean.size, 3))
@@ -390,10 +373,10 @@ def _map_of(
     mean: Float[np.ndarray, "h 2"],
     covariance: Float[np.ndarray, "d d"],
 ) -> Landmarks:
-    """Return a map, one row per member, from the joint covariance (2h, 2h) of all.
+    """Return a map, one row per hypothesis, from the joint covariance (2h, 2h).
 
-    A waiting bearing becomes two members of equal weight, half and twice as far as the point in its
-    direction, with standard deviations of half their range.
+    A stored bearing becomes two hypotheses of equal weight, at half and twice the distance of its
+    second point, with standard deviations of half their range.
     """
     members = len(mean)
     blocks, rows = covariance.reshape(members, 2, members, 2), np.arange(members)
@@ -412,7 +395,7 @@ def _map_of(
 def _with_points(
     belief: EkfBelief, known: Landmarks, by_state: Float[np.ndarray, "n d"]
 ) -> EkfBelief:
-    """Append members, with errors of their own and ``by_state`` times the error of the state."""
+    """Append points with errors ``by_state`` times the state's error, plus independent errors."""
     P, cross = belief.covariance, by_state @ belief.covariance
     own = np.zeros((len(by_state), len(by_state)))
     for row, covariance in enumerate(known.covariance):
@@ -427,7 +410,7 @@ def _with_points(
 
 
 def _with_velocities(belief: EkfBelief, moving: Int[np.ndarray, " v"], std: float) -> EkfBelief:
-    """Give each placed moving caller a velocity of 0, with a std [m/s] along each axis."""
+    """Add a velocity of 0, with a std [m/s] along each axis, for each moving caller without."""
     if moving.size == 0:
         return belief
     labels = missing_velocities(belief.landmark, moving)
@@ -447,8 +430,6 @@ def _with_velocities(belief: EkfBelief, moving: Int[np.ndarray, " v"], std: floa
 class EkfSlam:
     """EKF-SLAM (Bradley & Abaid, Sec. III-A) with rays (Sec. III-C).
 
-    Examples
-    --------
     >>> from pipistrelle.config import RayConfig
     >>> from pipistrelle.detection.scans import make_scan
     >>> motion = Motion(model="bicycle", control_std=(0.1, 0.03), wheelbase=0.2)
@@ -463,23 +444,23 @@ class EkfSlam:
     motion: Motion
     rays: RayConfig
     gate: float = 1.0
-    """A measurement outside this share of its predicted distribution (chi-square) is dropped; 1
-    drops none."""
+    """Gate: measurements outside this share of their predicted distribution (chi-square) are
+    discarded; 1 keeps all."""
     robust: bool = False
-    """Whether a measurement that surprises counts less (`estimation.ekf.huber`)."""
+    """Whether measurements of large innovation are down-weighted (Huber, `gaussian.inflated`)."""
     speed_std: float = 1.0
-    """Velocity [m/s] along an axis of a moving caller, before anything is known of it."""
+    """Initial standard deviation of a moving caller's velocity along each axis [m/s]."""
     walk_std: float = 0.2
-    """Random walk of that velocity: its standard deviation after 1 s [m/s]."""
+    """Standard deviation of the random walk of that velocity after 1 s [m/s]."""
     error: float = LINEAR
-    """The error that a first belief has: `gaussian.LINEAR` or `gaussian.INVARIANT`."""
+    """Error of the initial belief: `gaussian.LINEAR` or `gaussian.INVARIANT`."""
 
     def __post_init__(self) -> None:
-        """Refuse a gate that is no share."""
+        """Check that the gate is a probability."""
         check_gate(self.gate)
 
     def init(self, pose: Gaussian) -> EkfBelief:
-        """Return the belief that knows a pose, (3) and (3, 3), and no landmark."""
+        """Return the initial belief at a pose, (3) and (3, 3), without landmarks."""
         pose = usable_pose(pose)
         origin = np.zeros(2) if self.error == LINEAR else pose.mean[:2]
         return EkfBelief(
@@ -493,13 +474,11 @@ class EkfSlam:
         )
 
     def knowing(self, belief: EkfBelief, known: Landmarks) -> EkfBelief:
-        r"""Return a first belief that has landmarks in its map, one row each.
+        r"""Return the initial belief with known landmarks on its map.
 
-        Their places do not depend on the heading of the vehicle: an invariant error is
-        :math:`\xi_l = e_l - J\hat l\,\xi_\theta`, with their own errors e.
+        Their positions are independent of the vehicle's heading: their invariant error is
+        :math:`\xi_l = e_l - J\hat l\,\xi_\theta`, with independent errors e.
 
-        Examples
-        --------
         >>> motion = Motion(model="bicycle", control_std=(0.1, 0.03), wheelbase=0.2)
         >>> slam = EkfSlam(motion=motion, rays=RayConfig())
         >>> belief = slam.init(Gaussian(mean=np.zeros(3), covariance=np.eye(3)))
@@ -523,29 +502,15 @@ class EkfSlam:
         dt: Float[np.ndarray, " k"],
         rng: np.random.Generator | None = None,
     ) -> tuple[EkfBelief, Gaussian]:
-        r"""Carry the belief through the control steps of a frame.
+        r"""Predict the belief through the control steps of a frame (Bradley & Abaid, Eq. (10)).
 
         .. math:: \bar P_{xx} = F P_{xx} F^T + U Q U^T, \qquad
                   \bar P_{xm} = \bar P_{mx}^T = F P_{xm}
            :label: eq-10
 
-        with F and U the derivatives of the motion by the pose and by the control (Bradley & Abaid,
-        Eq. (10)).
-
-        Parameters
-        ----------
-        belief : EkfBelief
-        controls : (k, c)
-            As the motion model has them.
-        dt : (k) [s]
-        rng : Generator, optional
-            Not used: this filter draws nothing.
-
-        Returns
-        -------
-        belief : EkfBelief
-        poses : Gaussian of (k, 3) and (k, 3, 3)
-            After each step, with the covariance of the linear error.
+        with F and U the derivatives of the motion by the pose and by the control. ``controls`` (k,
+        c) are of the motion model, ``dt`` (k) [s]; ``rng`` is unused. Returns the belief, and the
+        pose after each step, (k, 3) and (k, 3, 3), with the covariance of the linear error.
         """
         check_belief(belief, EkfBelief)
         controls, dt = usable_controls(self.motion, controls, dt)
@@ -565,35 +530,20 @@ class EkfSlam:
     def update(
         self, belief: EkfBelief, scan: Scan, rng: np.random.Generator | None = None
     ) -> EkfBelief:
-        r"""Correct the belief with a frame's measurements.
+        r"""Update the belief with a frame's measurements (Bradley & Abaid, Eqs. (11), (16)-(21)).
 
         .. math:: K_i = \bar P H_i^T (H_i \bar P H_i^T + R)^{-1}, \qquad
                   \hat X = \bar X + K_i (z_i - \bar z_i), \qquad
                   \hat P = (I - K_i H_i) \bar P
            :label: eq-11
 
-        A landmark that is not in the map is placed where it was heard,
+        A new landmark is initialised at its measured range d and bearing :math:`\phi`,
 
         .. math:: \hat x_i = \hat x_v + d_i \cos(\phi_i + \hat\theta_v), \qquad
                   \hat y_i = \hat y_v + d_i \sin(\phi_i + \hat\theta_v)
            :label: eq-16
 
-        or, without a range, as a ray.
-
-        Parameters
-        ----------
-        belief : EkfBelief
-        scan : Scan
-        rng : Generator, optional
-            Not used: this filter draws nothing.
-
-        Returns
-        -------
-        EkfBelief
-
-        Notes
-        -----
-        Bradley & Abaid, Eqs. (11) and (16) to (21).
+        or, without a range, as a ray. ``rng`` is unused, as this filter is deterministic.
         """
         check_belief(belief, EkfBelief)
         scan = usable_scan(scan)
@@ -604,7 +554,7 @@ class EkfSlam:
         )
 
     def _corrected(self, belief: EkfBelief, scan: Scan) -> EkfBelief:
-        """Correct the belief with the measurements that pass the gate."""
+        """Update the belief with the measurements that pass the gate."""
         mean, covariance, landmark, weight, gated, squared, degrees = corrected(
             belief.mean,
             belief.covariance,
@@ -629,11 +579,9 @@ class EkfSlam:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class InvariantEkfSlam(EkfSlam):
-    """EKF-SLAM with the right-invariant error; its fields and methods are those of `EkfSlam`.
+    """EKF-SLAM with the right-invariant error; fields and methods as in `EkfSlam`.
 
-    Examples
-    --------
-    A vehicle that stands, unsure of its heading, learns nothing of it from what it hears.
+    A stationary vehicle with an uncertain heading does not gain heading information.
 
     >>> import numpy as np
     >>> from pipistrelle.config import RayConfig

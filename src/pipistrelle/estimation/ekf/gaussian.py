@@ -1,33 +1,25 @@
-r"""Kernels on one Gaussian over a pose and points: propagate, correct, initialise and drop.
+r"""Kernels on a joint Gaussian of a pose and points: predict, update, initialise and drop.
 
-The state is x, y, heading, then two numbers per point. A correction subtracts :math:`W W^T` with
-:math:`W = \bar P H^T L^{-T}, L L^T = S`: the two halves of the covariance get the same products
-in the same order, so it stays symmetric to the last bit.
+The state is x, y, heading, then two numbers per point. ``size`` is its length in arrays that may be
+longer, ``i`` the state index of a point. An update subtracts :math:`W W^T` with
+:math:`W = \bar P H^T L^{-T}, L L^T = S`, in the same order in both triangles, so that the
+covariance stays exactly symmetric. An update reads only five rows of the covariance, but changes
+all, so its columns of W are deferred: a point's rows catch up when they are read, the others
+together in one pass over memory, always in the order of the measurements.
 
-A correction reads five rows of the covariance, the pose's and the point's, and changes all of
-them. So the columns of W wait: a point's rows have them subtracted when they are read, and the
-others catch up together, many columns in one pass over memory. Every number is subtracted in the
-order of the measurements, as if each had been taken off at once. ``size`` is the length of the
-state in arrays that may be longer, ``i`` the state index of a point.
+The covariance is of the *linear* error, true state minus mean, or of the *right-invariant* error
+(`ekf.invariant_error`), which has no heading column in H: ``turns`` multiplies it, 0 for the
+invariant and 1 for the linear error.
 
-The covariance is that of the *linear* error, true state minus mean, or of the *right-invariant*
-error (`ekf.invariant_error`). An invariant error of heading turns vehicle and landmarks alike and
-changes no measurement: its column in H is multiplied by ``turns``, 0 there and 1 for the linear
-error.
-
-Huber's rule: the more a measurement surprises, the less it counts.
-
-Overlapping echoes make errors that no Gaussian describes. With the innovation :math:`\nu`, its
-expected variance S and :math:`e = |\nu| / \sqrt S`,
+**Huber's rule** (`inflated`): with the innovation :math:`\nu`, its expected variance S and
+:math:`e = |\nu| / \sqrt S`,
 
 .. math:: R' = R + S\,(e / k - 1) \quad (e > k = 2)
 
-makes S' = S e / k: the correction is that of a measurement off by k standard deviations, and grows
-no further. Range and bearing are judged separately; a ray is judged by the member that the bearing
-surprises least.
-
-Source: Huber, Robust Statistics (1981), for the influence of a bounded psi; applied to innovations
-as by Karlgaard & Schaub, Journal of Guidance, Control, and Dynamics 30 (2007).
+makes S' = S e / k, which limits the update to that of an innovation of k standard deviations. Range
+and bearing are treated separately, a ray by its hypothesis of least innovation. Source: Huber,
+Robust Statistics (1981); applied to innovations as by Karlgaard & Schaub, Journal of Guidance,
+Control, and Dynamics 30 (2007).
 """
 
 import math
@@ -43,38 +35,36 @@ from pipistrelle.jit import Whole, kernel, no_alloc
 
 GATED, APPLIED = 1, 0
 BEYOND, UNFORESEEN = -1.0, math.nan
-"""Instead of a squared innovation: outside the gate, or of a point too near to predict a
-bearing."""
+"""Substitutes for a squared innovation: outside the gate, or of a point too near for a bearing."""
 LINEAR, INVARIANT = 1.0, 0.0
-"""Factor by which an error of heading enters a measurement, for each of the two errors."""
+"""Factor of the heading column of H for each error definition."""
 LANE = 8
-"""Doubles in a cache line; a row of a multiple of it begins on one."""
+"""Doubles in a cache line; a row of a multiple of it starts on a line."""
 MAX_WAITING, WAITING = 32, 0
-"""How many columns may wait, and the index in ``taken`` of how many do: the pose has none
-waiting."""
+"""Most deferred columns of W, and index of their number in ``taken`` (none for the pose)."""
 
 
 class Joint(NamedTuple):
-    """A Gaussian that is being corrected, in arrays with room for what a frame adds."""
+    """A Gaussian during an update, in arrays with room for a frame's new points."""
 
     mean: Float[np.ndarray, " n"]  # (n)
     covariance: Float[np.ndarray, "n m"]
-    """Columns beyond n fill the last cache line. Rows i and i + 1 of a point still lack
-    the columns of W from ``taken[i]`` to ``taken[WAITING]``; those of the pose lack none."""
-    W: Float[np.ndarray, "w m"]  # the columns that wait, a row each
+    """Rows i and i + 1 of a point still lack columns ``taken[i]`` to ``taken[WAITING]`` of W; the
+    pose's rows are current. Columns beyond n fill the last cache line."""
+    W: Float[np.ndarray, "w m"]  # the deferred columns, as rows
     taken: Int[np.ndarray, " n"]
-    """one array, with the number that waits: a kernel takes a short record faster."""
+    """Number of columns of W applied to each point; ``taken[WAITING]``: number deferred."""
     turns: float  # LINEAR or INVARIANT
 
 
 class State(NamedTuple):
-    """The Gaussian that EKF-SLAM corrects, and the labels of its points."""
+    """The Gaussian that EKF-SLAM updates, and the labels of its points."""
 
     joint: Joint
     landmark: Int[np.ndarray, " h"]
-    """label of each member; the members of a ray stand together, near to far."""
-    weight: Float[np.ndarray, " h"]  # aggregated likelihood of each member within its landmark
-    members: Int[np.ndarray, "1"]  # how many there are; the arrays have room for more
+    """Label of each hypothesis; a ray's are contiguous, near to far."""
+    weight: Float[np.ndarray, " h"]  # aggregated likelihood of each hypothesis within its landmark
+    members: Int[np.ndarray, "1"]  # number of hypotheses; the arrays may be longer
 
 
 @kernel
@@ -85,7 +75,7 @@ def _lanes(size: Whole) -> Whole:
 
 @kernel
 def _on_cache_lines(rows: Whole, width: Whole) -> Float[np.ndarray, "rows width"]:
-    """Make an array (rows, width) that begins on a cache line."""
+    """Allocate an array (rows, width) aligned to cache lines."""
     buffer = np.empty(rows * width + LANE)
     start = -(buffer.ctypes.data // 8) % LANE
     return buffer[start : start + rows * width].reshape(rows, width)
@@ -95,7 +85,7 @@ def _on_cache_lines(rows: Whole, width: Whole) -> Float[np.ndarray, "rows width"
 def joint_of(
     mean: Float[np.ndarray, " d"], covariance: Float[np.ndarray, "d d"], room: Whole, turns: float
 ) -> Joint:
-    """Copy a mean (d) and a covariance (d, d) into a `Joint` with room for ``room`` numbers."""
+    """Copy a mean (d) and a covariance (d, d) to a `Joint` with capacity ``room``."""
     size, width = mean.size, _lanes(mean.size)
     longer, wider = np.empty(room), _on_cache_lines(room, _lanes(room))
     W = _on_cache_lines(MAX_WAITING, _lanes(room))
@@ -115,7 +105,7 @@ def joint_of(
 def gaussian_of(
     joint: Joint, size: Whole
 ) -> tuple[Float[np.ndarray, " d"], Float[np.ndarray, "d d"]]:
-    """Copy the mean (d) and covariance (d, d) out of a `Joint` in which nothing waits."""
+    """Copy the mean (d) and covariance (d, d) from a `Joint` without deferred columns."""
     mean, covariance = np.empty(size), np.empty((size, size))
     for a in range(size):
         mean[a] = joint.mean[a]
@@ -128,7 +118,7 @@ def gaussian_of(
 def point_rows(
     joint: Joint, size: Whole, i: Whole
 ) -> tuple[Float[np.ndarray, " m"], Float[np.ndarray, " m"]]:
-    """Return the rows i and i + 1 of the covariance, with all that waits subtracted from them."""
+    """Apply the deferred columns to rows i and i + 1 of the covariance, and return these rows."""
     pi, pj, W = joint.covariance[i], joint.covariance[i + 1], joint.W
     first, last, width = joint.taken[i], joint.taken[WAITING], _lanes(size)
     joint.taken[i] = last
@@ -151,7 +141,7 @@ def point_rows(
 
 @no_alloc
 def flush(joint: Joint, size: Whole) -> None:
-    """Subtract all that waits from every row."""
+    """Apply all deferred columns to every row."""
     covariance = joint.covariance
     for i in range(3, size, 2):
         pi, pj = point_rows(joint, i + 2, i)
@@ -163,7 +153,7 @@ def flush(joint: Joint, size: Whole) -> None:
 
 @no_alloc
 def defer(joint: Joint, size: Whole, w: Float[np.ndarray, " m"], step: float) -> None:
-    """Add step w to the mean, subtract w w^T from the pose's rows; the points' rows wait."""
+    """Add step w to the mean, subtract w w^T from the pose's rows, and defer the points' rows."""
     mean, p0, p1, p2 = joint.mean, joint.covariance[0], joint.covariance[1], joint.covariance[2]
     x, y, h = w[0], w[1], w[2]
     for a in range(size):
@@ -209,17 +199,14 @@ def propagate(
     pose_means: Float[np.ndarray, "k 3"],
     pose_covariances: Float[np.ndarray, "k 3 3"],
 ) -> None:
-    """Advance mean and covariance in place; cross-covariances once, by the product of the F.
-
-    ``motion`` is `MotionNumbers` as a plain tuple.
-    """
+    """Predict mean and covariance in place, through control steps; ``motion``: `MotionNumbers`."""
     pose, P, numbers = mean[:3], covariance[:3, :3].copy(), MotionNumbers(*motion)
     shift_x = shift_y = 0.0  # entries (0, 2) and (1, 2) of the product of the F
     for k in range(controls.shape[0]):
         dx, dy = propagate_pose(pose, P, controls[k], dt[k], numbers)
         shift_x -= dy
         shift_y += dx
-        for a in range(3):  # an assignment of slices would compile for a second longer
+        for a in range(3):  # assigning slices would compile for a second longer
             pose_means[k, a] = pose[a]
             for b in range(3):
                 pose_covariances[k, a, b] = P[a, b]
@@ -235,7 +222,7 @@ def propagate(
 
 @no_alloc
 def relative_covariance(joint: Joint, size: Whole, i: Whole) -> tuple[float, float, float]:
-    """Return the covariance xx, xy, yy of the member at index i minus the vehicle's position."""
+    """Return the covariance xx, xy, yy of the hypothesis at index i relative to the vehicle."""
     p0, p1 = joint.covariance[0], joint.covariance[1]
     pi, pj = point_rows(joint, size, i)
     return (
@@ -247,8 +234,8 @@ def relative_covariance(joint: Joint, size: Whole, i: Whole) -> tuple[float, flo
 
 @no_alloc
 def bearing_variance(joint: Joint, size: Whole, i: Whole, c: float, s: float, k: float) -> float:
-    """Return the innovation variance H P H^T of the bearing of the member at index i, without R."""
-    h0, h1, turns = s * k, -c * k, joint.turns  # by pose: (h0, h1, -turns); by member: (-h0, -h1)
+    """Return H P H^T, the predicted variance of the bearing of the hypothesis at index i."""
+    h0, h1, turns = s * k, -c * k, joint.turns  # by pose: (h0, h1, -turns); by point: (-h0, -h1)
     p0, p1, p2 = joint.covariance[0], joint.covariance[1], joint.covariance[2]
     pi, pj = point_rows(joint, size, i)
     pxx = p0[0] - 2.0 * p0[i] + pi[i]
@@ -266,9 +253,9 @@ def bearing_variance(joint: Joint, size: Whole, i: Whole, c: float, s: float, k:
 def correct_bearing(
     joint: Joint, size: Whole, i: Whole, bearing: float, variance: float, bound: float
 ) -> float:
-    """Correct with the bearing of the member at index i, unless it is beyond the bound.
+    """Update with the bearing of the hypothesis at index i, unless it exceeds the gate.
 
-    Returns the squared innovation divided by its variance, BEYOND or UNFORESEEN.
+    Returns the squared normalised innovation, BEYOND or UNFORESEEN.
     """
     mean = joint.mean
     distance, expected, c, s, k = observe(mean[0], mean[1], mean[2], mean[i], mean[i + 1])
@@ -307,7 +294,7 @@ def correct_active(
     bearing_variance: float,
     bound: float,
 ) -> float:
-    """Correct the state with range and bearing; return as `correct_bearing` does."""
+    """Update with range and bearing, unless they exceed the gate; returns as `correct_bearing`."""
     mean = joint.mean
     near, expected, c, s, k = observe(mean[0], mean[1], mean[2], mean[i], mean[i + 1])
     if near < NEAREST:
@@ -353,10 +340,7 @@ def initialise(
     range_variance: float,
     bearing_variance: float,
 ) -> None:
-    """Write a member at state index i, at a range and bearing from the pose (Eq. (16)).
-
-    The first ``size`` rows, without its own, are the rest of the state.
-    """
+    """Write a hypothesis at state index i, at a range and bearing from the pose (Eq. (16))."""
     mean, covariance = joint.mean, joint.covariance
     direction = mean[2] + bearing
     c, s = math.cos(direction), math.sin(direction)
@@ -387,10 +371,7 @@ def drop_members(
     keep: Bool[np.ndarray, " h"],
     source: Int[np.ndarray, " n"],
 ) -> None:
-    """Remove the members of one landmark that are not kept, and close the gaps.
-
-    ``source`` is room for as many indices as the state has numbers.
-    """
+    """Remove the hypotheses of a landmark that are not kept; ``source`` is workspace."""
     joint, landmark, weight, members = state.joint, state.landmark, state.weight, state.members[0]
     size = 3 + 2 * members
     flush(joint, size)
@@ -413,13 +394,13 @@ def drop_members(
 
 @no_alloc
 def _excess(squared: float, S: float) -> float:
-    """Return what to add to S so that an innovation is at most `HUBER_K` deviations."""
+    """Return the addition to S that limits an innovation to `HUBER_K` standard deviations."""
     return S * max(math.sqrt(squared / S) / HUBER_K - 1.0, 0.0)
 
 
 @no_alloc
 def inflated(state: State, first: Whole, count: Whole, row: Row) -> Row:
-    """Return a measurement of ``count`` members, with its variances raised by Huber's rule."""
+    """Inflate the variances of a landmark's measurement by Huber's rule."""
     joint, mean, size = state.joint, state.joint.mean, 3 + 2 * state.members[0]
     across, least, along = 0.0, math.inf, 0.0
     for j in range(count):

@@ -1,29 +1,26 @@
-r"""The right-invariant error: what is heard never tells which way is north.
+r"""The right-invariant error of EKF-SLAM, which avoids false information on the heading.
 
-EKF-SLAM's covariance is that of the linear error, true state minus mean. It is linearised about
-means that change from frame to frame, so its corrections learn a little of the heading of vehicle
-and map together, though no measurement can tell it: the filter becomes sure of what it cannot know
-(Julier & Uhlmann, 2001; Huang et al., 2010). The right-invariant error :math:`\xi` moves the mean
-by one rigid motion and shifts each position besides,
+The linear error, true state minus mean, is linearised at means that change between frames. Updates
+then reduce the variance of the common heading of vehicle and map, which no measurement observes, so
+that the filter becomes overconfident (Julier & Uhlmann, 2001; Huang et al., 2010). The
+right-invariant error :math:`\xi` moves the mean by a rigid motion, and shifts each position:
 
 .. math:: \theta = \hat\theta + \xi_\theta, \quad
           p = R(\xi_\theta)\,\hat p + V(\xi_\theta)\,\xi_p, \quad
           l = R(\xi_\theta)\,\hat l + V(\xi_\theta)\,\xi_l
 
-for vehicle and every member of every landmark, with V the integral of the rotation. Then
+for vehicle and hypotheses, with V the integral of the rotation. Then
 
-- the motion changes it by noise alone: F = I, and a control's noise (:math:`w_p, w_\theta` in x, y
-  and heading) enters the positions through the heading it turns,
-  :math:`\xi_p \mathrel{+}= w_p - J\hat p\,w_\theta`,
-  :math:`\xi_l \mathrel{-}= J\hat l\,w_\theta`, with J a rotation by 90 degrees; the noise of the
-  steps of a frame is summed first;
-- a measurement's Jacobian has no column of the heading, wherever it is linearised;
-- a new landmark has the row of the vehicle's position, and noise of its own;
-- a correction moves the whole mean by the exponential of its step.
+- only noise changes it in the motion: F = I, and the noise of a control (:math:`w_p, w_\theta`)
+  enters as :math:`\xi_p \mathrel{+}= w_p - J\hat p\,w_\theta`,
+  :math:`\xi_l \mathrel{-}= J\hat l\,w_\theta`, with J a rotation by 90 degrees, summed over the
+  steps of a frame;
+- a measurement's Jacobian has no heading column, wherever it is linearised;
+- a new landmark has the row of the vehicle's position, plus independent noise;
+- an update moves the whole mean by the exponential of its step.
 
-The velocity of a moving caller is rotated as points are (`ekf.caller_motion`). The origin of the
-frame is the start, so that levers are as short as the drive and no digits are lost to large
-coordinates.
+The velocity of a moving caller is rotated like points. The origin is the start position, so that
+large coordinates cost no precision.
 
 Sources: Barrau & Bonnabel, arXiv:1510.06263 (2015); Zhang, Wu, Song, Huang & Dissanayake, IEEE
 Robotics and Automation Letters 2 (2017).
@@ -39,7 +36,7 @@ from pipistrelle.jit import kernel, no_alloc
 
 
 def rotated_left(points: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, " m"]:
-    """Return J l of points l, one after the other: each rotated by 90 degrees to the left."""
+    """Rotate points by 90 degrees to the left (J l), and flatten them."""
     return (points @ np.array([[0.0, 1.0], [-1.0, 0.0]])).ravel()
 
 
@@ -52,10 +49,7 @@ def linear_part(
     with_pose: bool,
     invariant: bool,
 ) -> tuple[Float[np.ndarray, " k"], Float[np.ndarray, "k k"]]:
-    """Return mean and covariance of the linear errors of some members of a state.
-
-    ``with_pose``: whether the pose stands before them; ``invariant``: the state's error.
-    """
+    """Return mean and covariance of the linear error of selected hypotheses, or with the pose."""
     at, size = np.empty(mean.size, np.int64), 0
     for i in range(mean.size):
         if with_pose if i < 3 else kept[(i - 3) // 2]:
@@ -80,10 +74,9 @@ def linear_part(
 def shifted_covariance(
     P: Float[np.ndarray, "d d"], x: float, y: float, shifted: Float[np.ndarray, "3 3"]
 ) -> None:
-    """Write M P M^T of the first three rows, M = [[1, 0, -y], [0, 1, x], [0, 0, 1]].
+    """Convert a pose's covariance from invariant to linear error, at (x, y).
 
-    It turns the covariance of the invariant error of a pose at (x, y) into that of its linear
-    error; with (-x, -y), the other way round.
+    Writes M P M^T with M = [[1, 0, -y], [0, 1, x], [0, 0, 1]]; (-x, -y) converts back.
     """
     xh, yh, hh = P[0, 2], P[1, 2], P[2, 2]
     shifted[0, 0] = P[0, 0] - 2.0 * y * xh + y * y * hh
@@ -104,9 +97,9 @@ def propagate_invariant(
     pose_means: Float[np.ndarray, "k 3"],
     pose_covariances: Float[np.ndarray, "k 3 3"],
 ) -> None:
-    """Propagate mean and covariance in place; the noise of all steps enters the landmarks once.
+    """Predict mean and covariance of the invariant error in place, through control steps.
 
-    ``motion`` is `MotionNumbers` as a plain tuple; ``pose_covariances`` are of the linear error.
+    ``pose_covariances`` are of the linear error.
     """
     pose, P, numbers = mean[:3], covariance[:3, :3].copy(), MotionNumbers(*motion)
     noise, gathered, together = np.zeros((3, 3)), np.zeros((3, 3)), np.empty((3, 3))
@@ -120,7 +113,7 @@ def propagate_invariant(
             pose_means[k, a] = pose[a]
         shifted_covariance(together, pose[0], pose[1], pose_covariances[k])  # as `EkfBelief.pose`
     turned, root = np.empty(mean.size), math.sqrt(gathered[2, 2])
-    for i in range(3, mean.size, 2):  # J l of each member
+    for i in range(3, mean.size, 2):  # J l of each hypothesis
         turned[i], turned[i + 1] = -mean[i + 1], mean[i]
     for a in range(3):
         for b in range(3):

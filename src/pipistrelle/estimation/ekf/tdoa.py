@@ -1,32 +1,26 @@
-r"""Time difference of arrival: what one excess path says about a Gaussian.
+r"""Excess paths (time differences of arrival) in the EKF: update, initialise and weigh landmarks.
 
-An excess path :math:`e = |b - l| + |l - p| - |b - p|` links the vehicle p, the landmark l and the
-caller b, all parts of the state; the heading does not enter. With its slopes :math:`e_l, e_b` by
-landmark and caller, and :math:`e_p = -e_l - e_b`,
+An excess path :math:`e = |b - l| + |l - p| - |b - p|` relates vehicle p, landmark l and caller b,
+all in the state; the heading does not enter. With its derivatives :math:`e_l, e_b` by landmark and
+caller, and :math:`e_p = -e_l - e_b`,
 
-- it **corrects** all three where landmark and caller are placed (`correct_excess_path`), to second
-  order: a path of length L with the variance t across it is longer by :math:`t / 2L` than that of
-  its means, with the square of that as variance (Bar-Shalom, Li & Kirubarajan 2001,
-  Sec. 10.3.2);
-- it **places** a new landmark or a ray x by the other end y, which is placed: with the direction u
-  of the bearing there is one range r in closed form
-  (`pipistrelle.estimation.measurement.landmark_range`), and
+- it **updates** all three if landmark and caller are initialised (`correct_excess_path`), to second
+  order: a segment of length L with the variance t across it is longer by :math:`t / 2L` than
+  between the means, with the square of that as variance (Bar-Shalom, Li & Kirubarajan 2001, Sec.
+  10.3.2);
+- it **initialises** a new landmark or ray x given the other end y: with the direction u of the
+  bearing the range r has a closed form (`pipistrelle.estimation.measurement.landmark_range`), and
 
   .. math:: dx = dp + u\, a^T (dy - dp) + q\,(d\theta + d\phi) + \frac{u}{k} de, \quad
             k = e_x \cdot u, \quad a = -\frac{e_y}{k}, \quad
             q = r \left( u_\perp - u \frac{e_x \cdot u_\perp}{k} \right)
 
-  correlates it with the caller as with the vehicle (`place_by_excess_path`). Between vehicle and
-  caller k vanishes and the range is undetermined. So its standard deviation must be at most a tenth
-  of it, and the excess path must be clearly above 0 (`MIN_TDOA_SIGMAS`): an excess path of 0 with
-  an error has a range, too, which only seems sure;
-- else it **weighs** the members of a ray (`weigh_by_excess_path`).
+  correlates it with caller and vehicle (`place_by_excess_path`). Between vehicle and caller k
+  vanishes and the range is undetermined, so its standard deviation must be at most a tenth of it,
+  and the excess path clearly above 0 (`MIN_TDOA_SIGMAS`);
+- else it **weighs** the hypotheses of a ray (`weigh_by_excess_path`).
 
-Between two rays an excess path is not used: some pair of members fits any value.
-
-The excess paths of one scan: each places a landmark, corrects what is placed, or weighs a ray.
-
-What one excess path says about a Gaussian is in `tdoa`.
+Between two rays an excess path is not used, as some pair of hypotheses fits any value.
 """
 
 import math
@@ -65,8 +59,7 @@ from pipistrelle.estimation.rays import UpdateParams, log_likelihood, survivors,
 from pipistrelle.jit import Flag, Whole, kernel, no_alloc
 
 MAX_RELATIVE_RANGE_STD = 0.1
-"""An excess path places a point if the range has at most this standard deviation, divided by the
-range."""
+"""Largest standard deviation of a range from an excess path, relative to the range."""
 
 
 @no_alloc
@@ -81,7 +74,7 @@ def _bend(dx: float, dy: float, xx: float, xy: float, yy: float) -> float:
 def _expected(
     joint: Joint, size: Whole, i: Whole, ib: Whole, w: Float[np.ndarray, " m"]
 ) -> tuple[float, float]:
-    """Predict the excess path over the point at i of the caller at ib; write P H^T into w."""
+    """Predict an excess path via the point at i from the caller at ib; write P H^T into w."""
     mean = joint.mean
     excess_path, lx, ly, bx, by = excess_path_slopes(
         mean[0], mean[1], mean[i], mean[i + 1], mean[ib], mean[ib + 1]
@@ -98,7 +91,7 @@ def _expected(
 
 @no_alloc
 def _bends(joint: Joint, size: Whole, i: Whole, ib: Whole) -> tuple[float, float]:
-    """Return the second-order bias of the excess path, and an upper bound of its variance."""
+    """Return the second-order bias of an excess path, and an upper bound of its variance."""
     mean, p0, p1 = joint.mean, joint.covariance[0], joint.covariance[1]
     li, lj = point_rows(joint, size, i)
     bi, bj = point_rows(joint, size, ib)
@@ -129,10 +122,7 @@ def correct_excess_path(
     bound: float,
     robust: bool,
 ) -> Whole:
-    """Correct with an excess path over the point at index i of the caller at ib; GATED or APPLIED.
-
-    ``robust`` raises its variance by Huber's rule.
-    """
+    """Update with an excess path via the point at i from the caller at ib; GATED or APPLIED."""
     if joint.taken[WAITING] == MAX_WAITING:
         flush(joint, size)
     w = joint.W[joint.taken[WAITING]]
@@ -163,10 +153,9 @@ def weigh_by_excess_path(
     variance: float,
     likelihood: Float[np.ndarray, " m"],
 ) -> None:
-    """Write the log likelihood of an excess path for each member of a ray; the other end is placed.
+    """Write the log likelihood of an excess path for each hypothesis of a ray.
 
-    ``ray`` is its first member and their number, ``other`` a member; with ``of_caller`` the ray is
-    the caller's.
+    ``ray``: first hypothesis and number; ``other``: initialised end; ``of_caller``: a caller's ray.
     """
     joint, size = state.joint, 3 + 2 * state.members[0]
     if joint.taken[WAITING] == MAX_WAITING:
@@ -185,9 +174,9 @@ def weigh_by_excess_path(
 def _leverage(
     joint: Joint, iy: Whole, of_caller: Flag, excess_path: float, direction: float
 ) -> tuple[float, float, float, float, float]:
-    """Return the range of a point by excess path and direction, with a, k and e_x . u_perp.
+    """Return the range of a point by excess path and direction (0 if none), a, k and e_x . u_perp.
 
-    The point placed at index iy is the other end; the range is 0 where there is none.
+    The other end is the initialised point at index iy.
     """
     mean = joint.mean
     c, s = math.cos(direction), math.sin(direction)
@@ -217,11 +206,11 @@ def relative_range_std(
     of_caller: Flag,
     measured: tuple[float, float, float, float],
 ) -> float:
-    """Return the relative standard deviation of a range by excess path and bearing; or infinity.
+    """Return the relative standard deviation of a range by excess path and bearing, or infinity.
 
-    ``measured`` is excess path, its variance, bearing and its variance. With ``of_caller`` the
-    caller's range is asked, and a landmark is placed at index iy. It is infinite above
-    `MAX_RELATIVE_RANGE_STD` and where the excess path may be 0 (`MIN_TDOA_SIGMAS`).
+    ``measured`` is excess path, its variance, bearing and its variance. ``of_caller`` selects the
+    caller's range, with a landmark at index iy. It is infinite above `MAX_RELATIVE_RANGE_STD`, or
+    if the excess path may be 0 (`MIN_TDOA_SIGMAS`).
     """
     excess_path, along, bearing, across = measured
     mean, turns = joint.mean, joint.turns
@@ -254,10 +243,9 @@ def place_by_excess_path(
     of_caller: Flag,
     measured: tuple[float, float, float, float],
 ) -> None:
-    """Write a member at index i by an excess path, a bearing and the point at index iy.
+    """Initialise the hypothesis at index i by excess path, bearing and the point at index iy.
 
-    The arguments are those of `relative_range_std`, which has found the range sure. Nothing may
-    wait.
+    Arguments as in `relative_range_std`; no columns may be deferred.
     """
     excess_path, along, bearing, across = measured
     mean, covariance, turns = joint.mean, joint.covariance, joint.turns
@@ -284,24 +272,24 @@ def place_by_excess_path(
 
 
 ROBUST_BEARING_FACTOR = 3.0
-"""Factor on the standard deviations of bearings where some may be off by more than they say: a
-place that is wrong but seems sure makes all others wrong."""
+"""Factor on bearing standard deviations with the robust setting, as a wrong initial position would
+displace all later landmarks."""
 
 
 class FrameExcessPaths(NamedTuple):
-    """The excess paths of a scan, and the labels of callers that move."""
+    """The excess paths of a scan, and the labels of moving callers."""
 
     landmark: Int[np.ndarray, " d"]
     caller: Int[np.ndarray, " d"]
     excess_path: Float[np.ndarray, " d"]  # [m]
     variance: Float[np.ndarray, " d"]  # [m^2]
-    used: Bool[np.ndarray, " d"]  # whether an excess path has placed something
+    used: Bool[np.ndarray, " d"]  # whether it has initialised a landmark or caller
     moving: Int[np.ndarray, " v"]
 
 
 @kernel
 def frame_excess_paths(columns: Columns, timings: Timings) -> FrameExcessPaths:
-    """Return the excess paths of a scan, none of them used."""
+    """Return the excess paths of a scan, all unused."""
     heard = excess_paths(columns, timings)
     used = np.zeros(heard.landmark.size, dtype=np.bool_)
     return FrameExcessPaths(
@@ -311,17 +299,18 @@ def frame_excess_paths(columns: Columns, timings: Timings) -> FrameExcessPaths:
 
 @no_alloc
 def _single(state: State, label: Whole) -> Whole:
-    """Return the index of a landmark's only member; -1 where it has none or several."""
+    """Return the index of a landmark's only hypothesis, or -1 if it has none or several."""
     first, count = members_of(state.landmark, state.members[0], label)
     return first if count == 1 else -1
 
 
 @no_alloc
 def _surest(state: State, row: Row, frame: FrameExcessPaths, robust: bool) -> Whole:
-    """Return the excess path that gives the range of a row's landmark most surely, or -1.
+    """Return the excess path that gives the most precise range of a measurement's landmark, or -1.
 
-    It is over this landmark, of a placed caller, or of this landmark's own call, over a placed one.
-    ``robust``: it must be sure even if the bearing's std is larger by `ROBUST_BEARING_FACTOR`.
+    It is of this landmark with an initialised caller, or via an initialised landmark if this
+    landmark is the caller. ``robust``: precise even with the bearing std multiplied by
+    `ROBUST_BEARING_FACTOR`.
     """
     best, least, size = -1, math.inf, 3 + 2 * state.members[0]
     across = row.bearing_variance * (
@@ -343,7 +332,7 @@ def _surest(state: State, row: Row, frame: FrameExcessPaths, robust: bool) -> Wh
 
 @no_alloc
 def _place(state: State, member: Whole, row: Row, frame: FrameExcessPaths, d: Whole) -> None:
-    """Place a landmark of one member by excess path d and the bearing of its row."""
+    """Initialise a landmark by excess path d and the bearing of its measurement."""
     of_caller = frame.caller[d] == row.landmark
     other = _single(state, frame.landmark[d] if of_caller else frame.caller[d])
     measured = (frame.excess_path[d], frame.variance[d], row.bearing, row.bearing_variance)
@@ -356,7 +345,7 @@ def _place(state: State, member: Whole, row: Row, frame: FrameExcessPaths, d: Wh
 def placed_by_excess_path(
     state: State, row: Row, frame: FrameExcessPaths, robust: bool, scratch: Scratch
 ) -> bool:
-    """Place a ray or a waiting bearing by an excess path that gives its range; tell if done."""
+    """Initialise a ray or a stored bearing by an excess path; return whether this was possible."""
     first, count = members_of(state.landmark, state.members[0], row.landmark)
     if count == 1 or not math.isnan(row.range):
         return False
@@ -373,7 +362,7 @@ def placed_by_excess_path(
 
 @no_alloc
 def added_by_excess_path(state: State, row: Row, frame: FrameExcessPaths, robust: bool) -> bool:
-    """Append the landmark of a bearing whose range an excess path gives; tell if it was done."""
+    """Append a new landmark by bearing and excess path; return whether this was possible."""
     d = _surest(state, row, frame, robust) if math.isnan(row.range) else -1
     if d < 0:
         return False
@@ -393,7 +382,7 @@ def _weigh(
     params: UpdateParams,
     scratch: Scratch,
 ) -> None:
-    """Weigh the members of a ray by excess path d, and prune it."""
+    """Weigh and prune the hypotheses of a ray by excess path d."""
     label = frame.caller[d] if of_caller else frame.landmark[d]
     other = _single(state, frame.landmark[d] if of_caller else frame.caller[d])
     ray = members_of(state.landmark, state.members[0], label)
@@ -415,7 +404,7 @@ def _weigh(
 def correct_by_excess_path(
     state: State, frame: FrameExcessPaths, d: Whole, params: UpdateParams, scratch: Scratch
 ) -> Whole:
-    """Correct landmark, caller and vehicle by excess path d, or weigh a ray; GATED or APPLIED."""
+    """Update landmark, caller and vehicle by excess path d, or weigh a ray; GATED or APPLIED."""
     member, caller = _single(state, frame.landmark[d]), _single(state, frame.caller[d])
     if member >= 0 and caller >= 0:
         size, i, ib = 3 + 2 * state.members[0], 3 + 2 * member, 3 + 2 * caller

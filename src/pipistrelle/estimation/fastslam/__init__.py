@@ -1,5 +1,5 @@
-"""FastSLAM 2.0: particles, each a sampled path with its own map.
+"""FastSLAM 2.0: particles, each with a sampled path and a map.
 
-`filter` is the method and `poses` its resampling. The kernels: `particles` goes over all of them, a
-`block` of 32 at a time, whose rays `block_rays` weighs and prunes.
+`filter` is the estimator. The kernels: `particles` iterates over blocks of 32 particles, `block`
+and `block_rays` update poses and landmarks, `poses` predicts, summarises and resamples.
 """

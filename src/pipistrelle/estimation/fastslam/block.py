@@ -1,15 +1,14 @@
-"""Kernels on a block of particles: sampled poses with a Gaussian around each, and their members.
+"""Kernels on a block of particles: sampled poses with Gaussian uncertainty, and map hypotheses.
 
-Particles travel in blocks of `LANES`, and every loop here runs over the lanes of one block, which
-the processor takes several at a time: a row (x of all lanes, then y of all lanes, and so on) lies
-at a fixed place of a flat array, so ``pose[PXY + i]`` is the covariance of x and y in lane i. A
-lane whose turn it is not, because its landmark has fewer members or another kind of measurement,
-takes part with an information of zero, which changes nothing to the last bit.
+Particles are stored in blocks of `LANES`, and every loop runs over the lanes of a block, for
+vectorisation. A row (x of all lanes, then y, and so on) has a fixed offset in a flat array:
+``pose[PXY + i]`` is the covariance of x and y in lane i. Lanes to be left unchanged get an
+information of zero.
 
-``pose`` (9 rows) is a sampled pose and its uncertainty since the last sample; refinements are in
-Kalman form, which needs no inverse of the motion noise: that of one control step has rank 2 and
-none. ``member`` (6 rows) is a position [m] with its covariance [m^2] and the log of the aggregated
-likelihood. Given the pose, members are independent of each other.
+``pose`` (9 rows) is a sampled pose and its uncertainty since the last sample. Updates have Kalman
+form, as the noise of a control step has rank 2 and no inverse. ``member`` (6 rows) is a hypothesis:
+position [m], covariance [m^2] and log of the aggregated likelihood. Given the pose, hypotheses are
+independent.
 """
 
 import math
@@ -22,25 +21,26 @@ from pipistrelle.estimation.measurement import NEAREST, Row
 from pipistrelle.jit import Flag, Whole, inlined, no_alloc
 
 LANES = 32
-"""Particles in a block. With half as many the compiler unrolls the loops instead of vectorising
-them; with more, a few particles fill no block."""
+"""Particles in a block. With half as many, the compiler unrolls the loops instead of vectorising;
+with more, small particle sets do not fill a block."""
 X, Y, HEADING, PXX, PXY, PYY, PXH, PYH, PHH = range(0, 9 * LANES, LANES)
 XX, XY, YY, LOG_WEIGHT = range(2 * LANES, 6 * LANES, LANES)
 POSE, MEMBER = 9 * LANES, 6 * LANES
-"""Numbers of a block's poses, and of one member of each of its particles."""
+"""Numbers of a block's poses, and of a hypothesis in each of its lanes."""
 Poses = Float[np.ndarray, " rows"]
 Member = Float[np.ndarray, " numbers"]
 Lanes = Float[np.ndarray, " lanes"]
 Counts = Int[np.ndarray, " lanes"]
-"""Of a block: its poses, one member of each of its particles, a number of each, a count of each."""
+"""Arrays of a block: poses, a hypothesis, a float, and a count for each particle."""
 HALF_LOG_TAU = 0.5 * math.log(2.0 * math.pi)
 ROUNDING = 1e-12
-"""A pivot under this share of its variance is rounding: noise of one control step has rank 2."""
+"""Share of the variance below which a pivot is rounding error, as a control step's noise has rank
+2."""
 
 
 @inlined
 def _bearing(pose: Poses, member: Member, row: Row, i: Whole) -> tuple[float, float, float, Flag]:
-    """Return the innovation of a member's bearing, its slopes by x and y, if it is defined."""
+    """Return the innovation of a bearing, its derivatives by x and y, and whether it is defined."""
     dx, dy = member[X + i] - pose[X + i], member[Y + i] - pose[Y + i]
     squared = dx * dx + dy * dy
     inverse = 1.0 / max(squared, NEAREST * NEAREST)
@@ -50,7 +50,7 @@ def _bearing(pose: Poses, member: Member, row: Row, i: Whole) -> tuple[float, fl
 
 @inlined
 def _bearing_gain(pose: Poses, h0: float, h1: float, i: Whole) -> tuple[float, float, float]:
-    """Return the covariance of x, y and heading with the bearing, whose slopes are (h0, h1, -1)."""
+    """Return the covariance of a pose with a bearing of the derivatives (h0, h1, -1)."""
     return (
         h0 * pose[PXX + i] + h1 * pose[PXY + i] - pose[PXH + i],
         h0 * pose[PXY + i] + h1 * pose[PYY + i] - pose[PYH + i],
@@ -60,14 +60,14 @@ def _bearing_gain(pose: Poses, h0: float, h1: float, i: Whole) -> tuple[float, f
 
 @inlined
 def _spread(member: Member, h0: float, h1: float, i: Whole) -> float:
-    """Return the variance of the bearing due to a member's own uncertainty."""
+    """Return the bearing variance due to a hypothesis' position."""
     cross = 2.0 * h0 * h1 * member[XY + i]
     return h0 * h0 * member[XX + i] + cross + h1 * h1 * member[YY + i]
 
 
 @inlined
 def _foreseen(pose: Poses, member: Member, row: Row, i: Whole) -> tuple[float, float, Flag]:
-    """Return the innovation of a member's bearing, its variance, and whether it is defined."""
+    """Return the innovation of a bearing, its variance, and whether it is defined."""
     innovation, h0, h1, far = _bearing(pose, member, row, i)
     a0, a1, a2 = _bearing_gain(pose, h0, h1, i)
     S = (h0 * a0 + h1 * a1 - a2 + _spread(member, h0, h1, i)) + row.bearing_variance
@@ -84,11 +84,11 @@ def expect_bearing(
     printed: bool,
     log_likelihood: Lanes,
 ) -> None:
-    """Log likelihood, without its constant, of the bearing of each lane's member j (Eq. (19)).
+    """Write the log likelihood of a bearing for each lane's hypothesis j (Eq. (19)).
 
-    It is minus infinity where a lane has no member j. A member too near to predict its bearing
-    makes it uniform over the circle; alone, it says nothing. ``printed`` is the formula's other
-    reading.
+    It lacks the constant, and is minus infinity in lanes without hypothesis j. If the hypothesis is
+    too near, the bearing is uniform over the circle, or ignored if there is no other. ``printed``:
+    the formula's other reading.
     """
     if printed:
         _expect_as_printed(pose, member, row, count, j, log_likelihood)
@@ -105,7 +105,7 @@ def expect_bearing(
 def _expect_as_printed(
     pose: Poses, member: Member, row: Row, count: Counts, j: Whole, log_likelihood: Lanes
 ) -> None:
-    """Log of Eq. (19) with all of its root inside the exponent; zero for what is too near."""
+    """Write the log of Eq. (19) with the root inside the exponent; zero for too near hypotheses."""
     for i in range(LANES):
         innovation, S, far = _foreseen(pose, member, row, i)
         value = -0.5 * (innovation * innovation / S) / math.sqrt(2.0 * math.pi * S)
@@ -117,7 +117,7 @@ def _expect_as_printed(
 def bearing_beyond(
     pose: Poses, member: Member, row: Row, count: Counts, j: Whole, bound: float
 ) -> bool:
-    """Tell whether the bearing is beyond the bound for member j of every lane that has one."""
+    """Return whether a bearing is outside the gate of hypothesis j in every lane that has it."""
     beyond = 0
     for i in range(LANES):
         innovation, S, far = _foreseen(pose, member, row, i)
@@ -128,7 +128,7 @@ def bearing_beyond(
 
 @no_alloc
 def refine_by_bearing(pose: Poses, member: Member, row: Row, share: Lanes) -> None:
-    """Correct the poses by the bearing of a member, each by its share of the information."""
+    """Update each particle's pose with a bearing, its information scaled by ``share``."""
     for i in range(LANES):
         innovation, h0, h1, far = _bearing(pose, member, row, i)
         a0, a1, a2 = _bearing_gain(pose, h0, h1, i)
@@ -149,7 +149,7 @@ def refine_by_bearing(pose: Poses, member: Member, row: Row, share: Lanes) -> No
 
 @no_alloc
 def correct_by_bearing(pose: Poses, member: Member, row: Row, share: Lanes) -> None:
-    """Correct a member by its bearing from certain poses, each by its share of the information."""
+    """Update a hypothesis with a bearing from known poses, its information scaled by ``share``."""
     for i in range(LANES):
         innovation, h0, h1, far = _bearing(pose, member, row, i)
         a0 = -h0 * member[XX + i] - h1 * member[XY + i]
@@ -168,7 +168,7 @@ def correct_by_bearing(pose: Poses, member: Member, row: Row, share: Lanes) -> N
 def _active(
     pose: Poses, member: Member, row: Row, i: Whole
 ) -> tuple[float, float, float, float, float, Flag]:
-    """Return innovations of range and bearing, direction, inverse range, if they are defined."""
+    """Return innovations of range and bearing, direction, inverse range, and validity."""
     dx, dy = member[X + i] - pose[X + i], member[Y + i] - pose[Y + i]
     near = math.sqrt(dx * dx + dy * dy)
     k = 1.0 / max(near, NEAREST)
@@ -180,7 +180,7 @@ def _active(
 def _whitened(
     nu0: float, nu1: float, S00: float, S01: float, S11: float
 ) -> tuple[float, float, float, float, float]:
-    """Return the innovations made independent with variance one, and the factors that do so."""
+    """Return two innovations whitened by their covariance, and the transformation's factors."""
     i0 = 1.0 / math.sqrt(S00)
     L10 = S01 * i0
     i1 = 1.0 / math.sqrt(S11 - L10 * L10)
@@ -192,7 +192,7 @@ def _whitened(
 def _active_spread(
     pose: Poses, member: Member, c: float, s: float, k: float, row: Row, i: Whole
 ) -> tuple[float, float, float, float, float, float, float, float, float]:
-    """Return the covariance of range and bearing with x, y, heading, and of their innovations."""
+    """Return the covariance of range and bearing with the pose, and of their innovations."""
     h0, h1 = s * k, -c * k
     a0 = -c * pose[PXX + i] - s * pose[PXY + i]
     a1 = -c * pose[PXY + i] - s * pose[PYY + i]
@@ -210,10 +210,7 @@ def _active_spread(
 def expect_active(
     pose: Poses, member: Member, row: Row, count: Counts, j: Whole, log_likelihood: Lanes
 ) -> None:
-    """Log likelihood, without its constant, of range and bearing of each lane's member j.
-
-    Minus infinity and too near: as `expect_bearing` has them.
-    """
+    """Write the log likelihood of range and bearing for each lane's hypothesis j."""
     for i in range(LANES):
         nu0, nu1, c, s, k, far = _active(pose, member, row, i)
         _, _, _, _, _, _, S00, S01, S11 = _active_spread(pose, member, c, s, k, row, i)
@@ -228,7 +225,7 @@ def expect_active(
 
 @no_alloc
 def active_beyond(pose: Poses, member: Member, row: Row, count: Counts, bound: float) -> bool:
-    """Tell whether range and bearing are beyond the bound for every lane, each of one member."""
+    """Return whether range and bearing are outside the gate in every lane, all initialised."""
     beyond = 0
     for i in range(LANES):
         nu0, nu1, c, s, k, far = _active(pose, member, row, i)
@@ -241,7 +238,7 @@ def active_beyond(pose: Poses, member: Member, row: Row, count: Counts, bound: f
 
 @no_alloc
 def squared_innovation(pose: Poses, member: Member, row: Row, i: Whole) -> float:
-    """Return the squared innovation of lane i over its variance; NaN of a member too near."""
+    """Return the squared normalised innovation in lane i, or NaN if the landmark is too near."""
     nu0, nu1, c, s, k, far = _active(pose, member, row, i)
     _, _, _, _, _, _, S00, S01, S11 = _active_spread(pose, member, c, s, k, row, i)
     if not far:
@@ -256,7 +253,7 @@ def squared_innovation(pose: Poses, member: Member, row: Row, i: Whole) -> float
 def refine_by_active(
     pose: Poses, member: Member, row: Row, count: Counts, log_weight: Lanes
 ) -> None:
-    """Correct the poses whose landmark has one member by range and bearing, and weigh them."""
+    """Update and weigh poses with range and bearing, in lanes with a fully initialised landmark."""
     for i in range(LANES):
         nu0, nu1, c, s, k, far = _active(pose, member, row, i)
         a0, a1, a2, b0, b1, b2, S00, S01, S11 = _active_spread(pose, member, c, s, k, row, i)
@@ -280,7 +277,7 @@ def refine_by_active(
 
 @no_alloc
 def correct_by_active(pose: Poses, member: Member, row: Row, count: Counts) -> None:
-    """Correct a member by range and bearing, in lanes where it is its landmark's only one."""
+    """Update a landmark with range and bearing, in lanes that have it fully initialised."""
     for i in range(LANES):
         nu0, nu1, c, s, k, far = _active(pose, member, row, i)
         g0, g1 = -s * k, c * k
@@ -306,7 +303,7 @@ def correct_by_active(pose: Poses, member: Member, row: Row, count: Counts) -> N
 def initialise_member(
     pose: Poses, member: Member, row: Row, log_weight: float, count: Counts
 ) -> None:
-    """Place a member at a range and bearing, where its landmark has not one member (Eq. (16))."""
+    """Initialise a hypothesis at range and bearing, in lanes without the landmark (Eq. (16))."""
     distance, range_variance = row.range, row.range_variance
     across = row.bearing_variance * distance * distance
     for i in range(LANES):
@@ -326,7 +323,7 @@ def initialise_member(
 
 @inlined
 def _lower(pose: Poses, i: Whole) -> tuple[float, float, float, float, float, float]:
-    """Factor a pose's covariance of any rank by Cholesky, row by row: a flat pivot is zero."""
+    """Return the Cholesky factor of a pose's covariance of any rank; small pivots become zero."""
     L00 = math.sqrt(max(pose[PXX + i], 0.0))
     i0 = 1.0 / L00 if L00 > 0.0 else 0.0
     L10, L20 = pose[PXY + i] * i0, pose[PXH + i] * i0
@@ -341,7 +338,7 @@ def _lower(pose: Poses, i: Whole) -> tuple[float, float, float, float, float, fl
 
 @inlined
 def _log_density(gaussian: Poses, pose: Poses, i: Whole) -> float:
-    """Log of a Gaussian's density at a pose, without its constant and its flat directions."""
+    """Return the log density of a Gaussian at a pose, without constant and singular directions."""
     L00, L10, L11, L20, L21, L22 = _lower(gaussian, i)
     i0 = 1.0 / L00 if L00 > 0.0 else 0.0
     i1 = 1.0 / L11 if L11 > 0.0 else 0.0
@@ -355,14 +352,14 @@ def _log_density(gaussian: Poses, pose: Poses, i: Whole) -> float:
 
 @no_alloc
 def weigh_sample(prior: Poses, proposal: Poses, pose: Poses, log_weight: Lanes) -> None:
-    """Weigh sampled poses by the density of the prior divided by that of the proposal."""
+    """Weigh sampled poses by the density ratio of prior and proposal."""
     for i in range(LANES):
         log_weight[i] += _log_density(prior, pose, i) - _log_density(proposal, pose, i)
 
 
 @no_alloc
 def sample_pose(pose: Poses, normal: Lanes) -> None:
-    """Draw the poses from their Gaussians with three standard normals each; clear their spread."""
+    """Sample the poses from their Gaussians by standard normals, and reset their covariances."""
     for i in range(LANES):
         L00, L10, L11, L20, L21, L22 = _lower(pose, i)
         n0, n1, n2 = normal[X + i], normal[Y + i], normal[HEADING + i]

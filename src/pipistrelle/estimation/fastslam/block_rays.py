@@ -1,9 +1,8 @@
-"""Kernels on a block's rays: weigh, share, refine, correct and prune (the method is in `rays`).
+"""Kernels on a block's rays: weigh, share, update, prune and merge (method in `estimation.rays`).
 
-A landmark of one member is a ray of one: its share is one, and it is never pruned. The weights
-stay logs, so that no product of likelihoods underflows. ``rows`` (h, 6 `LANES`) are the members of
-one landmark; lane i has the first ``count[i]`` of them. ``turn`` is 1 in the lanes that are
-corrected and 0 elsewhere.
+An initialised landmark is a ray of a single hypothesis: its share is 1, and it is never pruned.
+Weights are logarithms against underflow. ``rows`` (h, 6 `LANES`) are the hypotheses of a landmark;
+lane i has the first ``count[i]``. ``turn`` is 1 in lanes to update and 0 elsewhere.
 """
 
 import math
@@ -51,26 +50,26 @@ from pipistrelle.estimation.rays import (
 from pipistrelle.jit import Flag, Whole, inlined, kernel, no_alloc
 
 Rows = Float[np.ndarray, "h numbers"]
-"""The members of one landmark."""
+"""Hypotheses of a landmark."""
 
 
 class Scratch(NamedTuple):
-    """Arrays to work with; L is `LANES`."""
+    """Workspace for updates of a block's rays; L is `LANES`."""
 
-    likelihood: Float[np.ndarray, "h lanes"]  # log, of each member
-    posterior: Float[np.ndarray, "h lanes"]  # log, of each member
+    likelihood: Float[np.ndarray, "h lanes"]  # log, of each hypothesis
+    posterior: Float[np.ndarray, "h lanes"]  # log, of each hypothesis
     share: Float[np.ndarray, "h lanes"]
     largest: Lanes
     total: Lanes
     whole: Lanes  # 1 in all lanes
-    alone: Lanes  # 1 where a landmark has one member, else 0 (`part_lanes`)
-    ray: Lanes  # 1 where it has several
-    refined: Float[np.ndarray, "h rows"]  # poses as each member alone would correct them
+    alone: Lanes  # 1 where a landmark is initialised, else 0 (`part_lanes`)
+    ray: Lanes  # 1 where it is a ray
+    refined: Float[np.ndarray, "h rows"]  # poses updated by each hypothesis separately
 
 
 @kernel
 def scratch_for(members: Whole) -> Scratch:
-    """Allocate arrays for rays of so many members."""
+    """Allocate a workspace for rays with a number of hypotheses."""
     return Scratch(
         np.empty((members, LANES)),
         np.empty((members, LANES)),
@@ -86,7 +85,7 @@ def scratch_for(members: Whole) -> Scratch:
 
 @no_alloc
 def part_lanes(count: Counts, scratch: Scratch) -> None:
-    """Separate the lanes in which a landmark has one member from those in which it is a ray."""
+    """Separate the lanes by whether a landmark is initialised or a ray."""
     for i in range(LANES):
         scratch.alone[i] = 1.0 if count[i] == 1 else 0.0
         scratch.ray[i] = 1.0 - scratch.alone[i]
@@ -94,7 +93,7 @@ def part_lanes(count: Counts, scratch: Scratch) -> None:
 
 @no_alloc
 def _largest(logs: Float[np.ndarray, "h lanes"], members: Whole, largest: Lanes) -> None:
-    """Write the largest of each lane's logs."""
+    """Write the largest log of each lane."""
     for i in range(LANES):
         largest[i] = -np.inf
     for j in range(members):
@@ -105,7 +104,7 @@ def _largest(logs: Float[np.ndarray, "h lanes"], members: Whole, largest: Lanes)
 
 @no_alloc
 def _weigh(rows: Rows, members: Whole, scratch: Scratch) -> None:
-    """Write normalised log weights (Eq. (18)) into ``posterior``, log sums into ``total``."""
+    """Write normalised log weights (Eq. (18)) to ``posterior``, and log sums to ``total``."""
     largest, total = scratch.largest, scratch.total
     for j in range(members):
         row, likelihood, posterior = rows[j], scratch.likelihood[j], scratch.posterior[j]
@@ -127,7 +126,7 @@ def _weigh(rows: Rows, members: Whole, scratch: Scratch) -> None:
 
 @no_alloc
 def _share(members: Whole, params: UpdateParams, turn: Lanes, scratch: Scratch) -> None:
-    """Divide the measurement by a power of the likelihoods, aggregated or not (Eq. (19))."""
+    """Write shares proportional to a power of the likelihoods, aggregated or not (Eq. (19))."""
     logs = scratch.posterior if params.aggregated else scratch.likelihood
     smallest = SMALLEST_AGGREGATED_SHARE if params.aggregated else SMALLEST_SHARE
     largest, total = scratch.largest, scratch.total
@@ -154,7 +153,7 @@ def _add(log_likelihood: Lanes, numbers: Whole, turn: Lanes, log_weight: Lanes) 
 
 @no_alloc
 def most_members(count: Counts) -> Whole:
-    """Return the number of members of the lane that has most."""
+    """Return the largest number of hypotheses in a lane."""
     largest = 1
     for i in range(LANES):
         largest = max(largest, count[i])
@@ -165,7 +164,7 @@ def most_members(count: Counts) -> Whole:
 def _expect_ray(
     pose: Poses, rows: Rows, count: Counts, row: Row, printed: bool, scratch: Scratch
 ) -> None:
-    """Write log likelihoods of a bearing for all members into ``likelihood``."""
+    """Write the log likelihoods of a bearing for all hypotheses to ``likelihood``."""
     for j in range(most_members(count)):
         likelihood = scratch.likelihood[j]
         expect_bearing(pose, rows[j], row, count, j, printed, likelihood)
@@ -181,7 +180,7 @@ def weigh_by_bearing(
     scratch: Scratch,
     log_weight: Lanes,
 ) -> None:
-    """Weigh the poses by the bearing of a landmark: the density of its members' mixture."""
+    """Weigh poses by the mixture density of a bearing over a landmark's hypotheses."""
     _expect_ray(pose, rows, count, row, False, scratch)
     if most_members(count) == 1:
         _add(scratch.likelihood[0], 1, turn, log_weight)
@@ -201,7 +200,7 @@ def refine_by_ray(
     scratch: Scratch,
     log_weight: Lanes,
 ) -> None:
-    """Correct the poses by the bearing of a landmark, and weigh them by its likelihood."""
+    """Update poses by a bearing to a landmark, and weigh them by its likelihood."""
     members = most_members(count)
     weigh_by_bearing(pose, rows, count, row, turn, scratch, log_weight)
     if members == 1:
@@ -228,11 +227,7 @@ def weigh_by_active(
     scratch: Scratch,
     log_weight: Lanes,
 ) -> None:
-    """Weigh the poses by range and bearing of a landmark: the density of its members' mixture.
-
-    One member is a mixture, too: all weights are densities over range and bearing, so that the
-    units do not matter.
-    """
+    """Weigh poses by the mixture density of range and bearing over a landmark's hypotheses."""
     members = most_members(count)
     for j in range(members):
         expect_active(pose, rows[j], row, count, j, scratch.likelihood[j])
@@ -244,7 +239,7 @@ def weigh_by_active(
 def _refine_to_mixture(
     pose: Poses, rows: Rows, members: Whole, row: Row, turn: Lanes, scratch: Scratch
 ) -> None:
-    """Set the poses to mean and covariance of the mixture of the members' refinements."""
+    """Set poses to mean and covariance of the mixture of their updates by each hypothesis."""
     for j in range(members):
         refined, weight = scratch.refined[j], scratch.posterior[j]
         for k in range(POSE):
@@ -281,7 +276,7 @@ def correct_ray(
     turn: Lanes,
     scratch: Scratch,
 ) -> None:
-    """Weigh, correct and prune a landmark's members from certain poses, in place."""
+    """Weigh, update, prune and merge a landmark's hypotheses from known poses, in place."""
     members = most_members(count)
     if members == 1:
         correct_by_bearing(pose, rows[0], row, turn)
@@ -300,7 +295,7 @@ def correct_ray(
 
 @inlined
 def _heaviest(rows: Rows, count: Counts, i: Whole) -> Whole:
-    """Return the index of the heaviest member of a lane, the first of equals."""
+    """Return the index of the heaviest hypothesis in a lane, the first of equals."""
     best = 0
     for j in range(1, count[i]):
         best = j if rows[j, LOG_WEIGHT + i] > rows[best, LOG_WEIGHT + i] else best
@@ -309,7 +304,7 @@ def _heaviest(rows: Rows, count: Counts, i: Whole) -> Whole:
 
 @no_alloc
 def keep_heaviest(rows: Rows, count: Counts) -> None:
-    """Keep the heaviest member of each lane."""
+    """Reduce each lane to its heaviest hypothesis."""
     for i in range(LANES):
         best = _heaviest(rows, count, i)
         for k in range(i, MEMBER, LANES):
@@ -319,7 +314,7 @@ def keep_heaviest(rows: Rows, count: Counts) -> None:
 
 @no_alloc
 def drop_heaviest(rows: Rows, count: Counts) -> None:
-    """Drop the heaviest member of each lane that has several."""
+    """Remove the heaviest hypothesis of each lane with several."""
     for i in range(LANES):
         if count[i] == 1:
             continue
@@ -337,7 +332,7 @@ def drop_heaviest(rows: Rows, count: Counts) -> None:
 
 @no_alloc
 def heaviest_to_range(pose: Poses, rows: Rows, count: Counts, distance: float, turn: Lanes) -> None:
-    """Move the heaviest member to a range, in its present direction; its covariance stays."""
+    """Move the heaviest hypothesis to a range, keeping its bearing and covariance."""
     for i in range(LANES):
         if turn[i] > 0.0:
             member = rows[_heaviest(rows, count, i)]
@@ -348,7 +343,7 @@ def heaviest_to_range(pose: Poses, rows: Rows, count: Counts, distance: float, t
 
 @no_alloc
 def reset_member(pose: Poses, member: Member, row: Row, turn: Lanes) -> None:
-    """Give a member the covariance that it would have if it were placed where it is."""
+    """Reset the covariance of a hypothesis as if initialised at its position."""
     for i in range(LANES):
         if turn[i] > 0.0:
             dx, dy = member[X + i] - pose[X + i], member[Y + i] - pose[Y + i]
@@ -361,10 +356,10 @@ def reset_member(pose: Poses, member: Member, row: Row, turn: Lanes) -> None:
 
 @no_alloc
 def _prune(rows: Rows, count: Counts, members: Whole, prune: float, scratch: Scratch) -> None:
-    """Drop members whose aggregated likelihood is too small; the heaviest stays (Eq. (21))."""
+    """Remove hypotheses of small aggregated likelihood, but not the heaviest (Eq. (21))."""
     largest, total = scratch.largest, scratch.total
     _largest(scratch.posterior, members, largest)
-    least = largest  # which is not needed any more
+    least = largest  # reuses the array
     for i in range(LANES):
         least[i] = min(prune / count[i], exponential(largest[i]))
         total[i] = 0.0
@@ -388,7 +383,7 @@ def _prune(rows: Rows, count: Counts, members: Whole, prune: float, scratch: Scr
 
 @no_alloc
 def _merge_members(rows: Rows, count: Counts, limit: float) -> None:
-    """Merge neighbours of a ray that agree, from near to far, as `ekf.merging` does."""
+    """Merge neighbouring hypotheses of a ray that agree, near to far, as `ekf.correction` does."""
     for i in range(LANES):
         last = 0
         for j in range(1, count[i]):
@@ -403,7 +398,7 @@ def _merge_members(rows: Rows, count: Counts, limit: float) -> None:
 
 @no_alloc
 def _merged(one: Member, other: Member, limit: float, i: Whole) -> Flag:
-    """Replace the first of a lane's two members by their mixture, if they agree; tell if so."""
+    """Replace the first of two hypotheses by their mixture if they agree; return if they do."""
     x, y = other[X + i] - one[X + i], other[Y + i] - one[Y + i]
     xx, xy = 0.5 * (one[XX + i] + other[XX + i]), 0.5 * (one[XY + i] + other[XY + i])
     yy = 0.5 * (one[YY + i] + other[YY + i])
@@ -422,7 +417,7 @@ def _merged(one: Member, other: Member, limit: float, i: Whole) -> Flag:
 
 @no_alloc
 def _close_up(rows: Rows, count: Counts, keep: Float[np.ndarray, "_ lanes"]) -> None:
-    """Move the kept members to the front, lane by lane."""
+    """Move the kept hypotheses to the front of each lane."""
     for i in range(LANES):
         left = 0
         for j in range(count[i]):

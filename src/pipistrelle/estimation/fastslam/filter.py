@@ -1,24 +1,24 @@
-r"""FastSLAM 2.0 with rays: each particle a sampled path with its own map.
+r"""FastSLAM 2.0 with rays: particles, each with a sampled path and a map.
 
-Given a path, landmarks are independent: a particle needs one small Gaussian for each and no joint
+Given a path, landmarks are independent: a particle needs a small Gaussian for each, but no joint
 covariance (Eq. (12)),
 
 .. math:: Y^{[j]} = \bigl\langle \hat x^{[j]}, \{\hat m_1^{[j]}, \hat P_1^{[j]}\}, \dots,
           \{\hat m_N^{[j]}, \hat P_N^{[j]}\} \bigr\rangle
    :label: eq-12
 
-and for a ray one per member, with its aggregated likelihood (Eq. (22)):
+and for each hypothesis of a ray, with its aggregated likelihood (Eq. (22)):
 
 .. math:: \{\hat m_i^{[j]}, \hat P_i^{[j]}\} \to
           \{\hat m_{i,1}^{[j]}, \hat P_{i,1}^{[j]}, \Lambda_{i,1}^{[j]}\}, \dots,
           \{\hat m_{i,N_g}^{[j]}, \hat P_{i,N_g}^{[j]}, \Lambda_{i,N_g}^{[j]}\}
    :label: eq-22
 
-A frame goes through five steps.
+The update by a frame has five steps; frames without measurements only extend the motion.
 
 1. **Propose.** Mean and covariance of the pose accumulate over the control steps since the last
-   sample, then each measurement of a mapped landmark refines them (Eqs. (13) and (14), in Kalman
-   form, each at the refined mean):
+   sample (from the start's covariance P0), then each measurement of a mapped landmark refines them
+   (Eqs. (13) and (14), in Kalman form, each at the refined mean):
 
    .. math:: S_i = H_x P_{i-1} H_x^T + H_m P_m H_m^T + R, \qquad
              K_i = P_{i-1} H_x^T S_i^{-1}, \\
@@ -26,32 +26,26 @@ A frame goes through five steps.
              P_i = (I - K_i H_x) P_{i-1}
       :label: eq-14
 
-   A particle's weight grows by each measurement's marginal likelihood
-   :math:`N(\nu_i; 0, S_i)`. Their product is the likelihood of the frame given the particle's past.
-   Of a partial landmark it is the members' mixture, :math:`\sum_j \Lambda_j N(\nu_j; 0, S_j)`, with
-   or without a range; a new landmark adds no weight.
-2. **Sample** the pose, once, from this refined Gaussian:
+   A particle's weight is multiplied by each marginal likelihood :math:`N(\nu_i; 0, S_i)`, for a
+   partially initialised landmark by the mixture :math:`\sum_j \Lambda_j N(\nu_j; 0, S_j)`.
+2. **Sample** the pose from this refined Gaussian:
 
    .. math:: \hat x_k^{[j]} \sim p(x_k \mid \hat x_{k-1}^{[j]}, u_k, z_k)
       :label: eq-13
-3. **Correct** the landmarks, weigh, share and prune the rays (`rays`), from the sampled pose.
+3. **Correct** the landmarks from the sampled pose; weigh, share and prune the rays (`rays`).
 4. **Place** new landmarks from the sampled pose.
-5. **Resample** when too few particles count (`resampling`). The members of a ray keep their
-   weights, or, with ``resampled_rays = "restart"``, become alike again, as the particles do: a ray
-   then collapses only by what is heard between two resamplings.
+5. **Resample** if too few particles are effective (`poses`). The hypotheses of a ray keep their
+   weights, or get equal weights with ``resampled_rays = "restart"``.
 
-``mixture`` says how a bearing treats a ray. ``federated``, the paper's way, corrects every member
-with the noise R / share. ``exact`` uses that members are independent given the pose: each is
-corrected with R itself and only the weights tell them apart, as in a Gaussian sum filter; the
-proposal is refined to the mean and covariance of the mixture of its members' refinements.
+``mixture = "federated"``, as in the paper, updates every hypothesis of a ray with the noise R /
+share. ``exact`` uses their independence given the pose: each is updated with R, only the weights
+distinguish them (Gaussian sum filter), and the proposal has the moments of their mixture.
 
-A frame without measurements is not sampled: its motion goes on accumulating, which loses nothing.
-The start is not sampled either: its covariance P0 is the first that accumulates.
+A frame without measurements is not sampled: its motion accumulates. The start is not sampled
+either: its covariance P0 is the first to accumulate.
 
-Excess paths are not used: they tie each landmark to a caller, and the paper's FastSLAM has a
-Gaussian for each landmark of its own. A scan that has them is used without them.
-
-Landmarks of all particles: their moments, taken out, and two that become one.
+Excess paths are not used: they tie each landmark to a caller, and the paper's FastSLAM has an
+independent Gaussian for each landmark.
 """
 
 import math
@@ -105,59 +99,57 @@ from pipistrelle.geometry import wrap
 
 _PAPER = FastSlamConfig()
 _PACKED = ([0, 0, 1, 0, 1, 2], [0, 1, 1, 2, 2, 2])
-"""Where in a pose's covariance the rows xx, xy, yy, xh, yh and hh of a block come from."""
+"""Indices in a pose's covariance of the rows xx, xy, yy, xh, yh and hh of a block."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class FastSlamBelief:
-    """Particles, and their summary.
+    """Particles with poses, maps and weights, and their estimate.
 
-    Particles are kept in b blocks of L = `block.LANES`, number by number: a row of L numbers is one
-    number of each of a block's particles. Spare lanes of the last block repeat the last particle.
+    Particles are kept in b blocks of L = `block.LANES`: a row of L numbers is a number of each of a
+    block's particles. Spare lanes of the last block repeat the last particle.
     """
 
     poses: Float[np.ndarray, "b rows"]
-    """(b, 9 L): x, y [m], heading [rad], and xx, xy, yy, xh, yh, hh of the covariance since the
-    last sample."""
+    """(b, 9 L): x, y [m], heading [rad], and covariance xx, xy, yy, xh, yh, hh since the last
+    sample."""
     log_weight: Float[np.ndarray, " p"]
     landmark: Int[np.ndarray, " n"]  # label, in order of entry
     first: Int[np.ndarray, " n+1"]  # first row of each landmark in ``member``, then their number
-    count: Int[np.ndarray, "b n lanes"]  # members of each particle's landmark
+    count: Int[np.ndarray, "b n lanes"]  # number of hypotheses of each particle's landmark
     member: Float[np.ndarray, "b c numbers"]
     """(b, c, 6 L): x, y [m], xx, xy, yy [m^2] and log weight of each hypothesis."""
     estimate: Gaussian
-    """The pose by ``settings.estimate``, before any resampling."""
-    best_count: Int[np.ndarray, " n"]  # the map of the heaviest particle, before any resampling
+    """Pose estimate selected by ``settings.estimate``, before resampling."""
+    best_count: Int[np.ndarray, " n"]  # map of the heaviest particle, before resampling
     best_member: Float[np.ndarray, "c 6"]
     full: float  # weighted mean number of fully initialised landmarks
     gated: int
     innovations: Innovations = NO_INNOVATIONS  # of the heaviest particle before each scan
-    best: int = 0  # the heaviest particle, or after a resampling its first copy
-    mixed: bool = False  # whether the map is that of all particles
-    before: "FastSlamBelief | None" = (
-        None  # the belief before the resampling, as long as nothing has moved
-    )
+    best: int = 0  # heaviest particle, or its first copy after resampling
+    mixed: bool = False  # whether the map combines all particles
+    before: "FastSlamBelief | None" = None  # belief before resampling, until the next motion
 
     def pose(self) -> Gaussian:
         """Return the vehicle's pose, (3) and (3, 3)."""
         return self.estimate
 
     def landmarks(self) -> Landmarks:
-        """Return the map, one row per member: of all particles or of the heaviest."""
+        """Return the map, one row per hypothesis, from all particles or from the heaviest."""
         if self.mixed:
             return mixture_map(self.before or self)
         return _rows(self.landmark, self.first, self.best_count, self.best_member)
 
     def labels(self) -> list[int]:
-        """Return the labels of all landmarks, placed or not."""
+        """Return the labels of all landmarks, initialised or not."""
         return self.landmark.tolist()
 
     def joint(self) -> JointGaussian:
-        """Return pose and placed landmarks of all particles together (`editing`)."""
+        """Return the joint Gaussian of pose and initialised landmarks over all particles."""
         return joint_of(self)
 
     def edited(self, remove: Sequence[int], merge: Sequence[tuple[int, int]]) -> "FastSlamBelief":
-        """Return the belief without some landmarks, and with others as one (`editing`)."""
+        """Return the belief with landmarks removed and merged."""
         return replace(self, **edits(self, remove, merge), before=None)
 
     def cloud(self) -> Float[np.ndarray, "p 3"]:
@@ -170,8 +162,6 @@ class FastSlamBelief:
 class FastSlam:
     """FastSLAM 2.0 (Bradley & Abaid, Sec. III-B) with rays (Sec. III-C).
 
-    Examples
-    --------
     >>> from pipistrelle.detection.scans import make_scan
     >>> motion = Motion(model="bicycle", control_std=(0.1, 0.03), wheelbase=0.2)
     >>> slam = FastSlam(motion=motion, rays=RayConfig())
@@ -186,16 +176,16 @@ class FastSlam:
     motion: Motion
     rays: RayConfig
     gate: float = 1.0
-    """A measurement that is outside this share of every particle's predicted distribution is
-    dropped; 1 drops none."""
+    """Gate: measurements outside this share of every particle's predicted distribution are
+    discarded; 1 keeps all."""
     settings: FastSlamConfig = _PAPER
 
     def __post_init__(self) -> None:
-        """Refuse a gate that is no share."""
+        """Check that the gate is a probability."""
         check_gate(self.gate)
 
     def init(self, pose: Gaussian) -> FastSlamBelief:
-        """Return the belief that knows a pose, (3) and (3, 3), and no landmark."""
+        """Return the initial belief at a pose, (3) and (3, 3), without landmarks."""
         pose = usable_pose(pose)
         particles = self.settings.particles
         blocks = -(-particles // LANES)
@@ -218,7 +208,7 @@ class FastSlam:
         )
 
     def knowing(self, belief: FastSlamBelief, known: Landmarks) -> FastSlamBelief:
-        """Return a first belief with landmarks in its map, the same in every particle."""
+        """Return the initial belief with known landmarks, the same in every particle."""
         check_belief(belief, FastSlamBelief)
         known = usable_known(known)
         blocks, n = len(belief.poses), known.landmark.size
@@ -242,9 +232,9 @@ class FastSlam:
         dt: Float[np.ndarray, " k"],
         rng: np.random.Generator | None = None,
     ) -> tuple[FastSlamBelief, Gaussian]:
-        """Carry every particle's pose and covariance through a frame's control steps (Eq. (10)).
+        """Predict every particle's pose and covariance through a frame's control steps (Eq. (10)).
 
-        Returns the belief and the mean pose after each step, (k, 3) and (k, 3, 3); draws nothing.
+        Returns the belief, and the mean pose after each step, (k, 3) and (k, 3, 3).
         """
         check_belief(belief, FastSlamBelief)
         controls, dt = usable_controls(self.motion, controls, dt)
@@ -261,10 +251,9 @@ class FastSlam:
     def update(
         self, belief: FastSlamBelief, scan: Scan, rng: np.random.Generator
     ) -> FastSlamBelief:
-        """Refine, sample, correct, place and resample with a scan (Eqs. (12) to (22)).
+        """Update the belief with a scan: refine, sample, correct, place, resample (Eqs. (12)-(22)).
 
-        It draws three normals per particle, then one uniform number per particle; nothing for an
-        empty scan, which a recorded log cannot hold.
+        Draws three normals, then a uniform number, per particle; nothing for an empty scan.
         """
         check_belief(belief, FastSlamBelief)
         scan = usable_scan(scan)
@@ -306,7 +295,7 @@ class FastSlam:
         return self._resampled(after, stratified(weight, uniform))
 
     def _estimating(self, weight: Float[np.ndarray, " p"], best: int) -> Float[np.ndarray, " p"]:
-        """Return the weights by which particles make the pose."""
+        """Return the particle weights of the pose estimate."""
         if self.settings.estimate != "heaviest":
             return weight
         return (np.arange(weight.size) == best).astype(float)
@@ -328,7 +317,7 @@ class FastSlam:
         )
 
     def _inside(self, belief: FastSlamBelief, scan: Scan, params: UpdateParams) -> tuple[Scan, int]:
-        """Return a scan without the measurements that no particle expected, and their number."""
+        """Discard measurements outside every particle's gate; return the scan and their number."""
         if self.gate >= 1.0:
             return scan, 0
         gated = gated_by_all(_arrays(belief), columns_of(scan), params)
@@ -336,7 +325,7 @@ class FastSlam:
 
 
 def _arrays(belief: FastSlamBelief) -> Arrays:
-    """Return a belief's particles as kernels take them."""
+    """Return a belief's particles as a tuple for kernels."""
     return belief.poses, belief.landmark, belief.first, belief.count, belief.member
 
 
@@ -346,7 +335,7 @@ def _rows(
     count: Int[np.ndarray, " n"],
     member: Float[np.ndarray, "c 6"],
 ) -> Landmarks:
-    """Return one particle's map, one row per member."""
+    """Return a particle's map, one row per hypothesis."""
     label = np.repeat(landmark, count)
     offset = np.arange(label.size) - np.repeat(np.cumsum(count) - count, count)
     rows = member[np.repeat(first[:-1], count) + offset]
@@ -359,24 +348,24 @@ def _rows(
 
 
 class _Placed(NamedTuple):
-    """Landmarks that most particles have placed, by p particles and k landmarks."""
+    """Landmarks that most particles have initialised, for p particles and k landmarks."""
 
     there: Int[np.ndarray, " k"]
-    """Their numbers."""
+    """Indices of the landmarks."""
     weight: Float[np.ndarray, " p"]
-    """Of each particle."""
+    """Weight of each particle."""
     placed: Bool[np.ndarray, "p k"]
-    """Whether a particle has placed it."""
+    """Whether each particle has initialised the landmark."""
     members: Float[np.ndarray, "p k 6"]
-    """Its numbers in each particle."""
+    """Position, covariance and log weight in each particle."""
     share: Float[np.ndarray, "p k"]
-    """Weight of each particle among those that have placed it."""
+    """Weight of each particle among the particles with the landmark initialised."""
     spots: Float[np.ndarray, "k 2"]
     """Mean position [m]."""
 
 
 def _placed_by_most(belief: FastSlamBelief) -> _Placed:
-    """Return the landmarks that most particles, by weight, have placed."""
+    """Return the landmarks that most particles, by weight, have initialised."""
     particles = belief.log_weight.size
     weight = np.exp(belief.log_weight - belief.log_weight.max())
     weight /= weight.sum()
@@ -390,13 +379,13 @@ def _placed_by_most(belief: FastSlamBelief) -> _Placed:
 
 
 def mixture_map(belief: FastSlamBelief) -> Landmarks:
-    r"""Return the map that all particles have: mean and covariance of each landmark over them.
+    r"""Return the map of all particles: mean and covariance of each landmark over them.
 
     .. math:: \bar l = \sum_i w_i l_i, \qquad
               P = \sum_i w_i \left( (l_i - \bar l)(l_i - \bar l)^T + P_i \right)
 
-    A landmark is fully initialised if it is in most particles, by weight. Of any other the rows are
-    those of the heaviest particle in which it is a ray.
+    A landmark is fully initialised if it is so in most particles, by weight. Others are copied from
+    the heaviest particle that has them as a ray.
     """
     of = _placed_by_most(belief)
     off = of.members[..., :2] - of.spots
@@ -425,13 +414,13 @@ def mixture_map(belief: FastSlamBelief) -> Landmarks:
 
 
 def joint_of(belief: FastSlamBelief) -> JointGaussian:
-    r"""Return pose and placed landmarks of all particles as one Gaussian.
+    r"""Return pose and initialised landmarks of all particles as a joint Gaussian.
 
     .. math:: \bar x = \sum_i w_i x_i, \qquad
               P = \sum_i w_i \left( (x_i - \bar x)(x_i - \bar x)^T + P_i \right)
 
-    with each particle's own covariances :math:`P_i` of its pose and of its landmarks. A landmark
-    counts that most particles have placed; where one has not, it is at the mean.
+    with each particle's covariances :math:`P_i` of pose and landmarks. Only landmarks that most
+    particles have initialised are included; in the other particles they have the mean position.
     """
     there, weight, placed, members, share, spots = _placed_by_most(belief)
     rows = _numbers(belief.poses, 9)[: weight.size]
@@ -448,19 +437,19 @@ def joint_of(belief: FastSlamBelief) -> JointGaussian:
 
 
 def _numbers(blocks: np.ndarray, count: int) -> np.ndarray:
-    """Return numbers by block and lane as numbers of particles, the numbers of one last."""
+    """Convert numbers by block and lane to numbers by particle, moved to the last axis."""
     middle = blocks.shape[1:-1]
     lanes = blocks.reshape(len(blocks), *middle, count, LANES)
     return np.moveaxis(lanes, -1, 1).reshape(len(blocks) * LANES, *middle, count)
 
 
 def _lanes(count: np.ndarray) -> np.ndarray:
-    """Return counts by block, landmark and lane as counts by particle and landmark."""
+    """Convert counts by block, landmark and lane to counts by particle and landmark."""
     return np.swapaxes(count, 1, 2).reshape(len(count) * LANES, count.shape[1])
 
 
 def _packed(numbers: Float[np.ndarray, "6"]) -> Float[np.ndarray, "3 3"]:
-    """Return the covariance that xx, xy, yy, xh, yh and hh are."""
+    """Convert xx, xy, yy, xh, yh and hh to a 3 x 3 covariance."""
     xx, xy, yy, xh, yh, hh = numbers
     return np.array([[xx, xy, xh], [xy, yy, yh], [xh, yh, hh]])
 
@@ -468,9 +457,9 @@ def _packed(numbers: Float[np.ndarray, "6"]) -> Float[np.ndarray, "3 3"]:
 def edits(
     belief: FastSlamBelief, remove: Sequence[int], merge: Sequence[tuple[int, int]]
 ) -> dict[str, Any]:
-    """Return the changed arrays of a belief without some landmarks, and with others as one.
+    """Remove and merge landmarks of a belief; return its changed arrays.
 
-    Of two that are one, that stays which most particles have placed, the first if both are.
+    A merged pair keeps the landmark that most particles have initialised, the first if both are.
     """
     landmark, gone = belief.landmark.copy(), [*remove]
     for kept, other in merge:
@@ -486,7 +475,7 @@ def edits(
 
 
 def _number(belief: FastSlamBelief, label: int) -> int:
-    """Return the number of a landmark; refuse one that is not on the map."""
+    """Return the index of a landmark; raise InputError if it is not on the map."""
     found = np.flatnonzero(belief.landmark == label)
     if not found.size:
         raise InputError(f"association: found landmark {label} to change, which is not on the map")
@@ -496,7 +485,7 @@ def _number(belief: FastSlamBelief, label: int) -> int:
 def _without(
     belief: FastSlamBelief, landmark: np.ndarray, kept: Bool[np.ndarray, " n"]
 ) -> dict[str, Any]:
-    """Return the arrays of a belief of which some landmarks are left, by their new labels."""
+    """Return a belief's arrays reduced to selected landmarks, with new labels."""
     rows = np.diff(belief.first)
     members = np.repeat(kept, rows)
     return {

@@ -1,9 +1,7 @@
-"""Kernels on all particles: gate, correct, resample.
+"""Kernels on all particles: gate, update and resample.
 
-The steps of a block are in `block` and `block_rays`.
-
-Landmark n of a block has its members in the rows ``member[b, first[n] : first[n + 1]]``, of which
-lane i has the first ``count[b, n, i]``: the particles share the rows, not the members.
+Landmark n of block b has its hypotheses in the rows ``member[b, first[n] : first[n + 1]]``, and
+lane i uses the first ``count[b, n, i]``.
 """
 
 import math
@@ -61,11 +59,11 @@ class Particles(NamedTuple):
 
 
 Arrays = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]
-"""The same as a plain tuple, which is passed to a kernel faster."""
+"""`Particles` as a plain tuple, which kernels take faster."""
 
 
 class Block(NamedTuple):
-    """One block: poses, what their log weights gain, the maps."""
+    """Poses, log-weight gains and maps of a block of particles."""
 
     pose: Poses
     gained: Lanes
@@ -85,7 +83,7 @@ def slot_of(landmark: Int[np.ndarray, " n"], label: Whole) -> Whole:
 
 @kernel
 def _slots(landmark: Int[np.ndarray, " n"], labels: Int[np.ndarray, " m"]) -> Int[np.ndarray, " m"]:
-    """Return the index of each label among the landmarks; -1 for a new one."""
+    """Return the index of each label among the landmarks; -1 if new."""
     slot = np.empty(labels.size, dtype=np.int64)
     for m in range(labels.size):
         slot[m] = slot_of(landmark, labels[m])
@@ -118,7 +116,7 @@ def gated_by_all(arrays: Arrays, columns: Columns, params: UpdateParams) -> Bool
 
 @kernel
 def innovations_of(arrays: Arrays, columns: Columns, particle: Whole) -> tuple[float, float]:
-    """Sum one particle's squared innovations over rows of placed landmarks, and their degrees."""
+    """Sum a particle's squared innovations of initialised landmarks and their dimensions."""
     particles, heard = Particles(*arrays), measurements(columns)
     slot, b, i = _slots(particles.landmark, heard.landmark), particle // LANES, particle % LANES
     squared, degrees = 0.0, 0.0
@@ -138,7 +136,7 @@ def innovations_of(arrays: Arrays, columns: Columns, particle: Whole) -> tuple[f
 def _correct_by_range(
     pose: Poses, rows: Rows, count: Counts, row: Row, params: UpdateParams, scratch: Scratch
 ) -> None:
-    """Correct a landmark by range and bearing, a ray as `rays.ranged` says, in place."""
+    """Update a landmark by range and bearing, a ray as ``rays.ranged`` selects, in place."""
     ranged = params.ranged
     if ranged == CORRECTED:
         keep_heaviest(rows, count)
@@ -192,10 +190,7 @@ def _refine(
 def _refine_by_ranged_ray(
     block: Block, rows: Rows, count: Counts, row: Row, params: UpdateParams, scratch: Scratch
 ) -> None:
-    """Weigh a block's poses by range and bearing of a ray, or by its bearing alone.
-
-    Where a range leaves it a ray, the bearing refines and weighs the poses as if it came alone.
-    """
+    """Weigh a block's poses by range and bearing of a ray, or refine them by its bearing only."""
     pose, gained, ray = block.pose, block.gained, scratch.ray
     if params.ranged >= BEARING:
         refine_by_ray(pose, rows, count, row, params, ray, scratch, gained)
@@ -212,11 +207,7 @@ def _weigh_at_sample(
     params: UpdateParams,
     scratch: Scratch,
 ) -> None:
-    """Weigh a block's sampled poses anew: prior x likelihood / proposal at the sample.
-
-    ``before`` are the poses of the prior and of the proposal. Where both filters are linear this is
-    the likelihood before the sample; elsewhere it corrects for a proposal that fits badly.
-    """
+    """Weigh a block's sampled poses by prior x likelihood / proposal at the sample."""
     block.gained[:] = 0.0
     weigh_sample(before[0], before[1], block.pose, block.gained)
     for m in range(slot.size):
@@ -238,7 +229,7 @@ def _weigh_at_sample(
 
 @no_alloc_inlined
 def _correct_row(block: Block, n: Whole, row: Row, params: UpdateParams, scratch: Scratch) -> None:
-    """Correct a block's landmark n from its sampled poses by a measurement, in place."""
+    """Update a block's landmark n with a measurement from the sampled poses, in place."""
     rows, pose = block.member[block.first[n] : block.first[n + 1]], block.pose
     count = block.count[n]
     if math.isnan(row.range):
@@ -255,7 +246,7 @@ def _correct(
     params: UpdateParams,
     scratch: Scratch,
 ) -> None:
-    """Correct a block's measured landmarks from its sampled poses, in place."""
+    """Update a block's measured landmarks from its sampled poses, in place."""
     for m in range(slot.size):
         if slot[m] >= 0:
             _correct_row(block, slot[m], row_of(heard, m), params, scratch)
@@ -263,7 +254,7 @@ def _correct(
 
 @no_alloc
 def _add_new(pose: Poses, rows: Rows, count: Counts, row: Row, params: UpdateParams) -> None:
-    """Place a block's new landmark: one member, or a ray (Eqs. (16) to (18))."""
+    """Initialise a block's new landmark: a single hypothesis, or a ray (Eqs. (16) to (18))."""
     if not math.isnan(row.range):
         initialise_member(pose, rows[0], row, 0.0, count)
         count[:] = 1
@@ -297,7 +288,7 @@ def _place(
 def _rows(
     particles: Particles, slot: Int[np.ndarray, " m"], heard: Measurements, rays: Whole
 ) -> tuple[Int[np.ndarray, " n"], Int[np.ndarray, " n+1"], Whole]:
-    """Return all labels, each landmark's first row, and the most rows that one needs."""
+    """Return all labels, each landmark's first row, and the largest number of rows."""
     known, fresh, widest = particles.landmark.size, 0, 1
     for m in range(slot.size):
         fresh += slot[m] < 0
@@ -321,7 +312,7 @@ def _rows(
 
 @no_alloc
 def _copy_members(particles: Particles, b: Whole, block: Block) -> None:
-    """Copy the members of a block into their new rows."""
+    """Copy the hypotheses of a block to their new rows."""
     for n in range(particles.landmark.size):
         for j in range(block.first[n + 1] - block.first[n]):
             source = particles.member[b, particles.first[n] + j]
@@ -340,9 +331,9 @@ def correct_particles(
     params: UpdateParams,
     sampled: bool,
 ) -> tuple[Arrays, Float[np.ndarray, " p"]]:
-    """Refine, sample, correct and extend a copy of all particles; return it and log weights.
+    """Refine, sample, update and extend a copy of all particles; return it and its log weights.
 
-    With ``sampled`` they are weighed at the sample.
+    With ``sampled``, particles are weighed at the sampled pose.
     """
     old, heard = Particles(*arrays), measurements(columns)
     blocks, known, total = old.pose.shape[0], old.landmark.size, normal.shape[0]
@@ -371,7 +362,7 @@ def correct_particles(
 def particle_map(
     count: Int[np.ndarray, "b n lanes"], member: Float[np.ndarray, "b c numbers"], particle: Whole
 ) -> tuple[Int[np.ndarray, " n"], Float[np.ndarray, "c 6"]]:
-    """Return one particle's map: the number of each landmark's members, and their rows."""
+    """Return a particle's map: the number of each landmark's hypotheses, and their rows."""
     b, i = particle // LANES, particle % LANES
     rows = np.empty((member.shape[1], MEMBER // LANES))
     for j in range(rows.shape[0]):
@@ -382,7 +373,7 @@ def particle_map(
 
 @kernel
 def mean_full(count: Int[np.ndarray, "b n lanes"], weight: Float[np.ndarray, " p"]) -> float:
-    """Average over particles how many landmarks have one member: exact where all agree."""
+    """Return the mean number of fully initialised landmarks; exact if all particles agree."""
     first, more = 0, 0.0
     for p in range(weight.size):
         full = 0
@@ -399,7 +390,7 @@ def resample_into(
 ) -> tuple[
     Float[np.ndarray, "b rows"], Int[np.ndarray, "b n lanes"], Float[np.ndarray, "b c numbers"]
 ]:
-    """Put copies of the ancestors in the particles' places; spare lanes follow the last."""
+    """Copy the ancestors to the resampled particles; spare lanes repeat the last."""
     old = Particles(*arrays)
     pose, count = np.empty_like(old.pose), np.empty_like(old.count)
     member, source = np.empty_like(old.member), np.empty(LANES, dtype=np.int64)
@@ -425,7 +416,7 @@ def restart_rays(
     count: Int[np.ndarray, "b n lanes"],
     member: Float[np.ndarray, "b c numbers"],
 ) -> None:
-    """Give the members of each ray equal weights, in place."""
+    """Give the hypotheses of each ray equal weights, in place."""
     for b in range(count.shape[0]):
         for n in range(count.shape[1]):
             for j in range(first[n], first[n + 1]):

@@ -1,15 +1,12 @@
-r"""Kernels on all particles' poses: propagate, and summarise to a mean and a covariance.
+r"""Kernels on particle poses, and resampling: predict, summarise, weigh and draw ancestors.
 
-Resampling: from weighted particles to equally weighted ones.
-
-The weights tell how many particles still count,
+The weights give the effective number of particles,
 
 .. math:: N_\mathrm{eff} = \left( \sum_j w_j^2 \right)^{-1}
 
-(Eq. (15)); below a threshold the particles are drawn anew, each as often as its weight says. The
-draw is *stratified*: one uniform number in each of N equal strata of [0, 1), so particle j gets
-:math:`N w_j` copies on average and differs from it by less than two. Weights are kept as logs,
-because the product of a frame's likelihoods underflows.
+(Eq. (15)); below a threshold the particles are resampled. Resampling is *stratified*: a uniform
+number in each of N equal strata of [0, 1) gives particle j :math:`N w_j` copies on average, within
+less than two. Weights are stored as logarithms, as the product of a frame's likelihoods underflows.
 """
 
 import math
@@ -38,11 +35,9 @@ from pipistrelle.jit import kernel, no_alloc
 
 
 def normalised(log_weight: Float[np.ndarray, " p"]) -> Float[np.ndarray, " p"]:
-    """Return the weights that sum to one, from their logs.
+    """Return the weights that sum to 1, from their logs; equal weights if no log is finite.
 
-    The sum is rounded once, so the order of the particles does not matter, to the last bit. Where
-    no log weight is finite the weights are equal: such a filter has lost the vehicle, which is a
-    result and not an error.
+    The sum is rounded only once, so that it is independent of the order of particles.
 
     >>> normalised(np.array([-1000.0, -1000.0 + np.log(3.0)])).round(12)
     array([0.25, 0.75])
@@ -66,15 +61,13 @@ def _shifted(log_weight):
 
 
 def effective_particles(weight: Float[np.ndarray, " p"]) -> float:
-    r"""Return how many equally weighted particles would be worth as much, in [1, p].
+    r"""Return the effective number of particles, in [1, p], for weights that sum to 1.
 
     .. math:: N_\mathrm{eff} = 1 / \sum_j w_j^2
        :label: eq-15
 
-    Bradley & Abaid, Eq. (15); the weights sum to 1.
+    Bradley & Abaid, Eq. (15).
 
-    Examples
-    --------
     >>> effective_particles(np.array([0.5, 0.5, 0.0, 0.0]))
     2.0
     """
@@ -84,10 +77,10 @@ def effective_particles(weight: Float[np.ndarray, " p"]) -> float:
 def stratified(
     weight: Float[np.ndarray, " p"], uniform: Float[np.ndarray, " p"]
 ) -> Int[np.ndarray, " p"]:
-    """Draw each particle's ancestor, one from each stratum of the cumulated weights.
+    """Draw each particle's ancestor, from the strata of the cumulated weights, in rising order.
 
-    The weights sum to 1, ``uniform`` is in [0, 1); the indices rise. Bradley & Abaid, Sec. III-B;
-    Douc, Cappe & Moulines (2005).
+    The weights sum to 1, ``uniform`` is in [0, 1). Bradley & Abaid, Sec. III-B; Douc, Cappe &
+    Moulines (2005).
 
     >>> stratified(np.array([0.1, 0.6, 0.3]), np.array([0.2, 0.9, 0.5])).tolist()
     [0, 1, 2]
@@ -95,13 +88,13 @@ def stratified(
     points = (np.arange(weight.size) + uniform) / weight.size
     bounds = np.cumsum(weight)
     bounds /= bounds[-1]
-    last = np.flatnonzero(weight)[-1]  # a point can round to 1
+    last = np.flatnonzero(weight)[-1]  # a point may round to 1
     return np.minimum(np.searchsorted(bounds, points, side="right"), last)
 
 
 SMALLEST_STD = 1e-6
-"""Added in quadrature to x, y [m] and heading [rad] of the estimate: particles that stand still or
-share an ancestor have no spread, and their covariance no inverse."""
+"""Added in quadrature to x, y [m] and heading [rad] of the estimate, as stationary particles or
+copies of an ancestor have a singular covariance."""
 
 
 LEAST = SMALLEST_STD**2
@@ -149,7 +142,7 @@ def _add_lanes(sums: Poses) -> Float[np.ndarray, "9"]:
 def summarise(
     pose: Float[np.ndarray, "b rows"], weight: Float[np.ndarray, " p"]
 ) -> tuple[Float[np.ndarray, "3"], Float[np.ndarray, "3 3"]]:
-    """Return mean (circular in the heading) and covariance of all particles, their own added."""
+    """Return mean (circular in the heading) and covariance of all particles with theirs."""
     blocks = pose.shape[0]
     lanes, sums = np.zeros((blocks, LANES)), np.zeros(POSE)
     for p in range(weight.size):
@@ -174,7 +167,7 @@ def summarise(
 
 @no_alloc
 def _propagate_block(pose: Poses, step: tuple[float, ...], q0: float, q1: float) -> None:
-    """Propagate a block's poses by a control step in the vehicle's frame (Eq. (10))."""
+    """Predict a block's poses by a control step in the vehicle's frame (Eq. (10))."""
     ahead, aside, turn, u00, u10, u20, u01, u11, u21 = step
     for i in range(LANES):
         c, s = cosine_and_sine(pose[HEADING + i])
@@ -195,7 +188,7 @@ def _propagate_block(pose: Poses, step: tuple[float, ...], q0: float, q1: float)
 
 @no_alloc
 def _propagate_block_by(pose: Poses, step: tuple[float, ...], noise: tuple[float, ...]) -> None:
-    """Propagate a block's poses by a motion with a covariance, both in the vehicle's frame."""
+    """Predict a block's poses by a motion and its covariance, both in the vehicle's frame."""
     ahead, aside, turn = step[0], step[1], step[2]
     qxx, qxy, qxh, qyy, qyh, qhh = noise
     for i in range(LANES):
@@ -226,7 +219,7 @@ def propagate(
     pose_means: Float[np.ndarray, "k 3"],
     pose_covariances: Float[np.ndarray, "k 3 3"],
 ) -> None:
-    """Propagate all particles through control steps, in place, and summarise after each."""
+    """Predict all particles through control steps, in place, and summarise after each."""
     for k in range(dt.size):
         control = controls[k]
         step = motion_increment(motion, 0.0, control, dt[k])

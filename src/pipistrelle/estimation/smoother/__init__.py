@@ -1,1 +1,1 @@
-"""The smoother: `filter` is the method, `elimination` the solver, `belief` what it answers."""
+"""Smoother: `filter` is the estimator, `elimination` the solver, `belief` the result."""

@@ -1,10 +1,4 @@
-"""The smoother's belief: the solution of all that was heard, and path and map from it.
-
-Landmarks that are taken out of a history, and two that become one.
-
-The rows of a landmark that was none are taken out, as if they had never been heard. Of two that are
-one, all rows are the first's. The chain is then eliminated anew.
-"""
+"""Belief of the smoother: a solution of all measurements, with its trajectory and map."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
@@ -36,7 +30,10 @@ from pipistrelle.jit import kernel
 def edited(
     history: History, remove: Sequence[int], merge: Sequence[tuple[int, int]]
 ) -> tuple[History, Bool[np.ndarray, " l"]]:
-    """Return a history without some landmarks, and with others as one; which of the border stay."""
+    """Remove and merge landmarks of a history; return it, and which separator landmarks remain.
+
+    Their measurements are deleted or relabelled; the chain must be eliminated again.
+    """
     for kept, gone in merge:
         history = _merged(history, _slot(history, kept), _slot(history, gone))
     keep, slots = np.ones(history.rows.size, bool), [_slot(history, label) for label in remove]
@@ -50,7 +47,7 @@ def edited(
 
 
 def _slot(history: History, label: int) -> int:
-    """Return the slot of a landmark; refuse one that moves, or that nobody heard."""
+    """Return the slot of a landmark; raise InputError if it moves or was never measured."""
     if (label, False) not in history.slots:
         raise InputError(
             f"association: found landmark {label} to change, which is not on the map, or moves"
@@ -59,7 +56,7 @@ def _slot(history: History, label: int) -> int:
 
 
 def _merged(history: History, kept: int, gone: int) -> History:
-    """Return a history in which the rows of one slot are another's."""
+    """Assign the measurements of a slot to another slot."""
     if kept == gone:
         raise InputError("association: found a landmark to merge with itself; expected two")
     ends, index, heard = history.rows.entries(0).copy(), history.index.copy(), history.heard.copy()
@@ -74,7 +71,7 @@ def _merged(history: History, kept: int, gone: int) -> History:
 def _with_rows(
     history: History, ends: Int[np.ndarray, "r 4"], keep: Bool[np.ndarray, " r"]
 ) -> History:
-    """Return a history with other ends of its rows, and only some of them."""
+    """Return a history with changed `Rows.ends`, reduced to selected measurements."""
     numbers = history.rows.entries(1)[keep]
     ends, latest = ends[keep], np.full(history.latest.size, -1)
     _link(ends, numbers, latest)
@@ -93,7 +90,7 @@ def _with_rows(
 def _link(
     ends: Int[np.ndarray, "r 4"], numbers: Float[np.ndarray, "r 8"], latest: Int[np.ndarray, " s"]
 ) -> None:
-    """Write the row of each row's bearing before, and the latest of each slot."""
+    """Link each measurement to the previous bearing of its slot; write the latest of each slot."""
     for row in range(ends.shape[0]):
         ends[row, 3] = -1
         if not np.isnan(numbers[row, BEARING]):
@@ -101,7 +98,7 @@ def _link(
 
 
 def _forgetting(history: History, slots: Sequence[int]) -> History:
-    """Return a history whose slots are nobody's: they keep their numbers, under no label."""
+    """Detach slots from their labels, keeping their numbers."""
     named = {slot: key for key, slot in history.slots.items()}
     named |= {slot: (-2 - slot, False) for slot in slots}
     index, heard = history.index.copy(), history.heard.copy()
@@ -111,7 +108,7 @@ def _forgetting(history: History, slots: Sequence[int]) -> History:
 
 
 def _renumbered(history: History, kept: Bool[np.ndarray, " l"]) -> History:
-    """Return a history with some of the border's landmarks, numbered anew."""
+    """Reduce the separator to selected landmarks and renumber them."""
     number, index = np.append(0, np.cumsum(kept)), history.index.copy()
     index[index > 0] = number[index[index > 0]]
     mean, information = history.known
@@ -126,14 +123,14 @@ def _renumbered(history: History, kept: Bool[np.ndarray, " l"]) -> History:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SmootherBelief:
-    """A solution of all that was heard so far, and the control steps since."""
+    """Solution of all measurements up to the last node, and the control steps since."""
 
     at: Gaussian
-    """The pose at the last node of the chain, (3) and (3, 3)."""
+    """Pose at the last node of the chain, (3) and (3, 3)."""
     ahead: Gaussian
-    """The same after the steps since."""
+    """Current pose, after the control steps since the last node."""
     odometry: Odometry
-    """The control steps since, by what is assumed."""
+    """Control steps since the last node, with assumed parameters."""
     history: History
     solution: Solution
     noise: Noise
@@ -141,24 +138,24 @@ class SmootherBelief:
     gated: int = 0
     innovations: Innovations = NO_INNOVATIONS  # counted only with a gate
     doubt: float = 0.0
-    """Evidence that the odometry has failed (`estimation.recovery`)."""
+    """Evidence for failed odometry (`estimation.recovery`)."""
     found: dict[str, Any] = field(init=False, repr=False, default_factory=dict)
-    """The optimum, once it has been asked for, and all covariances there."""
+    """Cache of the optimum and its covariances."""
 
     def best(self) -> Solution:
-        """Return the optimum of all that was heard so far."""
+        """Return the optimum of all measurements so far."""
         if "best" not in self.found:
             self.found["best"] = converged(self.solution, self.history, self.noise)
         return self.found["best"]
 
     def smoothed(self) -> Smoothed:
-        """Return all states and places at the optimum, with their covariances."""
+        """Return all states and landmarks at the optimum, with covariances."""
         if "smoothed" not in self.found:
             self.found["smoothed"] = smoothed(self.best(), self.history)
         return self.found["smoothed"]
 
     def guess(self) -> Float[np.ndarray, " d"]:
-        """Return the pose, and where moving callers are, after the steps since the last node."""
+        """Predict the chain's state: current pose and moving callers."""
         state = self.solution.state.copy()
         state[:POSE] = self.ahead.mean
         for i in range(POSE, len(state), CALLER):
@@ -166,16 +163,16 @@ class SmootherBelief:
         return state
 
     def pose(self) -> Gaussian:
-        """Return the vehicle's pose, (3) and (3, 3)."""
+        """Return the current vehicle pose, (3) and (3, 3)."""
         return self.ahead
 
     def placed(self, odometry: Odometry, first: int) -> Gaussian:
-        """Return the poses after the steps of odometry from number ``first`` on."""
+        """Return the poses after the steps of odometry from index ``first``."""
         parameters = self.history.calibration.odometry.size
         return _placed(self.solution, self.at, odometry, first, parameters)
 
     def path(self) -> Gaussian:
-        """Return the start and every control step so far, given all measurements so far."""
+        """Return the smoothed trajectory at each control step, given all measurements so far."""
         known, legs, steps = self.smoothed(), self.history.legs, self.history.steps
         mean = np.ascontiguousarray(known.states[:, :3])
         mean[:, 2] = wrap(mean[:, 2])
@@ -196,7 +193,7 @@ class SmootherBelief:
         )
 
     def landmarks(self) -> Landmarks:
-        """Return the map: a row for each landmark of the border, a ray for each that waits."""
+        """Return the map: a Gaussian for each initialised landmark, a ray for each other."""
         known = self.smoothed()
         points = [
             (label, Gaussian(mean=place, covariance=about), 1.0)
@@ -207,7 +204,7 @@ class SmootherBelief:
         return _rows(points, self._rays(moving=False))
 
     def calibration(self) -> dict[str, tuple[float, float]]:
-        """Return value and standard deviation of what was calibrated, by name."""
+        """Return estimate and standard deviation of each calibration parameter, by name."""
         known, made = self.smoothed(), self.history.calibration
         values = made.assumed + made.unit * known.parameters
         stds = made.unit * np.sqrt(known.parameter_covariance.diagonal())
@@ -215,14 +212,11 @@ class SmootherBelief:
         return dict(zip(made.names, both, strict=True))
 
     def labels(self) -> list[int]:
-        """Return the labels of all landmarks and callers, placed or not."""
+        """Return the labels of all landmarks and callers, initialised or not."""
         return [label for label, _ in self.history.slots if label >= 0]
 
     def joint(self, among: Int[np.ndarray, " n"] | None = None) -> JointGaussian:
-        """Return pose and placed landmarks together, callers that move among them.
-
-        ``among``: labels of the only landmarks that are returned, besides callers that move.
-        """
+        """Return the joint Gaussian of pose, initialised landmarks and moving callers."""
         solution, steps = self.solution, self.ahead.mean[:2] - self.at.mean[:2]
         d, n, callers = len(solution.state), solution.beta.size, self._callers()
         there = np.flatnonzero(solution.columns)
@@ -253,7 +247,7 @@ class SmootherBelief:
         )
 
     def edited(self, remove: Sequence[int], merge: Sequence[tuple[int, int]]) -> "SmootherBelief":
-        """Return the belief without some landmarks, and with others as one (`editing`)."""
+        """Return the belief with landmarks removed and merged."""
         history, kept = edited(self.history, remove, merge)
         points = replace(self.solution.points, spots=self.solution.points.spots[kept])
         solution = eliminated(history, self.noise, points)
@@ -266,10 +260,7 @@ class SmootherBelief:
         return replace(belief, ahead=ahead)
 
     def freed(self, pose: Float[np.ndarray, "3"], stds: Float[np.ndarray, "3"]) -> "SmootherBelief":
-        """Return the belief with the vehicle at a pose, with an independent error more.
-
-        The change and the error grow evenly over the control steps since the last node.
-        """
+        """Move the pose and add an error, both spread over the steps since the last node."""
         if not len(self.odometry.mean):
             return self
         x, y, turned = pose - self.at.mean
@@ -287,7 +278,7 @@ class SmootherBelief:
         return replace(self, odometry=odometry, ahead=ahead)
 
     def moving(self) -> Landmarks:
-        """Return moving callers: a row for each in the chain, a ray for each heard just now."""
+        """Estimates of moving callers: Gaussians if tracked, else rays from the last bearings."""
         points = [
             (label, _propagated(self.solution, i, self.odometry.seconds, self.noise[3]), 1.0)
             for label, i in self._callers()
@@ -295,10 +286,7 @@ class SmootherBelief:
         return _rows(points, self._rays(moving=True))
 
     def tracks(self) -> dict[int, Gaussian]:
-        """Return where moving callers were at the nodes of the chain, by label.
-
-        A row (2) and (2, 2) for the start and every control step so far, NaN where there is none.
-        """
+        """Return the past positions of moving callers by label, (2) and (2, 2) for each step."""
         history = self.history
         if not history.callers:
             return {}
@@ -313,14 +301,11 @@ class SmootherBelief:
         return found
 
     def _callers(self) -> list[tuple[int, int]]:
-        """Return label and index in the chain of each moving caller."""
+        """Return label and chain index of each moving caller."""
         return [(label, POSE + CALLER * v) for v, label in enumerate(self.history.callers)]
 
     def _rays(self, *, moving: bool) -> list[tuple[int, Gaussian, float]]:
-        """Return the members of the rays of what waits to be placed.
-
-        Those of a landmark begin where it was heard last, those of a moving caller here and now.
-        """
+        """Return ray hypotheses of landmarks or moving callers that are not yet initialised."""
         history, rays = self.history, []
         waits = (history.index == 0) & (history.latest >= 0) & (history.moves == moving)
         labels = list(history.slots)
@@ -345,7 +330,7 @@ class SmootherBelief:
 def _placed(
     solution: Solution, at: Gaussian, odometry: Odometry, first: int, parameters: int
 ) -> Gaussian:
-    """Return the poses after steps of odometry from a solution's last pose, by its parameters."""
+    """Predict poses from a solution's last pose by odometry with the estimated parameters."""
     if not parameters:
         return placed(at, odometry, first)
     estimate = solution.border[1 : 1 + parameters] + solution.beta[1 : 1 + parameters]
@@ -359,7 +344,7 @@ def _placed(
 
 
 def _corrected(odometry: Odometry, parameters: Float[np.ndarray, " q"]) -> Odometry:
-    """Return odometry by its parameters, not by what was assumed."""
+    """Correct odometry by estimated parameters."""
     return replace(odometry, mean=odometry.mean + (odometry.slopes * parameters).sum(axis=-1))
 
 
@@ -369,10 +354,7 @@ def _by_parameters(
     slopes: Float[np.ndarray, "m 3 q"],
     about: Float[np.ndarray, "e e"],
 ) -> Float[np.ndarray, "m 3 3"]:
-    """Return what parameters add to the covariances of poses after a start.
-
-    ``about``: covariance of start and parameters.
-    """
+    """Return the covariance of poses due to parameters; ``about``: of start pose and parameters."""
     c, s, count = np.cos(start[2]), np.sin(start[2]), len(poses)
     by_start, by = np.tile(np.eye(3), (count, 1, 1)), slopes.copy()
     by_start[:, 0, 2], by_start[:, 1, 2] = start[1] - poses[:, 1], poses[:, 0] - start[0]
@@ -382,7 +364,7 @@ def _by_parameters(
 
 
 def _propagated(solution: Solution, i: int, seconds: float, walk_std: float) -> Gaussian:
-    """Return the place of a moving caller some time after the last node, (2) and (2, 2)."""
+    """Predict a moving caller's position some time after the last node, (2) and (2, 2)."""
     b, v, C = slice(i, i + 2), slice(i + 2, i + 4), solution.covariance
     both = seconds * (C[b, v] + C[v, b])
     strayed = walk_std**2 * seconds**3 / 3.0 * np.eye(2)
@@ -395,7 +377,7 @@ def _propagated(solution: Solution, i: int, seconds: float, walk_std: float) -> 
 def _ray(
     pose: Gaussian, bearing: float, std: float, rays: RayConfig
 ) -> list[tuple[Gaussian, float]]:
-    """Return the members of the ray of a waiting landmark, two or more."""
+    """Return the Gaussian hypotheses of a ray, at least two, with equal weights."""
     ranges, stds = ray_members(rays)
     if len(ranges) == 1:
         ranges, stds = np.repeat(ranges, 2), np.repeat(stds, 2)
@@ -415,7 +397,7 @@ def _ray(
 
 
 def _rows(*parts: list[tuple[int, Gaussian, float]]) -> Landmarks:
-    """Return a map of labels, places and weights."""
+    """Collect labelled Gaussians with weights into a map."""
     rows = [row for part in parts for row in part]
     return Landmarks(
         landmark=np.array([label for label, _, _ in rows], dtype=np.int64),

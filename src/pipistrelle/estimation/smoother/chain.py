@@ -1,9 +1,8 @@
-"""The chain solved, and solved again: what has moved is linearised anew.
+"""Solution of the pose chain by elimination and relinearisation.
 
-All is linearised at points that stay, so that what is believed is consistent, until something has
-moved too far from them. Then the chain is eliminated anew at its solution, from the first stretch
-on in which anything has moved (`relinearised`); at the end, all of it, until nothing moves any more
-(`converged`).
+Linearisation points are kept, for consistency, until the estimate has moved too far from them. Then
+the chain is eliminated again from the first changed segment on (`relinearised`), and for the
+smoothed result as a whole until convergence (`converged`).
 """
 
 from collections.abc import Sequence
@@ -27,24 +26,21 @@ from pipistrelle.estimation.smoother.sweep import Noise, Points, Solution, Stret
 from pipistrelle.jit import optimised_once
 
 CONVERGED = 1e-10
-"""Change of the cost, absolute and relative, under which the optimum is reached."""
+"""Change of the cost, absolute and relative, at convergence."""
 LEAST_DAMPING, MOST_DAMPING = 1e-3, 1e9
-"""The least and the most information that holds every unknown at its point [1/m^2, 1/rad^2]."""
+"""Range of Levenberg damping [1/m^2, 1/rad^2]."""
 PASSES = 30
-"""How often all is linearised anew, at most."""
+"""Most relinearisations of the whole chain."""
 LEAST_SHARE, MOST_SHARE = 0.2, 0.95
-"""Share of a step before at which the next goes further."""
+"""Range of ratios of consecutive steps within which the next step is extrapolated."""
 STILL = 1e-4
-"""What has moved by less than this [m, rad] stays where it is linearised."""
+"""Smallest change [m, rad] that moves a linearisation point."""
 
 
 def eliminated(
     history: History, noise: Noise, points: Points, kept: Sequence[Stretch] = (), first: int = 0
 ) -> Solution:
-    """Return the chain linearised at points, eliminated and solved.
-
-    Of the stretches ``kept`` those before number ``first`` stay.
-    """
+    """Linearise, eliminate and solve the chain; segments before ``first`` come from ``kept``."""
     sweep = Sweep(history, noise, points)
     if first:
         sweep.take_up(kept, first)
@@ -57,7 +53,7 @@ def eliminated(
 def stepped(
     solution: Solution, history: History, noise: Noise, guess: Float[np.ndarray, " d"]
 ) -> Sweep:
-    """Return the chain with a node more, before anything is heard there, linearised at a guess."""
+    """Return the chain extended by a node linearised at a guess, before the node's measurements."""
     at = solution.points.at.extended(1)
     at.arrays[0][history.nodes - 1] = guess
     sweep = Sweep(history, noise, replace(solution.points, at=at))
@@ -67,7 +63,7 @@ def stepped(
 
 
 def off_line(solution: Solution, history: History) -> float:
-    """Return how far the lines of the last node's measurements are off (`linearity`)."""
+    """Return the linearisation error of the last node's measurements [std] (`nonlinearity`)."""
     points, k = (solution.points.at.arrays[0], solution.border), history.nodes - 1
     off = solution.state - points[0][k], solution.beta
     return nonlinearity(history.rows.arrays, history.span, solution.places, points, off)
@@ -76,11 +72,9 @@ def off_line(solution: Solution, history: History) -> float:
 def relinearised(
     solution: Solution, history: History, noise: Noise, still: float = STILL
 ) -> Solution:
-    """Return the chain linearised at its solution, or on the way there, where that costs less.
+    """Relinearise the chain at its solution; return it unchanged if that does not lower the cost.
 
-    What has moved by less than ``still``, and all before, stays. Where the solution costs more than
-    its points, steps are damped as Levenberg's are. Where no step leads to less, the chain stays as
-    it is.
+    Levenberg damping is used if the cost would rise. Points that moved by less than ``still`` stay.
     """
     further, damping = _at_solution(solution, history, noise, still), LEAST_DAMPING
     while not further.cost <= solution.cost and damping <= MOST_DAMPING:
@@ -90,16 +84,15 @@ def relinearised(
 
 
 def _at_solution(solution: Solution, history: History, noise: Noise, still: float) -> Solution:
-    """Return the chain linearised at its solution, eliminated and solved anew."""
+    """Linearise, eliminate and solve the chain at its solution."""
     points, first = solved_points(solution, history, still)
     return eliminated(history, noise, points, solution.stretches, first)
 
 
 def converged(solution: Solution, history: History, noise: Noise) -> Solution:
-    """Return the chain at its optimum; landmarks leave the border once they are heard no more.
+    """Iterate to the optimum, with landmarks leaving the separator after their last measurement.
 
-    Huber's weights converge by steps of which each is the same share of the one before. Once two
-    steps have told that share, the next goes as far as all that would follow it together (Aitken).
+    Huber weights converge linearly: the ratio of two steps extrapolates all further steps (Aitken).
     """
     history = in_hindsight(history)
     solution, before = eliminated(history, noise, solution.points), None
@@ -119,14 +112,14 @@ def converged(solution: Solution, history: History, noise: Noise) -> Solution:
 
 
 def _between(points: Points, others: Points) -> Float[np.ndarray, " u"]:
-    """Return how far points are from others, in one array."""
+    """Return the differences between two sets of points as a vector."""
     parts = (points.at.entries(0), points.spots, points.parameters)
     there = (others.at.entries(0), others.spots, others.parameters)
     return np.concatenate([(b - a).ravel() for a, b in zip(parts, there, strict=True)])
 
 
 def _beyond(points: Points, step: Float[np.ndarray, " u"], times: float) -> Points:
-    """Return points that are moved on along a step."""
+    """Move points by a multiple of a step."""
     if times == 0.0:
         return points
     states, size = points.at.entries(0), points.spots.size
@@ -139,7 +132,7 @@ def _beyond(points: Points, step: Float[np.ndarray, " u"], times: float) -> Poin
 
 @optimised_once
 def share_of(step: Float[np.ndarray, " u"], before: Float[np.ndarray, " u"]) -> float:
-    """Return which share of the step before a step is; 0 where going further would not help."""
+    """Return the ratio of a step to the step before, or 0 if extrapolation would not help."""
     along, size = 0.0, 0.0
     for i in range(step.size):
         along += step[i] * before[i]
@@ -149,10 +142,7 @@ def share_of(step: Float[np.ndarray, " u"], before: Float[np.ndarray, " u"]) -> 
 
 
 def solved_points(solution: Solution, history: History, still: float) -> tuple[Points, int]:
-    """Return the solution as points of linearisation, and the first stretch that they change.
-
-    Points before that stretch are as they were, and so are those of landmarks that entered before.
-    """
+    """Return the solution as linearisation points, and the first segment that they change."""
     spots, parameters = solution.points.spots.copy(), solution.points.parameters.size
     beta = np.zeros(len(solution.border))
     beta[: solution.beta.size] = solution.beta
@@ -195,25 +185,25 @@ def _earliest(
     entering: Int[np.ndarray, " l"], moved: Float[np.ndarray, "l 2"],
     among: Int[np.ndarray, " g"], still: float, first: int,
 ) -> int:  # fmt: skip
-    """Return the first stretch in which landmarks have entered that have moved, or an earlier."""
+    """Return the entry segment of the earliest moved landmark, at most ``first``."""
     far = among[np.any(np.abs(moved[among]) > still, axis=1)]
     return min(first, int(entering[far].min(initial=first)))
 
 
 def _links_of(stretch: Stretch) -> tuple[Arrays, int]:
-    """Return the links of a stretch, and how many there are: the start has none."""
+    """Return the links of a segment and their number; the start has no link."""
     arrays, size = stretch.links.arrays, stretch.links.size
     return (arrays, size) if stretch.first else (tuple(one[1:] for one in arrays), size - 1)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Smoothed:
-    """All states and places, as known by all that was heard."""
+    """All states, landmarks and parameters given all measurements."""
 
     states: Float[np.ndarray, "k d"]
     covariance: Float[np.ndarray, "k d d"]
     cross: Float[np.ndarray, "k d d"]
-    """Of each state with the one before."""
+    """Cross-covariance of each state with the state before."""
     places: Float[np.ndarray, "l 2"]
     place_covariance: Float[np.ndarray, "l 2 2"]
     parameters: Float[np.ndarray, " p"]
@@ -253,7 +243,7 @@ def smoothed(best: Solution, history: History) -> Smoothed:
 
 
 def _known_beforehand(history: History) -> Float[np.ndarray, "l 2 2"]:
-    """Return the prior covariances of the landmarks of the border."""
+    """Return the prior covariances of the separator's landmarks."""
     xx, xy, yy = history.known[1].T
     det = xx * yy - xy * xy
     return np.stack([yy, -xy, -xy, xx], axis=1).reshape(-1, 2, 2) / det[:, None, None]

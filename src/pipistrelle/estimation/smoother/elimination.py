@@ -1,36 +1,28 @@
-r"""The arrow: poses eliminated along their chain, with landmarks as a border.
+r"""Elimination of the pose chain, with landmarks and parameters as its separator (`border`).
 
-The normal equations of a drive have the shape of an arrow. Poses form a chain, each linked to the
-next by odometry; landmarks, resting callers and unknown parameters border it. Given the border b,
-the chain is a linear Gaussian process, so a Kalman filter runs along it whose mean is affine in b:
-with all unknowns as differences from the points of linearisation and :math:`\beta = (1, b)`,
+Odometry links consecutive poses to a chain; landmarks, stationary callers and parameters form the
+separator b. Given b, the chain is a linear Gaussian process, so a Kalman filter runs along it with
+a mean affine in b. With all unknowns as differences from their linearisation points, and
+:math:`\beta = (1, b)`:
 
 .. math:: x_k \mid b \sim N(C_k \beta,\, P_k), \qquad
           \bar C = F C_k + u, \quad \bar P = F P_k F^T + Q .
 
-What a frame measures, :math:`r = H x + G \beta` in standard deviations, corrects both and leaves
-its evidence about the border behind (:math:`T = H^T H`, :math:`E = T \bar C + H^T G`):
+The measurements of a node, :math:`r = H x + G \beta` in standard deviations, update both and leave
+information on the separator (:math:`T = H^T H`, :math:`E = T \bar C + H^T G`):
 
 .. math:: P = (\bar P^{-1} + T)^{-1}, \quad C = \bar C - P E, \quad
           \Lambda \leftarrow \Lambda + G^T G + G^T H \bar C + C^T E .
 
-:math:`\tfrac12 \beta^T \Lambda \beta` is the least that poses so far cost, as a function of the
-border: exact elimination, in 3 x 3 blocks and rank-3 updates of one small matrix. Neither Q nor the
-prior is inverted, so both may be singular. `solution` solves for the border.
-
-A step leaves behind what the state before it is, given the state after it and the border, from
-which `smoothing` goes back along the chain:
+:math:`\tfrac12 \beta^T \Lambda \beta` is the minimal cost of the chain as a function of b
+(`solution` solves for b). Neither Q nor the prior is inverted, so that both may be singular. Each
+step leaves the conditional of the previous state, for the backward pass:
 
 .. math:: x_k \mid x_{k+1}, b \sim N(D_k \beta + G_k x_{k+1},\, S_k), \qquad
           G_k = P_k F^T \bar P^{-1}, \quad D_k = C_k - G_k \bar C .
 
-A landmark stands in the border while it is heard. One that is heard no more may leave: it is
-eliminated as a pose is, given the state and what stays (`leave`), so that the border is as wide as
-what is around the vehicle, not as what it has ever met.
-
-A moving caller joins the chain: place and velocity follow the pose in its state.
-
-Steps of the chain: how odometry and the walks of moving callers lead from node to node.
+Landmarks without recent measurements may leave the separator by elimination (`leave`). Moving
+callers join the chain: their positions and velocities follow the pose in the state.
 """
 
 import math
@@ -65,7 +57,7 @@ from pipistrelle.geometry import wrap_angle
 from pipistrelle.jit import Whole, no_alloc, optimised_once
 
 LEAST_STD = 1e-4
-"""Added in quadrature to the noise of a caller's velocity [m/s] and place [m] in a step."""
+"""Added in quadrature to a caller's velocity [m/s] and position [m] noise in a step."""
 
 
 @no_alloc
@@ -77,10 +69,7 @@ def transition(
     points: PointArrays,
     noise: NoiseModel,
 ) -> float:
-    """Write F, u, Q and the slopes by parameters of the step to node k.
-
-    Returns what the step costs at the points, times two.
-    """
+    """Linearise the motion to node k (F, u, Q, parameter Jacobian); return twice its cost."""
     F, u, Q, at, (mx, my, mh) = work.F, work.u, work.Q, points[0], _motion(legs, k, points[1])
     F[:], Q[:] = 0.0, 0.0
     x, y, heading = at[k - 1, 0], at[k - 1, 1], at[k - 1, 2]
@@ -110,7 +99,7 @@ def transition(
 def _stretch(
     N: Float[np.ndarray, "3 3"], scale: float, stretched: Float[np.ndarray, "d d"]
 ) -> None:
-    """Write the noise of a motion of which x and y are multiplied by a scale."""
+    """Write the noise of a motion with x and y multiplied by a scale."""
     for a in range(POSE):
         for b in range(POSE):
             stretched[a, b] = N[a, b] * (scale if a < 2 else 1.0) * (scale if b < 2 else 1.0)
@@ -118,7 +107,7 @@ def _stretch(
 
 @no_alloc
 def _motion(legs: Legs, k: Whole, border: Float[np.ndarray, " n"]) -> tuple[float, float, float]:
-    """Return the motion to node k by the parameters at their points."""
+    """Return the motion to node k with the parameters at their linearisation points."""
     x, y, turn = legs.mean[k, 0], legs.mean[k, 1], legs.mean[k, 2]
     for e in range(legs.slopes.shape[2]):
         x += legs.slopes[k, 0, e] * border[1 + e]
@@ -129,7 +118,7 @@ def _motion(legs: Legs, k: Whole, border: Float[np.ndarray, " n"]) -> tuple[floa
 
 @no_alloc
 def write_start(work: Work, legs: Legs, at: Float[np.ndarray, "k d"]) -> float:
-    """Write u and Q of the start; return what it costs at its point, times two."""
+    """Write u and Q of the start; return twice the cost of its linearisation point."""
     turn = wrap_angle(at[0, 2] - legs.mean[0, 2])
     off = at[0, 0] - legs.mean[0, 0], at[0, 1] - legs.mean[0, 1], turn
     return _odometry(legs.noise[0], off, (1.0, 0.0), work.u, work.Q)
@@ -143,10 +132,10 @@ def _odometry(
     u: Float[np.ndarray, " d"],
     Q: Float[np.ndarray, "d d"],
 ) -> float:
-    r"""Write how far a motion leads from a point, u, and its noise Q; return what it costs, twice.
+    r"""Write offset u and noise Q of a motion with residual ``off``; return twice its cost.
 
-    The misfit is the logarithm of SE(2), :math:`r = V^{-1}(\theta)\,(x, y)` and :math:`\theta`,
-    of what a motion of noise N is off at the points; ``axes``: cosine and sine of their heading.
+    The residual is the logarithm of SE(2), :math:`r = V^{-1}(\theta)\,(x, y)` and :math:`\theta`;
+    ``axes``: cosine and sine of the heading.
     """
     (x, y, turn), (c, s) = off, axes
     if abs(turn) < 1e-4:
@@ -177,7 +166,7 @@ def _odometry(
 
 @no_alloc
 def _misfit(N: Float[np.ndarray, "3 3"], x: float, y: float, z: float) -> float:
-    """Return (x, y, z) N^-1 (x, y, z); 0 of a step without noise."""
+    """Return (x, y, z) N^-1 (x, y, z), or 0 for a step without noise."""
     if N[2, 2] == 0.0:
         return 0.0
     z /= math.sqrt(N[2, 2])
@@ -199,7 +188,7 @@ def _transition_of_caller(
     at: Float[np.ndarray, "k d"],
     noise: NoiseModel,
 ) -> float:
-    """Write F, u and Q of moving caller v; return what its step costs at the points, times two."""
+    """Write F, u and Q of moving caller v; return twice the cost of its step."""
     F, u, Q, cost, i = work.F, work.u, work.Q, 0.0, POSE + CALLER * v
     for a in range(i, i + CALLER):
         u[a] = 0.0
@@ -227,7 +216,7 @@ def _transition_of_caller(
 
 @no_alloc
 def predicted(work: Work, M: Float[np.ndarray, "d d"], P: Float[np.ndarray, "d d"]) -> None:
-    """Write F M F^T + Q; P is not M."""
+    """Write the predicted covariance F M F^T + Q to P, which must not be M."""
     write(work.Q, P)
     congruent(work.F, M, work.A, P)
 
@@ -243,10 +232,9 @@ def eliminate(
     noise: tuple[float, ...],
     span: tuple[Whole, Whole, Whole, Whole, Whole],
 ) -> float:
-    """Carry a front on along the chain, in place; return twice what nodes and steps cost.
+    """Eliminate the chain between two nodes, in place; return the added chi-square cost.
 
-    ``span``: the node at which the front stands, the first of which the rows are heard, that or the
-    next, and the one after the last; the columns; the node whose link is the first of ``links``.
+    ``span``: node of the front, first node to update, end of the nodes, columns, node of link 0.
     """
     front, legs, rows, places = Front(*front), Legs(*legs), Rows(*rows), Places(*places)
     links, noise, (stands, first, last, n, base) = Links(*links), NoiseModel(*noise), span
@@ -271,10 +259,7 @@ def step_to(
     noise: tuple[float, ...],
     span: tuple[Whole, Whole, Whole],
 ) -> float:
-    """Carry a front to a node, before anything is heard there; return twice what the step costs.
-
-    ``span``: the node, the columns, and the node of the first link.
-    """
+    """Predict the frontal state to a node without its measurements; return twice the cost."""
     front, legs, (k, n, base) = Front(*front), Legs(*legs), span
     work = work_of(front.C.shape[0], n, legs.slopes.shape[2])
     cost = transition(work, k, legs, Places(*places), points, NoiseModel(*noise))
@@ -287,7 +272,7 @@ def begin(
     front: Arrays, legs: Arrays, at: Float[np.ndarray, "k d"], border: Float[np.ndarray, " n"],
     parameters: Float[np.ndarray, " p"], damping: float,
 ) -> float:  # fmt: skip
-    """Begin a front at the start, with the deviations of the parameters; return twice its cost."""
+    """Initialise the frontal state with the start and parameter priors; return twice the cost."""
     front[0][:], front[1][:], front[2][:] = 0.0, 0.0, 0.0
     work = work_of(POSE, 1, 0)
     cost = write_start(work, Legs(*legs), at)
@@ -312,7 +297,7 @@ def enter(
     border: Float[np.ndarray, " n"],
     damping: float,
 ) -> float:
-    """Add places to the border: what is known of them (xx, xy, yy); return what it costs, twice."""
+    """Add landmarks with priors (xx, xy, yy of information); return twice their cost."""
     cost = 0.0
     for number in range(column.size):
         i, mean, by = column[number], known[0][number], known[1][number]
@@ -334,16 +319,16 @@ def leave(
     column: Int[np.ndarray, " g"],
     left: tuple[Float[np.ndarray, "g 2 n"], Float[np.ndarray, "g 2 d"], Float[np.ndarray, "g 2 2"]],
 ) -> None:
-    r"""Eliminate places from the border, one after the other, in place.
+    r"""Eliminate landmarks from the separator in sequence, in place.
 
-    With c the columns of one, :math:`V = \Lambda_{cc}^{-1}`, :math:`H = -V \Lambda_c` and
-    :math:`C_c` the slopes of the state by it,
+    With c the columns of a landmark, :math:`V = \Lambda_{cc}^{-1}`, :math:`H = -V \Lambda_c` and
+    :math:`C_c` the derivatives of the state by it,
 
     .. math:: C \leftarrow C + C_c H, \quad P \leftarrow P + C_c V C_c^T, \quad
               \Lambda \leftarrow \Lambda + \Lambda_c^T H,
 
-    and the place is :math:`(H - K C)\beta + K x` with :math:`K = V C_c^T P^{-1}`, and a covariance
-    of what x does not say of V; ``left`` gets all three.
+    and ``left`` gets its conditional :math:`(H - K C)\beta + K x` with :math:`K = V C_c^T P^{-1}`
+    and covariance :math:`V - K C_c V`.
     """
     C, P, information = front
     d, n = C.shape
@@ -378,7 +363,7 @@ def leave(
 def _take_out(
     information: Float[np.ndarray, "n n"], i: Whole, by: Float[np.ndarray, "2 n"]
 ) -> None:
-    """Write the rows of a place at column i, and make them 0, of a lower triangle."""
+    """Move the rows of column pair i from a lower triangle to ``by``, leaving zeros."""
     for e in range(2):
         for j in range(by.shape[1]):
             by[e, j] = information[max(i + e, j), min(i + e, j)]
@@ -389,7 +374,7 @@ def _take_out(
 
 @no_alloc
 def _take_slopes(C: Float[np.ndarray, "d n"], i: Whole, own: Float[np.ndarray, "d 2"]) -> None:
-    """Write the slopes by a place at column i, and make them 0."""
+    """Move the derivatives by column pair i from C to ``own``, leaving zeros."""
     for a in range(C.shape[0]):
         own[a, 0], own[a, 1] = C[a, i], C[a, i + 1]
         C[a, i] = C[a, i + 1] = 0.0
@@ -402,7 +387,7 @@ def _write_rest(
     K: Float[np.ndarray, "2 d"],
     W: Float[np.ndarray, "2 2"],
 ) -> None:
-    """Write V - K C_c V."""
+    """Write V - K C_c V to W."""
     for e in range(2):
         for f in range(e + 1):
             W[e, f] = V[e, f]
@@ -413,7 +398,7 @@ def _write_rest(
 
 @no_alloc
 def advance(front: Front, work: Work, n: Whole) -> None:
-    """Carry the front through a transition, in place; what it was stays in the work's C and M."""
+    """Predict the frontal state in place; the previous C and P stay in the work's C and M."""
     write(front.P, work.M)
     for a in range(work.u.size):
         for j in range(n):
@@ -430,7 +415,7 @@ def advance(front: Front, work: Work, n: Whole) -> None:
 
 @no_alloc
 def step(front: Front, work: Work, links: Links, k: Whole, n: Whole) -> None:
-    """Carry the front through a transition, and write what it leaves of the state before."""
+    """Predict the frontal state by a transition; write the conditional of the previous state."""
     advance(front, work, n)
     D, G, S, d = links.D[k], links.G[k], links.S[k], front.P.shape[0]
     multiply(work.F, work.M, work.A)
@@ -453,7 +438,7 @@ def step(front: Front, work: Work, links: Links, k: Whole, n: Whole) -> None:
 
 @no_alloc
 def correct(front: Front, work: Work, n: Whole) -> None:
-    """Correct the front with what was gathered at a node."""
+    """Update the frontal state with the accumulated measurements of a node."""
     if work.alone[0]:
         return
     C, T, E, M = front.C, work.T, work.E, work.M
@@ -469,7 +454,7 @@ def correct(front: Front, work: Work, n: Whole) -> None:
 
 @no_alloc
 def _inform(front: Front, work: Work, E: Float[np.ndarray, "d n"], n: Whole) -> None:
-    """Add C^T E, with C corrected, and G^T C, with C before, to the information."""
+    """Add C^T E, with C updated, and G^T C, with C before, to the separator information."""
     C, G, before = front.C, work.G, work.C
     for i in range(n):
         row = front.information[i]

@@ -1,25 +1,17 @@
-"""The smoother: the whole path is estimated again with each frame, by relinearisation.
+"""Incremental smoother: the whole trajectory is re-estimated with each frame.
 
-A filter folds what it hears into one Gaussian, linearised where it then was. Here every measurement
-stays, and the normal equations of the whole drive are eliminated along its chain of poses
-(`elimination`): a frame adds one step, and what has moved is linearised anew (`chain`). Nodes of
-the chain are where something was heard (`preintegration` has the steps between).
+The smoother keeps every measurement, and eliminates the normal equations along the chain of poses
+(`elimination`): a frame adds a node, and unknowns that moved are relinearised (`chain`). Nodes are
+the times of scans (`preintegration` has the control steps between). Landmarks and callers are
+initialised by a range, a precise excess path, or crossing bearings (`initialization`), with all
+their measurements so far; until then they are partially initialised. An excess path counts once its
+landmark and its caller are initialised. A moving caller has a position and a velocity at each node,
+and is no landmark.
 
-A landmark enters with its first range, with an excess path that makes its range sure, or where two
-of its bearings cross clearly, with all that was heard of it so far: until then it waits, and counts
-as partial (`delayed_initialization`). A caller enters likewise. An excess path counts once both its
-ends are placed. What enters gets a weak prior of `PRIOR_STD`, so that there is always a solution.
-
-A moving caller has a place and a velocity at each node, once a range or an excess path places it;
-it is no landmark.
-
-``robust`` uses Huber's loss. The belief at a frame is the solution there; path, tracks of callers
-and map are the optimum of everything so far (`belief`).
-
-The gate: measurements outside a share of their predicted distribution are dropped.
-
-Bearing and range of a row are judged together. An excess path is judged alone: an error of one,
-such as a wrong direct call, says nothing about the other.
+``robust`` uses Huber's loss. With a gate, measurements outside a share of their predicted
+distribution are discarded: bearing and range jointly, an excess path separately, as an error such
+as a wrong direct call affects only it. The belief at a frame is the solution there; trajectory,
+caller tracks and map are the optimum of all measurements so far (`belief`).
 """
 
 import math
@@ -109,10 +101,10 @@ def drop_outside(
     R: Float[np.ndarray, "n n"],
     bounds: tuple[float, float],
 ) -> tuple[Whole, float, float]:
-    """Make what is outside the gate NaN, in place: a row's bearing and range, or its excess path.
+    """Replace gated bearings and ranges by NaN, and gated excess paths by no caller, in place.
 
-    Returns how many were dropped, and of the directions that passed the sum of squared innovations,
-    in deviations, and their degrees of freedom. What is new passes. See `entering_places`.
+    Returns their number, and the passed directions' sum of squared normalised innovations and
+    degrees.
     """
     rows, places, front = Rows(*rows), Places(*places), Front(*front)
     (k, first, last), (dropped, squared, degrees) = span, (0, 0.0, 0.0)
@@ -149,7 +141,7 @@ def _part(
     by_chain: Float[np.ndarray, " d"],
     by_border: Float[np.ndarray, " n"],
 ) -> None:
-    """Part a row of slopes in those by the chain and those by the border."""
+    """Split a Jacobian row into derivatives by the chain and by the separator."""
     chain, size = written
     for e in range(chain):
         by_chain[work.at[e]] += work.slope[e]
@@ -166,7 +158,7 @@ def _surprise_of_direction(
     front: Front,
     R: Float[np.ndarray, "n n"],
 ) -> tuple[float, Whole]:
-    """Return the squared innovation of a bearing, with a range if any, and how many they are."""
+    """Return the squared innovation of a bearing, and its range if measured, and its dimension."""
     (i, px, py), d, n = point, front.P.shape[0], R.shape[0]
     seen = observe(view.x, view.y, view.heading, px, py)
     off, across = (
@@ -196,7 +188,7 @@ def _surprise_of_excess_path(
     front: Front,
     R: Float[np.ndarray, "n n"],
 ) -> float:
-    """Return the squared innovation of an excess path, divided by its variance."""
+    """Return the squared innovation of an excess path over its variance."""
     d, n = front.P.shape[0], R.shape[0]
     by_chain, by_border = np.zeros((1, d)), np.zeros((1, n))
     path, chain, size = write_excess_path(work, view, ends)
@@ -206,22 +198,19 @@ def _surprise_of_excess_path(
 
 
 PRIOR_STD, PRIOR_SHARE = 20.0, 0.1
-"""Prior of a landmark about the place where it enters [m]; or, if that is more, this share of the
-way so far: it must not hold the map of a long drive where dead reckoning has put it."""
+"""Std of a new landmark's weak prior: absolute [m], or relative to the travelled distance if
+larger, so that dead-reckoning errors do not bind the map."""
 RELINEARISE_ABOVE = 0.1
-"""How far the lines of a frame's measurements may be off, in standard deviations, before all is
-linearised anew (`linearity`)."""
+"""Linearisation error of a frame's measurements [std] above which the chain is relinearised."""
 ENTERING_PASSES = 5
-"""How often all is linearised anew, at most, where measurements enter that have waited: they
-correct many poses at once."""
+"""Most relinearisations where past measurements of new landmarks enter, which correct many poses.
+"""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Smoother:
     """Incremental smoothing and mapping by elimination along the chain of poses.
 
-    Examples
-    --------
     >>> from pipistrelle.detection.scans import make_scan
     >>> motion = Motion(model="bicycle", control_std=(0.1, 0.03), wheelbase=0.2)
     >>> slam = Smoother(motion=motion, rays=RayConfig())
@@ -233,27 +222,27 @@ class Smoother:
     """
 
     motion: Motion
-    rays: RayConfig  # how far a waiting landmark may be
-    gate: float = 1.0  # as those of `EkfSlam`, and all below
+    rays: RayConfig  # ranges of an uninitialised landmark
+    gate: float = 1.0  # this and the fields below as in `EkfSlam`
     robust: bool = False
     speed_std: float = 1.0
     walk_std: float = 0.2
     calibration: Calibration = NOTHING
     window: float = math.inf
-    """For how long a landmark stays in the border that is not heard [s]."""
+    """Time without measurements after which a landmark leaves the separator [s]."""
 
     def __post_init__(self) -> None:
-        """Refuse a gate that is no share."""
+        """Check that the gate is a probability."""
         check_gate(self.gate)
 
     @property
     def noise(self) -> Noise:
-        """Assumptions about measurements and moving callers, for the kernels."""
+        """Noise of measurements and moving callers, as a tuple for kernels."""
         believed = HUBER_K if self.robust else math.inf
         return believed, PRIOR_STD, float(self.speed_std), float(self.walk_std), 0.0
 
     def init(self, pose: Gaussian) -> SmootherBelief:
-        """Return the belief that knows a pose, (3) and (3, 3), and no landmark."""
+        """Return the initial belief at a pose, (3) and (3, 3), without landmarks."""
         pose = usable_pose(pose)
         history, parameters = begun(pose, self.calibration), np.zeros(self.calibration.stds.size)
         at = Stack((pose.mean[None].copy(),), 1, [1])
@@ -269,7 +258,7 @@ class Smoother:
         )
 
     def knowing(self, belief: SmootherBelief, known: Landmarks) -> SmootherBelief:
-        """Return a first belief with landmarks in its map; ``belief`` is that of `init`."""
+        """Return the initial belief with known landmarks; ``belief`` is the result of `init`."""
         check_belief(belief, SmootherBelief)
         known = usable_known(known)
         C = known.covariance + SMALLEST_STD**2 * np.eye(2)
@@ -287,10 +276,7 @@ class Smoother:
         dt: Float[np.ndarray, " k"],
         rng: np.random.Generator | None = None,
     ) -> tuple[SmootherBelief, Gaussian]:
-        """Carry the belief through the control steps of a frame; nothing is drawn.
-
-        Returns the belief and the pose after each step, (k, 3) and (k, 3, 3).
-        """
+        """Predict the belief through control steps; return it, and the pose after each step."""
         check_belief(belief, SmootherBelief)
         controls, dt = usable_controls(self.motion, controls, dt)
         parameters = belief.history.calibration.odometry
@@ -303,7 +289,7 @@ class Smoother:
     def update(
         self, belief: SmootherBelief, scan: Scan, rng: np.random.Generator | None = None
     ) -> SmootherBelief:
-        """Add a frame's measurements to the chain, and the landmarks that they place."""
+        """Update the belief with a frame's measurements, initialising landmarks."""
         check_belief(belief, SmootherBelief)
         scan = usable_scan(scan)
         if scan.landmark.size == 0:
@@ -311,7 +297,7 @@ class Smoother:
         return corrected(self._corrected, belief, scan, self.gate, self.rays.range_bounds[1])
 
     def _corrected(self, belief: SmootherBelief, scan: Scan) -> SmootherBelief:
-        """Correct the belief with the measurements that pass the gate."""
+        """Update the belief with the measurements that pass the gate."""
         history, solution = self._awake(
             heard_more(belief.history, belief.odometry, scan), belief.history, belief.solution
         )
@@ -338,7 +324,7 @@ class Smoother:
     def _awake(
         self, history: History, before: History, solution: Solution
     ) -> tuple[History, Solution]:
-        """Return history and solution with those in the border that left and are heard again."""
+        """Reactivate landmarks that had left the separator and are measured again."""
         if math.isinf(self.window):
             return history, solution
         number = history.index[slots_heard(history)] - 1
@@ -353,7 +339,7 @@ class Smoother:
         return history, eliminated(before, self.noise, solution.points, kept, first)
 
     def _forgetting(self, history: History, solution: Solution) -> History:
-        """Return a history in which what was not heard within the window leaves the border."""
+        """Schedule landmarks without measurements within the window to leave the separator."""
         k = history.nodes - 1
         if k % STRETCH or math.isinf(self.window):
             return history
@@ -362,7 +348,7 @@ class Smoother:
         return with_leaving(history, leaving, k // STRETCH - 1) if leaving.any() else history
 
     def _heard(self, before: History, here: Sweep, estimate: Solution) -> tuple[History, Solution]:
-        """Return history and solution with the last frame's measurements and what they place."""
+        """Add the last frame's measurements and new landmarks; return history and solution."""
         history = before
         if (here.places[0][slots_heard(before)] == 0).any():
             history = _placed(before, here, estimate)
@@ -387,7 +373,7 @@ class Smoother:
 def _frame(
     history: History, here: Sweep, estimate: Solution
 ) -> tuple[Arrays, tuple[int, int, int], Arrays, tuple[np.ndarray, np.ndarray], Arrays, np.ndarray]:
-    """Return what kernels need to judge the rows of the last node."""
+    """Return the arguments common to `drop_outside` and `entering_places` for the last node."""
     border = here.border.copy()
     border[1 : estimate.beta.size] += estimate.beta[1:]
     points = here.points.at.arrays[0], border
@@ -395,7 +381,7 @@ def _frame(
 
 
 def _placed(history: History, here: Sweep, estimate: Solution) -> History:
-    """Return a history with the landmarks and callers that the last node's rows place."""
+    """Initialise landmarks and callers from the last node's measurements."""
     rows, span, places, points, front, factor = _frame(history, here, estimate)
     found = entering_places(rows, span, history.moves, places, points, front, factor)
     ends = rows[0][span[1] : span[2], 0]

@@ -1,9 +1,8 @@
-"""The history of a drive: motion, measurements, and what of it is among the unknowns.
+"""History of a mission in the smoother: motion, measurements and index of unknowns.
 
-Every label has a *slot*, one as a landmark and another as a caller that moves. A slot that is
-placed is a place of the border, with a number of its own, or a part of the chain's state.
-Measurements are kept whether their landmark is placed or not: the elimination leaves out those of a
-slot that is nowhere yet, and finds them once it is somewhere.
+Every label has a *slot*, with separate slots for a landmark and for a moving caller. An initialised
+slot is a landmark of the separator (`border`) or a part of the chain's state. The measurements of
+an uninitialised slot are kept, but skipped by the elimination until it is initialised.
 """
 
 import math
@@ -27,44 +26,45 @@ from pipistrelle.estimation.smoother.records import CALLER, POSE, Arrays, Stack
 from pipistrelle.jit import Whole, optimised_once
 
 STRETCH = 64
-"""Nodes that are eliminated in one go: between stretches landmarks leave the border, and from the
-start of any all can be linearised anew."""
+"""Nodes per segment: landmarks leave the separator, and relinearisation starts, between segments.
+"""
 NEVER = np.iinfo(np.int64).max
-"""Number of a stretch that never comes."""
+"""Number of a segment that never occurs."""
 FREE, GIVEN = np.ones(1, np.int64), np.zeros(1, np.int64)
-"""Column of the speed's scale, which is the first, or none (`records.Legs.scale`)."""
+"""Separator column of the speed scale: the first, or none (`records.Legs.scale`)."""
 Slot = tuple[int, bool]
-"""A label, and whether it is that of a caller that moves."""
+"""A label, and whether it belongs to a moving caller."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class History:
-    """The motion, the measurements and the numbering of the unknowns."""
+    """Motion, measurements and index of unknowns of a mission."""
 
     legs: Stack
-    """Mean, noise, seconds and rows of `records.Legs`; first control step and the one after the
-    last; slopes."""
-    steps: Stack  # mean and covariance of each control step, since the node before it; slopes
-    rows: Stack  # ends and numbers (`records.Rows`)
+    """Columns of `records.Legs` (mean, noise, seconds, measurements), range of control steps,
+    Jacobians."""
+    steps: Stack  # mean, covariance and Jacobian of each control step since the node before
+    rows: Stack  # `records.Rows`
     calibration: Calibration = NOTHING
     slots: Mapping[Slot, int] = field(default_factory=dict)
     index: Int[np.ndarray, " s"] = field(default_factory=lambda: np.empty(0, np.int64))
-    """Of each slot 1 and its number in the border; minus its index in the chain; 0: nowhere."""
+    """For each slot 1 + its number in the separator, or minus its index in the chain; 0:
+    uninitialised."""
     latest: Int[np.ndarray, " s"] = field(default_factory=lambda: np.empty(0, np.int64))
-    """Last row of each slot with a bearing, or -1."""
+    """Row of each slot's last bearing, or -1."""
     heard: Int[np.ndarray, "s 2"] = field(default_factory=lambda: np.empty((0, 2), np.int64))
-    """First and last node at which each slot was heard; NEVER and -1 before."""
+    """First and last node with a measurement of each slot; NEVER and -1 without."""
     moves: Int[np.ndarray, " s"] = field(default_factory=lambda: np.empty(0, np.int64))
     placed: tuple[int, ...] = ()
-    """Labels of the landmarks of the border, by their numbers."""
+    """Labels of the separator's landmarks, by their numbers."""
     known: Arrays
-    """Prior knowledge of them: mean (l, 2), information xx, xy, yy (l, 3)."""
+    """Priors of these landmarks: mean (l, 2), information xx, xy, yy (l, 3)."""
     leaves: Int[np.ndarray, " l"] = field(default_factory=lambda: np.empty(0, np.int64))
-    """Stretches after which they leave the border, or NEVER."""
+    """Segments after which these landmarks leave the separator, or NEVER."""
     way: float = 0.0
-    """How far the vehicle has gone from node to node, by the odometry [m]."""
+    """Travelled distance between nodes by odometry [m]."""
     ranged: bool = False
-    """Whether a range or an excess path was heard."""
+    """Whether a range or an excess path was measured."""
     callers: tuple[int, ...] = ()
     """Labels of the moving callers in the chain, in order."""
     first: Int[np.ndarray, " v"] = field(default_factory=lambda: np.empty(0, np.int64))
@@ -72,56 +72,56 @@ class History:
 
     @property
     def nodes(self) -> int:
-        """How many nodes the chain has."""
+        """Number of nodes in the chain."""
         return self.legs.size
 
     @property
     def dimension(self) -> int:
-        """How many numbers a state of the chain has."""
+        """Size of a state of the chain."""
         return POSE + CALLER * len(self.callers)
 
     @property
     def motion(self) -> Arrays:
-        """How the vehicle came to each node, as `records.Legs`."""
+        """Motion to each node, as `records.Legs`."""
         mean, noise, seconds, rows, _, slopes = self.legs.arrays
         free = self.calibration.scale_is_free(self.ranged)
         return mean, noise, seconds, rows, slopes, FREE if free else GIVEN
 
     @property
     def span(self) -> tuple[int, int, int]:
-        """The last node, its first row and the one after its last."""
+        """The last node, its first measurement and the end of its range."""
         k = self.nodes - 1
         first, last = self.legs.arrays[3][k].tolist()
         return k, first, last
 
     @property
     def met(self) -> Int[np.ndarray, " l"]:
-        """The node at which each landmark of the border was heard first, or NEVER."""
+        """First node with a measurement of each separator landmark, or NEVER."""
         return self._of_placed(self.heard[:, 0])
 
     @property
     def entering(self) -> Int[np.ndarray, " l"]:
-        """The stretch in which each landmark of the border is heard first, or one that is none."""
+        """Segment of the first measurement of each separator landmark."""
         return self.met // STRETCH
 
     @property
     def silent(self) -> Int[np.ndarray, " l"]:
-        """The node at which each landmark of the border was heard last, or -1."""
+        """Last node with a measurement of each separator landmark, or -1."""
         return self._of_placed(self.heard[:, 1])
 
     def silent_for(self) -> Float[np.ndarray, " l"]:
-        """Return how long each landmark of the border has not been heard [s]."""
+        """Return the time since the last measurement of each separator landmark [s]."""
         time = np.cumsum(self.legs.entries(2))
         return time[-1] - time[np.maximum(self.silent, 0)]
 
     def _of_placed(self, values: Int[np.ndarray, " s"]) -> Int[np.ndarray, " l"]:
-        """Return what the slots of the landmarks of the border have, by their numbers."""
+        """Reorder per-slot values by the landmarks' index in the separator."""
         found, border = np.empty(len(self.placed), np.int64), self.index > 0
         found[self.index[border] - 1] = values[border]
         return found
 
     def places(self, columns: Int[np.ndarray, " l"]) -> Arrays:
-        """Return where each slot stands, as `records.Places`, by the columns of the landmarks."""
+        """Return the variable of each slot, as `records.Places`, given the landmarks' columns."""
         index = self.index
         if columns.size:
             index = np.where(index > 0, columns[np.maximum(index - 1, 0)], index)
@@ -130,7 +130,7 @@ class History:
 
 
 def begun(pose: Gaussian, calibration: Calibration) -> History:
-    """Return the history of a drive that starts at a pose."""
+    """Return the initial history at a start pose."""
     q = calibration.odometry.size
     legs = Stack(
         (
@@ -150,7 +150,7 @@ def begun(pose: Gaussian, calibration: Calibration) -> History:
 
 
 def heard_more(history: History, odometry: Odometry, scan: Scan) -> History:
-    """Return a history with a node more, at which odometry ends, and a scan heard from there."""
+    """Append a node: motion by odometry, and a scan measured there."""
     landmarks, callers, history = _slots_of(history, scan)
     legs, rows = history.legs.extended(1), history.rows.extended(landmarks.size)
     steps = history.steps.extended(len(odometry.mean))
@@ -175,7 +175,7 @@ def heard_more(history: History, odometry: Odometry, scan: Scan) -> History:
 
 @optimised_once
 def _write_leg(legs: Arrays, steps: Arrays, led: Led, span: tuple[Whole, Whole, float]) -> None:
-    """Write the leg to a node by its control steps; ``span``: the node, the steps then, seconds."""
+    """Write the motion to a node; ``span``: the node, the number of steps, duration [s]."""
     (mean, noise, seconds, _, ends, slopes), (k, last, took) = legs, span
     count = led[0].shape[0]
     first, moved = last - count, False
@@ -204,11 +204,7 @@ def _write_rows(
     seen: tuple[Int[np.ndarray, " s"], Int[np.ndarray, "s 2"]],
     span: tuple[Whole, Whole],
 ) -> bool:
-    """Write the rows of a node, each with the row of its landmark's bearing before.
-
-    Returns whether any has a range or an excess path. ``seen``: the latest row of each slot, and
-    when it was heard; ``span``: the node, its first row.
-    """
+    """Write a node's measurements, linked to previous bearings; return whether any has a range."""
     (spans, ends, values), (landmarks, callers, numbers) = rows, scan
     (latest, heard), (k, first) = seen, span
     spans[k, 0], spans[k, 1], ranged = first, first + landmarks.size, False
@@ -229,7 +225,7 @@ def _write_rows(
 def _slots_of(
     history: History, scan: Scan
 ) -> tuple[Int[np.ndarray, " m"], Int[np.ndarray, " m"], History]:
-    """Return the slots of landmarks and callers (-1: none) of a scan, and a history with them."""
+    """Return the slots of a scan's landmarks and callers (-1: none), and a history with them."""
     labels, callers = scan.landmark.tolist(), np.full(scan.landmark.size, -1)
     if (timings := timings_of(scan)) is not None:
         found = excess_paths(columns_of(scan), timings)
@@ -246,7 +242,7 @@ def _slots_of(
 
 
 def _with_slots(history: History, slots: Mapping[Slot, int]) -> History:
-    """Return a history with slots more, which are nowhere yet."""
+    """Append slots that have no variable yet."""
     count = len(slots) - len(history.slots)
     more = np.array([moves for _, moves in slots], np.int64)[-count:]
     return replace(
@@ -265,10 +261,7 @@ def with_places(
     mean: Float[np.ndarray, "l 2"],
     information: Float[np.ndarray, "l 3"],
 ) -> History:
-    """Return a history with landmarks of the border, of which something is known beforehand.
-
-    What was never heard stands there from the start.
-    """
+    """Add landmarks with priors to the separator, from the start if never measured."""
     slots = dict(history.slots)
     for label in labels:
         slots.setdefault((label, False), len(slots))
@@ -287,7 +280,7 @@ def with_places(
 
 
 def with_caller(history: History, label: int, place: Float[np.ndarray, "2"]) -> History:
-    """Return a history with a moving caller in the chain, from the last node on."""
+    """Add a moving caller to the chain, from the last node on."""
     index = history.index.copy()
     index[history.slots[label, True]] = -history.dimension
     return replace(
@@ -300,23 +293,23 @@ def with_caller(history: History, label: int, place: Float[np.ndarray, "2"]) -> 
 
 
 def with_leaving(history: History, numbers: Bool[np.ndarray, " l"], stretch: int) -> History:
-    """Return a history of which some landmarks leave the border after a stretch."""
+    """Schedule landmarks to leave the separator after a segment."""
     return replace(history, leaves=np.where(numbers, stretch, history.leaves))
 
 
 def in_hindsight(history: History) -> History:
-    """Return a history whose landmarks leave the border once they are heard no more."""
+    """Schedule each landmark to leave the separator after its last measurement."""
     last = history.silent // STRETCH
     return replace(history, leaves=np.where(last < (history.nodes - 1) // STRETCH, last, NEVER))
 
 
 def slots_heard(history: History) -> Int[np.ndarray, " u"]:
-    """Return the slots that the last node heard, as landmarks or as callers."""
+    """Return the slots measured at the last node, as landmarks or as callers."""
     _, first, last = history.span
     ends = history.rows.arrays[0][first:last, :2].ravel()
     return ends[ends >= 0]
 
 
 def _sure(covariance: Float[np.ndarray, "3 3"]) -> Float[np.ndarray, "3 3"]:
-    """Return a covariance that is not singular (`SMALLEST_STD`)."""
+    """Regularise a covariance by `SMALLEST_STD`."""
     return covariance + SMALLEST_STD**2 * np.eye(3)

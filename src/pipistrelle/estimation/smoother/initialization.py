@@ -1,21 +1,12 @@
-"""Initialization by an excess path: the range of a landmark, or of a caller, along its bearing.
+"""Initialisation of landmarks and callers in the smoother, delayed until their range is certain.
 
-The range of a landmark follows from its bearing and an excess path over a caller that is placed;
-that of a caller from an excess path over a landmark that is (`estimation.measurement`). Its
-uncertainty depends on vehicle and other point together, and on the geometry: between vehicle and
-caller an excess path says nothing of the range, and close to that line the range is far from
-linear, so that slopes would deceive. So the range is evaluated at eight sigma points, two standard
-deviations to either side along the columns of the factor of the covariance of offset, bearing and
-excess path: their spread is that of the range (an unscented transform; Julier & Uhlmann 1997).
-Where one of them has no range, or the excess path may be 0, nothing is known.
-
-Delayed initialization: where a landmark or a caller enters, once what is heard of it places it.
-
-A range places what it is of. A landmark without one is placed by an excess path (`tdoa`), or where
-two of its bearings cross clearly: of the earlier ones, the newest is crossed with the one that it
-crosses most squarely, in front of both poses. The uncertainty along the newest bearing is that of
-the other line, and its own, over the sine of their angle. Bearings of a moving caller are not
-crossed: they say nothing of where it has gone between them.
+A measured range initialises at once. Otherwise an excess path gives the range along the bearing: of
+a landmark if the caller is initialised, of a caller if the landmark is (`estimation.measurement`).
+It is strongly nonlinear near the line from vehicle to caller, so its uncertainty is an unscented
+transform of offset, bearing and excess path (eight sigma points at two standard deviations; Julier
+& Uhlmann 1997), unknown if a sigma point has no range. Without it, a landmark is initialised where
+its newest bearing clearly crosses an earlier bearing; the standard deviation along the newest
+combines both lines over the sine of their angle. Moving callers' bearings are not crossed.
 """
 
 import math
@@ -42,10 +33,9 @@ from pipistrelle.estimation.smoother.solution import joint
 from pipistrelle.jit import Whole, kernel, no_alloc, optimised_once
 
 MAX_RELATIVE_RANGE_STD = 0.2
-"""An excess path places a point if the range has at most this standard deviation, divided by the
-range."""
+"""Largest standard deviation of a range from an excess path, relative to the range."""
 MAX_RANGE = 1e6
-"""A larger range [m] counts as none."""
+"""Largest valid range [m]."""
 
 
 @kernel
@@ -59,11 +49,7 @@ def place_by_excess_path(
     front: Front,
     R: Float[np.ndarray, "n n"],
 ) -> float:
-    """Return the range of a row's landmark or caller by its surest excess path; NaN if unsure.
-
-    ``heard``: the row, and the first and the one after the last of its frame, from node k; what is
-    not known of the sensor counts as known.
-    """
+    """Return the range of a landmark or caller from its most precise excess path, or NaN."""
     m, first, last = heard
     slot, scale = rows.ends[m, 0], view.scale
     angle, across = direction_of(view, rows.numbers[m]), rows.numbers[m, BEARING_STD]
@@ -98,7 +84,7 @@ def place_by_excess_path(
 def _offset_covariance(
     i: Whole, front: Front, R: Float[np.ndarray, "n n"]
 ) -> Float[np.ndarray, "4 4"]:
-    """Return the covariance of the offset to a place and of the heading; the last row is 0."""
+    """Return the covariance of position offset and heading; the fourth row and column are 0."""
     by_chain, by_border = np.zeros((3, front.P.shape[0])), np.zeros((3, R.shape[0]))
     for a in range(2):
         by_chain[a, a] = -1.0
@@ -119,20 +105,15 @@ def _offset_covariance(
 def unscented_range(
     way: Float[np.ndarray, "4"], spread: Float[np.ndarray, "4 4"], caller: bool
 ) -> tuple[float, float]:
-    """Return a range by excess path and its relative standard deviation, infinite where unknown.
+    """Return a range from an excess path, and its relative std (infinite if unknown).
 
-    ``way`` (4) is the offset to the other point (2), the direction of the asked one, and the
-    excess path; ``spread`` (4, 4) is their covariance. With ``caller`` the range of the caller is
-    asked.
-
-    The landmark is at (3, 4), the caller at (6, 0).
+    ``way`` (4) is the offset to the other point (2), the direction of the unknown point, and the
+    excess path; ``spread`` (4, 4) is their covariance. ``caller`` selects the range of the caller.
+    In the example the landmark is at (3, 4), then between the two, and the caller at (6, 0).
 
     >>> way, spread = np.array([6.0, 0.0, np.arctan2(4.0, 3.0), 4.0]), np.diag([0, 0, 0, 0.01])
     >>> [round(float(number), 3) for number in unscented_range(way, spread, False)]
     [5.0, 0.016]
-
-    Were it midway between the two:
-
     >>> unscented_range(np.array([6.0, 0.0, 0.0, 0.0]), spread, False)[1]
     inf
     """
@@ -156,7 +137,7 @@ def unscented_range(
 
 @kernel
 def _range(way: Float[np.ndarray, "4"], caller: bool) -> float:
-    """Return the range of a landmark, or of a caller, by its excess path."""
+    """Return the range of a landmark or of a caller from an excess path."""
     c, s = math.cos(way[2]), math.sin(way[2])
     if caller:
         return caller_range_by_excess_path(way[3], way[0], way[1], c, s)
@@ -164,9 +145,9 @@ def _range(way: Float[np.ndarray, "4"], caller: bool) -> float:
 
 
 MIN_CROSSING_ANGLE = 0.5
-"""Least angle [rad] at which two bearings place a landmark."""
+"""Least angle [rad] between bearings that initialise a landmark."""
 MAX_RELATIVE_PLACE_STD = 0.5
-"""Largest standard deviation of the place, divided by the range."""
+"""Largest standard deviation of a crossing, relative to the range."""
 
 
 @optimised_once
@@ -179,11 +160,7 @@ def entering_places(
     front: Arrays,
     R: Float[np.ndarray, "n n"],
 ) -> Float[np.ndarray, "m 2"]:
-    """Return where the landmarks and callers of a frame's rows enter; NaN of those that do not.
-
-    ``span``: the frame's node, its first row and the one after its last. ``estimate``: states of
-    all nodes and the border. ``front``: at this node, and the factor of its information.
-    """
+    """Return initial positions for a frame's landmarks and callers, NaN if still uncertain."""
     rows, places, front = Rows(*rows), Places(*places), Front(*front)
     k, first, last = span
     view, found = (
@@ -208,7 +185,7 @@ def entering_places(
 
 @no_alloc
 def range_by_crossing(rows: Rows, m: Whole, estimate: PointArrays, places: Places) -> float:
-    """Return the range where the bearing of row m clearly crosses an earlier one, or NaN."""
+    """Return the range where a bearing clearly crosses an earlier bearing, or NaN."""
     numbers, (poses, border) = rows.numbers[m], estimate
     k = rows.ends[m, 2]
     view = view_of(poses[k], border, places, k)

@@ -1,29 +1,17 @@
-r"""What a sensor on the vehicle should measure, and the slopes of that by all unknowns.
+r"""Measurement models of the smoother: residuals, Jacobians and normal equations of a node.
 
-A row of slopes is written to the work's entries: three by the pose, further ones by moving callers,
-one that is left for the misfit, and those by the border. What the vehicle does not know of its
-sensor stands there, too: with an offset l and a turn :math:`\delta` in the axes of a pose
-(p, :math:`\theta`), the sensor is at :math:`p + R(\theta) l` and looks along
-:math:`\theta + \delta`. Where its clock is late by :math:`\tau`, it heard while the vehicle
-where it was :math:`\tau` before, by the velocities v ahead and to the left and :math:`\omega` that
-lead along the way to the node:
-:math:`p - \tau R(\theta - \tfrac12 \tau \omega) v`, :math:`\theta - \tau \omega`; callers count as
-standing meanwhile. Where the true speed of sound is k times the one that ranges r and excess
-paths were computed with, these measure r / k, and a bearing is off by its slope (`Scan`) times
-k - 1 and what else leans on that slope.
+**Model.** A sensor with offset l and rotation :math:`\delta` on a vehicle at (p, :math:`\theta`) is
+at :math:`p + R(\theta) l` with heading :math:`\theta + \delta`. A clock delay :math:`\tau` moves it
+back to :math:`p - \tau R(\theta - \tfrac12 \tau \omega) v`, :math:`\theta - \tau \omega`, with the
+velocities v and :math:`\omega` of the motion to the node; callers count as stationary meanwhile. If
+the true speed of sound is k times the assumed, a range r or an excess path is measured as r / k,
+and a bearing is off by its slope (`Scan`) times k - 1 plus the lean parameter.
 
-When to linearise anew: when measurements are off the lines that stand for them.
-
-Each measurement is linearised at points that stay while the estimate moves. How far the line is
-then off the measurement itself is known: it is measured in standard deviations, for what the last
-node heard.
-
-Rows of the normal equations: what a node's measurements say of its state and of the border.
-
-A row of slopes and a misfit is divided by the measurement's standard deviation, and by the root of
-Huber's weight. Bearing and range of a landmark have one weight together, an excess path its own.
-Rows are gathered (T, G and the border's own information), or, where they know the state far better
-than it was known, correct the front one by one.
+**Normal equations.** Jacobian rows are divided by the measurement's standard deviation, and
+multiplied by the root of the Huber weight (joint for bearing and range, separate for excess paths).
+They are accumulated (T, G, separator information), or, if far more precise than the prior state,
+applied individually. Linearisation points are kept until the linear model deviates too far from the
+measurement model (`nonlinearity`).
 """
 
 import math
@@ -60,35 +48,35 @@ from pipistrelle.geometry import wrap_angle
 from pipistrelle.jit import Whole, no_alloc, no_alloc_inlined, optimised_once
 
 MISFIT = POSE
-"""Entry of a row that is left for its misfit, before places of the chain are inserted."""
+"""Entry of a Jacobian row for its residual, before moving callers' entries are inserted."""
 Point = tuple[Whole, float, float]
-"""Where a place stands among the unknowns, and its x and y [m]."""
+"""Unknown of a position (as `Places.index`), and x and y [m]."""
 Seen = tuple[float, float, float, float, float]
-"""Of a point: what `estimation.measurement.observe` returns."""
+"""Range, bearing, cosines and inverse range of a point, from `estimation.measurement.observe`."""
 
 
 class View(NamedTuple):
-    """The sensor's pose at a node, and what of it is not known."""
+    """Sensor pose at a node, with its unknown parameters."""
 
     x: float
     y: float
     heading: float
-    c: float  # of the vehicle's heading
+    c: float  # cosine and sine of the vehicle's heading
     s: float
-    away_x: float  # of the sensor from the vehicle, in the world's axes
+    away_x: float  # offset from the vehicle in world axes [m]
     away_y: float
-    by_late: tuple[float, float, float]  # slopes of the sensor's pose by how late its clock is
-    scale: float  # true speed of sound over the one that was assumed, k
-    lean: float  # by which slopes of bearings are multiplied, about k - 1
-    columns: tuple[Whole, Whole, Whole, Whole]  # as `Places.sensor`
-    known: bool  # whether nothing of the sensor is estimated
+    by_late: tuple[float, float, float]  # derivative of the sensor pose by the clock delay
+    scale: float  # true over assumed speed of sound, k
+    lean: float  # multiplier of the bearings' slopes, about k - 1
+    columns: tuple[Whole, Whole, Whole, Whole]  # columns as in `Places.sensor`
+    known: bool  # whether no sensor parameter is estimated
 
 
 @no_alloc
 def view_of(
     pose: Float[np.ndarray, " d"], border: Float[np.ndarray, " n"], places: Places, k: Whole
 ) -> View:
-    """Return the view from a pose of node k."""
+    """Return the sensor's view from node k at a vehicle pose."""
     sensor = places.sensor
     sound, turned, place, clock = sensor[0], sensor[1], sensor[2], sensor[3]
     heading, x, y = pose[2], 0.0, 0.0
@@ -115,10 +103,7 @@ def view_of(
 def _steps_back(
     heading: float, late: float, way: Float[np.ndarray, " 3"], seconds: float
 ) -> tuple[float, float, float, float, float]:
-    """Return how far a vehicle was back along the way to a node, by how late a clock is.
-
-    First in the world's axes, then the slopes of that and of the heading.
-    """
+    """Return a vehicle's displacement during the clock delay, and its derivatives by the delay."""
     half = 0.5 * way[2]
     along = half / math.tan(half) if abs(half) > 1e-9 else 1.0
     ahead = (along * way[0] + half * way[1]) / seconds
@@ -131,10 +116,7 @@ def _steps_back(
 
 @no_alloc
 def point_of(slot: Whole, k: Whole, places: Places, points: PointArrays) -> Point:
-    """Return where a slot stands among the unknowns (`Places`) and its place, from node k.
-
-    A moving caller is nowhere before it joined the chain.
-    """
+    """Return state index and position of a landmark or caller at node k; zeros if uninitialised."""
     i, (at, border) = places.index[slot], points
     if i > 0:
         return i, border[i], border[i + 1]
@@ -145,13 +127,13 @@ def point_of(slot: Whole, k: Whole, places: Places, points: PointArrays) -> Poin
 
 @no_alloc
 def bearing_of(view: View, seen: Seen, slope: float) -> float:
-    """Return the bearing that is measured of a point; ``slope``: that by the speed of sound."""
+    """Return the predicted bearing of a point; ``slope``: sensitivity to the speed of sound."""
     return seen[1] if math.isnan(slope) else seen[1] - slope * view.lean
 
 
 @no_alloc
 def direction_of(view: View, numbers: Float[np.ndarray, " 8"]) -> float:
-    """Return the direction in the world from which a row's bearing was heard."""
+    """Return the world direction of a measured bearing."""
     angle = view.heading + numbers[BEARING]
     return angle if math.isnan(numbers[SLOPE]) else angle + numbers[SLOPE] * view.lean
 
@@ -160,9 +142,9 @@ def direction_of(view: View, numbers: Float[np.ndarray, " 8"]) -> float:
 def write_bearing(
     work: Work, view: View, seen: Seen, slope: float, i: Whole
 ) -> tuple[Whole, Whole]:
-    """Write the slopes of the bearing of a point that stands at i.
+    """Write the Jacobian row of a bearing to a point with state index i.
 
-    Returns how many of the entries are of the chain, and how many there are; so do the others.
+    This and the following functions return the number of chain entries and of all entries.
     """
     _, _, c, s, inverse = seen
     lean = 0.0 if math.isnan(slope) else -slope
@@ -172,7 +154,7 @@ def write_bearing(
 
 @no_alloc
 def write_range(work: Work, view: View, seen: Seen, i: Whole) -> tuple[Whole, Whole]:
-    """Write the slopes of the range of a point that stands at i."""
+    """Write the Jacobian row of a range to a point with state index i."""
     distance, _, c, s, _ = seen
     k = 1.0 / view.scale
     size = _write_view(work, view, (-k * c, -k * s, 0.0), -distance * k * k, 0.0)
@@ -183,7 +165,7 @@ def write_range(work: Work, view: View, seen: Seen, i: Whole) -> tuple[Whole, Wh
 def write_excess_path(
     work: Work, view: View, ends: tuple[Point, Point]
 ) -> tuple[float, Whole, Whole]:
-    """Write the slopes of an excess path over a point, from a caller; return it, too, first."""
+    """Write the Jacobian row of an excess path; return its predicted value and the entry counts."""
     (i, px, py), (j, bx, by) = ends
     path, lx, ly, cx, cy = excess_path_slopes(view.x, view.y, px, py, bx, by)
     k = 1.0 / view.scale
@@ -197,10 +179,7 @@ def write_excess_path(
 def _write_view(
     work: Work, view: View, by_pose: tuple[float, float, float], by_scale: float, by_lean: float
 ) -> Whole:
-    """Write slopes by the sensor's pose as those by the vehicle's and by what is not known of it.
-
-    Returns how many entries there are.
-    """
+    """Convert derivatives by sensor pose to vehicle pose and parameters; return their number."""
     at, slope, size, (by_x, by_y, by_heading) = work.at, work.slope, MISFIT + 1, by_pose
     sound, turned, place, clock = view.columns
     for a in range(POSE):
@@ -231,7 +210,7 @@ def _write_view(
 def _write_point(
     work: Work, chain: Whole, size: Whole, i: Whole, by_x: float, by_y: float
 ) -> tuple[Whole, Whole]:
-    """Add the slopes by a place to a row of so many entries, the first of them of the chain."""
+    """Insert derivatives by a position into a Jacobian row with ``chain`` leading entries."""
     if i > 0:
         work.at[size], work.at[size + 1] = i, i + 1
         work.slope[size], work.slope[size + 1] = by_x, by_y
@@ -244,7 +223,7 @@ def _write_point(
 
 
 Off = tuple[Float[np.ndarray, " d"], Float[np.ndarray, " n"]]
-"""How far the state of a node and the border are from their points."""
+"""Deviation of a node's state and of the separator from their linearisation points."""
 
 
 @optimised_once
@@ -255,10 +234,7 @@ def nonlinearity(
     points: PointArrays,
     off: Off,
 ) -> float:
-    """Return how far the lines of a node's rows are off at an estimate, the most [deviations].
-
-    ``span``: the node, its first row and the one after its last.
-    """
+    """Return the largest linearisation error of a node's measurements at the estimate [std]."""
     rows, places, (k, first, last), most = Rows(*rows), Places(*places), span, 0.0
     work, border = work_of(off[0].size, 1, 0), points[1].copy()
     for i in range(1, off[1].size):
@@ -297,7 +273,7 @@ def nonlinearity(
 
 @no_alloc
 def _moved(point: Point, off: Off) -> Point:
-    """Return a place where it is believed to be."""
+    """Return a position at the current estimate."""
     i, x, y = point
     if i > 0:
         return i, x + off[1][i], y + off[1][i + 1]
@@ -306,7 +282,7 @@ def _moved(point: Point, off: Off) -> Point:
 
 @no_alloc
 def _along(work: Work, written: tuple[Whole, Whole], off: Off) -> float:
-    """Return how far a row of slopes leads from its point."""
+    """Return the linear change of a measurement from its linearisation point to the estimate."""
     chain, size = written
     total = 0.0
     for e in range(chain):
@@ -318,10 +294,10 @@ def _along(work: Work, written: tuple[Whole, Whole], off: Off) -> float:
 
 
 LEAST_DEVIATION = 1e-6
-"""A measurement counts as no surer [rad, m]."""
+"""Least standard deviation of a measurement [rad, m]."""
 ALONE_ABOVE = 1e4
-"""Information of a node's rows, over that of its state before, above which each row corrects alone.
-All at once they cost a tenth of that, but lose the square of this number in precision."""
+"""Measured over prior information above which updates are individual: batches cost a tenth, but
+lose the square of this ratio in precision."""
 
 
 @no_alloc
@@ -334,10 +310,7 @@ def hear(
     points: PointArrays,
     noise: NoiseModel,
 ) -> float:
-    """Gather T, G and the direct information of the rows of a node; return twice their cost.
-
-    ``span``: the node, its first row and the one after its last.
-    """
+    """Accumulate a node's measurements in T, G and information; return twice their cost."""
     (k, begin, end), believed, cost, G = span, noise.believed, 0.0, work.G
     work.T[:] = 0.0
     for a in range(G.shape[0]):
@@ -371,7 +344,7 @@ def _hear_direction(
     point: Point,
     believed: float,
 ) -> float:
-    """Add a bearing, and its range if there is one; return what they cost, times two."""
+    """Add a bearing, and its range if measured; return twice their cost."""
     i, px, py = point
     seen = observe(view.x, view.y, view.heading, px, py)
     across = 1.0 / max(numbers[BEARING_STD], LEAST_DEVIATION)
@@ -401,11 +374,7 @@ def _add_direction(
     slopes: tuple[float, float, float],
     off: tuple[float, float],
 ) -> None:
-    """Add the rows of a bearing and a range, of a place at column i of the border: as `_add` does.
-
-    ``slopes``: of the bearing by a move across, of the range by one along, of minus the bearing by
-    the heading; ``off``: what they are off.
-    """
+    """Add a bearing and a range to a landmark in separator column i, faster than by `_add`."""
     (c, s), (q, p, h), (b, r), T, G = cosines, slopes, off, work.T, work.G
     xx, xy, yy = (
         q * q * s * s + p * p * c * c,
@@ -449,7 +418,7 @@ def _hear_excess_path(
     ends: tuple[Point, Point],
     believed: float,
 ) -> float:
-    """Add an excess path over a landmark, from a caller; return what it costs, times two."""
+    """Add an excess path; return twice its cost."""
     path, chain, size = write_excess_path(work, view, ends)
     sure = 1.0 / max(numbers[EXCESS_PATH_STD], LEAST_DEVIATION)
     off = (path - numbers[EXCESS_PATH]) * sure
@@ -460,7 +429,7 @@ def _hear_excess_path(
 
 @no_alloc
 def _huber(squared: float, believed: float) -> tuple[float, float]:
-    """Return the root of the weight of a misfit in deviations, and its loss, times two."""
+    """Return the root of the Huber weight and twice the loss of a squared normalised residual."""
     if squared <= believed * believed:
         return 1.0, squared
     size = math.sqrt(squared)
@@ -469,10 +438,7 @@ def _huber(squared: float, believed: float) -> tuple[float, float]:
 
 @no_alloc
 def _add(work: Work, front: Front, chain: Whole, size: Whole, weight: tuple[float, float]) -> None:
-    """Add a row to T, to G and to the information about the border; or correct by it alone.
-
-    ``weight``: by which its slopes are multiplied, and its misfit.
-    """
+    """Add a weighted Jacobian row to T, G and separator information, or apply it as an update."""
     at, slope, T, G, information = work.at, work.slope, work.T, work.G, front.information
     for e in range(size):
         slope[e] *= weight[0]
@@ -494,9 +460,9 @@ def _add(work: Work, front: Front, chain: Whole, size: Whole, weight: tuple[floa
 
 @no_alloc
 def _correct_by_row(work: Work, front: Front, chain: Whole, size: Whole) -> None:
-    """Correct the front by a row alone: a Kalman filter's correction, without any difference.
+    """Update the frontal state with a single Jacobian row, as a Kalman filter.
 
-    With w the row's slopes by the border, S its variance: the information gains w w^T / S.
+    With w its derivatives by the separator and S its variance, the information gains w w^T / S.
     """
     at, slope, P, C, w, gain = work.at, work.slope, front.P, front.C, work.w, work.u
     w[:] = 0.0
@@ -521,7 +487,7 @@ def _correct_by_row(work: Work, front: Front, chain: Whole, size: Whole) -> None
 
 @no_alloc
 def _hold(work: Work, front: Front, damping: float) -> None:
-    """Hold each number of the state at its point, by a row of its own."""
+    """Add Levenberg damping to each number of the state."""
     for a in range(front.P.shape[0]):
         work.at[0], work.slope[0] = a, math.sqrt(damping)
         _add(work, front, 1, 1, (1.0, 0.0))
@@ -536,7 +502,7 @@ def _is_sure(
     points: PointArrays,
     damping: float,
 ) -> bool:
-    """Tell whether a node's rows know its state far better than it is known (`ALONE_ABOVE`)."""
+    """Return whether a node's measurements are far more precise than its prior (`ALONE_ABOVE`)."""
     (k, begin, end), x, y = span, points[0][span[0], 0], points[0][span[0], 1]
     turns, moves = damping, damping
     for m in range(begin, end):

@@ -1,22 +1,17 @@
-r"""Preintegration: the control steps from one node of the chain to the next, as one motion.
+r"""Preintegration of control steps between nodes, and calibration parameters of vehicle and sensor.
 
-The chain has a node where something was heard, not one for each control step: a step's noise has
-rank 2, and nothing measures the poses between. `Odometry` keeps them relative to the node before:
-means :math:`d_j`, and covariances :math:`P_j` of x, y and heading in that pose's axes. When the
-poses a and b at its ends are known better, so are those between, by the gain
+**Preintegration.** The chain has a node for each scan, not for each control step, as a step's noise
+has rank 2 and nothing measures the poses between. `Odometry` keeps these relative to the node
+before: means :math:`d_j` and covariances :math:`P_j` of x, y and heading in its axes. Smoothed
+poses a and b of the two nodes update them by the gain
 
 .. math:: G_j = P_j \Phi_{mj}^T P_m^{-1}, \quad d_j \leftarrow d_j + G_j (a^{-1} b - d_m)
 
-with :math:`\Phi_{mj}` the derivative of the last step by step j: the fixed-interval smoother of
-Rauch, Tung & Striebel (1965).
+with :math:`\Phi_{mj}` the derivative of the last step by step j (Rauch, Tung & Striebel 1965).
 
-Calibration: what a vehicle does not know of itself, estimated beside poses and landmarks.
-
-Each parameter is a number or two, constant over the drive, with a normal prior about what is
-assumed. Those of odometry change the motion between two nodes (`preintegration`), to first order
-about what is assumed, which is exact but for products of errors within one leg; those of the sensor
-change what it measures (`observations`). In the border stands how far a number is from what is
-assumed, in its unit: the speed of sound as a share of the assumed one.
+**Calibration.** Each parameter is constant over the mission, with a normal prior about its assumed
+value. Odometry parameters change the motion between nodes to first order, sensor parameters the
+measurements (`observations`).
 """
 
 import math
@@ -62,46 +57,44 @@ NUMBERS = {
     "sensor_place": ("sensor_place_x", "sensor_place_y"),
     "time_offset": ("time_offset",),
 }
-"""The names of the numbers of each parameter. They stand in the border in this order."""
+"""Names of the numbers of each parameter, in the order of the separator."""
 LEAN_STD = 0.003
-"""How much the slopes of bearings by the speed of sound say of it, as a share: what an array's
-bearings are off for other reasons grows like them towards its sides. In the sound of `physics`
-they lean by 0.1 to 0.3 %."""
+"""Prior std of the relative lean of bearings with the speed of sound, which other errors of an
+array resemble; the `physics` preset leans by 0.1 to 0.3 %."""
 OF_ODOMETRY = ("speed_scale", "turn_bias", "wheelbase")
-"""Parameters of odometry, by the codes that kernels have for them."""
+"""Odometry parameters, by their codes in kernels."""
 OF_SENSOR = ("speed_of_sound", "sensor_heading", "sensor_place", "time_offset")
-"""Parameters of the sensor, as `records.Places.sensor` has their columns."""
+"""Sensor parameters, in the order of `records.Places.sensor`."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Calibration:
-    """The parameters that are estimated."""
+    """Estimated calibration parameters."""
 
     names: tuple[str, ...]
-    """Of their numbers."""
+    """Names of the numbers."""
     assumed: Float[np.ndarray, " p"]
-    """What is assumed of each number."""
+    """Assumed values."""
     unit: Float[np.ndarray, " p"]
-    """By which a number in the border is multiplied before it is added to that."""
+    """Factors that convert numbers of the separator to deviations from the assumed values."""
     stds: Float[np.ndarray, " p"]
-    """Standard deviation of the prior of each, in the border."""
+    """Prior standard deviations, in the separator's units."""
     odometry: Int[np.ndarray, " q"]
-    """Codes of those of odometry (`OF_ODOMETRY`), which stand first."""
+    """Codes of the odometry parameters (`OF_ODOMETRY`), which come first."""
     sensor: Int[np.ndarray, "4"]
-    """Columns of those of the sensor (`OF_SENSOR`); 0 where one is not estimated."""
+    """Separator columns of the sensor parameters (`OF_SENSOR`); 0 if not estimated."""
 
     def scale_is_free(self, ranged: bool) -> bool:
-        """Tell whether nothing but the speed's scale tells how large the world is.
+        """Return whether the speed scale is the only source of absolute size.
 
-        Bearings do not, nor do ranges of an unknown speed of sound. The motion is then compared
-        with the odometry in the odometry's scale: in its own, the smaller a world, the less its
-        odometry would seem to be off.
+        The motion residual is then taken at the odometry's scale, as it would fall with a shrinking
+        world.
         """
         return "speed_scale" in self.names and (not ranged or "speed_of_sound" in self.names)
 
 
 def numbers_of(parameters: Iterable[str]) -> tuple[str, ...]:
-    """Return the names of the numbers of some parameters, in the order of the border.
+    """Return the names of the numbers of parameters, in the order of the separator.
 
     >>> numbers_of(["sensor_place", "wheelbase"])
     ('wheelbase', 'sensor_place_x', 'sensor_place_y')
@@ -111,7 +104,7 @@ def numbers_of(parameters: Iterable[str]) -> tuple[str, ...]:
 
 
 def calibration_of(config: Config, motion: Motion) -> Calibration:
-    """Return what ``filter.calibrate`` asks for, of a vehicle with a motion model.
+    """Build the calibration that ``filter.calibrate`` selects, for a motion model.
 
     >>> from pipistrelle.config import FilterConfig
     >>> config = Config(filter=FilterConfig(calibrate=("sensor_place", "speed_of_sound")))
@@ -149,38 +142,37 @@ def calibration_of(config: Config, motion: Motion) -> Calibration:
 
 
 NOTHING = calibration_of(Config(), Motion(model="unicycle", control_std=(0.0, 0.0)))
-"""Nothing is calibrated."""
+"""Calibration without parameters."""
 
 
 SMALLEST_STD = 1e-6
-"""Added in quadrature to x, y [m] and heading [rad] of the start and of a motion: what is known
-exactly would make all that is heard worthless."""
+"""Added in quadrature to the start and each motion [m, rad], so that no prior is exact."""
 
 NO_PARAMETERS = np.empty(0, np.int64)
-"""No parameter of odometry is estimated."""
+"""No odometry parameters."""
 
 Steps = tuple[Float[np.ndarray, "s 3"], Float[np.ndarray, "s 3 3"]]
-"""Means and covariances of control steps, since the node before them."""
+"""Means and covariances of control steps relative to the node before."""
 Led = tuple[Float[np.ndarray, "s 3"], Float[np.ndarray, "s 3 3"], Float[np.ndarray, "s 3 q"]]
-"""The same, with slopes of the means by parameters."""
+"""Means, covariances and parameter Jacobians of control steps relative to the node before."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Odometry:
-    """The control steps since a node of the chain."""
+    """Control steps since a node of the chain."""
 
-    mean: Float[np.ndarray, "m 3"]  # after each step, in the axes of that pose [m, m, rad]
-    covariance: Float[np.ndarray, "m 3 3"]  # of x, y and heading in those axes
-    slopes: Float[np.ndarray, "m 3 q"]  # of the mean by the parameters of odometry
-    seconds: float = 0.0  # how long they took
+    mean: Float[np.ndarray, "m 3"]  # after each step, relative to that node [m, m, rad]
+    covariance: Float[np.ndarray, "m 3 3"]  # of x, y and heading in the node's axes
+    slopes: Float[np.ndarray, "m 3 q"]  # Jacobian of the mean by the odometry parameters
+    seconds: float = 0.0  # total duration [s]
 
     def moves(self) -> bool:
-        """Tell whether the vehicle has moved, or may have."""
+        """Return whether the vehicle has moved, or may have."""
         return bool(np.any(self.mean[-1:]) or np.any(self.covariance[-1:]))
 
 
 def no_odometry(parameters: int = 0) -> Odometry:
-    """Return odometry without a step, and with so many parameters."""
+    """Return odometry without steps, for a number of parameters."""
     return Odometry(
         mean=np.empty((0, 3)),
         covariance=np.empty((0, 3, 3)),
@@ -195,7 +187,7 @@ def extended(
     dt: Float[np.ndarray, " k"],
     parameters: Int[np.ndarray, " q"] = NO_PARAMETERS,
 ) -> Odometry:
-    """Return odometry with more control steps; ``parameters``: codes of `calibration.OF_ODOMETRY`.
+    """Append control steps to odometry; ``parameters``: codes of `OF_ODOMETRY`.
 
     >>> motion = Motion(model="unicycle", control_std=(0.1, 0.1))
     >>> extended(no_odometry(), motion, np.ones((2, 2)) * [1.0, 0.0], np.ones(2)).mean[:, 0]
@@ -209,7 +201,7 @@ def extended(
 
 
 def placed(start: Gaussian, odometry: Odometry, first: int = 0) -> Gaussian:
-    """Return the poses after each step from ``first`` on, (m, 3) and (m, 3, 3), in the world.
+    """Return the world poses after each step from index ``first``, (m, 3) and (m, 3, 3).
 
     >>> north = Gaussian(mean=np.array([0.0, 1.0, np.pi / 2]), covariance=np.zeros((3, 3)))
     >>> way = {"covariance": np.zeros((1, 3, 3)), "slopes": np.zeros((1, 3, 0))}
@@ -223,7 +215,7 @@ def placed(start: Gaussian, odometry: Odometry, first: int = 0) -> Gaussian:
 
 @optimised_once
 def _placed(start: tuple[Float[np.ndarray, "3"], Float[np.ndarray, "3 3"]], steps: Steps) -> Steps:
-    """Place all steps from a start in the world."""
+    """Convert relative steps to world poses with covariances."""
     poses, spreads = np.empty(steps[0].shape), np.empty(steps[1].shape)
     for k in range(len(poses)):
         place(start, steps[0][k], steps[1][k], poses[k], spreads[k])
@@ -238,7 +230,7 @@ def _extended(
     motion: MotionNumbers,
     parameters: Int[np.ndarray, " q"],
 ) -> Led:
-    """Append control steps to others."""
+    """Append control steps to relative steps."""
     (before, _, q), size = steps[2].shape, dt.size
     mean, covariance = np.empty((before + size, 3)), np.empty((before + size, 3, 3))
     slopes = np.empty((before + size, 3, q))
@@ -268,14 +260,14 @@ def _lead_on(
     motion: MotionNumbers,
     parameters: Int[np.ndarray, " q"],
 ) -> None:
-    """Carry slopes of a pose by parameters (`calibration.OF_ODOMETRY`) through a control step."""
+    """Propagate the parameter Jacobian of a pose through a control step."""
     controls, dt = control
     dx, dy, turn, sx, sy, sh, tx, ty, th = motion_increment(motion, pose[2], controls, dt)
     for e in range(parameters.size):
         J[0, e] -= dy * J[2, e]
         J[1, e] += dx * J[2, e]
         if parameters[e] == 0:
-            bent = motion.model == ACKERMANN  # its way is not in proportion to its speed
+            bent = motion.model == ACKERMANN  # its motion is not proportional to its speed
             J[0, e] += sx * controls[0] if bent else dx
             J[1, e] += sy * controls[0] if bent else dy
             J[2, e] += 0.0 if motion.model == BY_POSES else sh * controls[0]
@@ -297,10 +289,7 @@ def place(
     pose: Float[np.ndarray, "3"],
     covariance: Float[np.ndarray, "3 3"],
 ) -> None:
-    """Write a pose in the world from one relative to a start, and its covariance F C F^T + R P R^T.
-
-    ``start``: the pose and its covariance C.
-    """
+    """Write a world pose and its covariance F C F^T + R P R^T from a pose relative to ``start``."""
     (x, y, heading), C = start[0], start[1]
     c, s = math.cos(heading), math.sin(heading)
     dx, dy = c * relative[0] - s * relative[1], s * relative[0] + c * relative[1]
@@ -327,11 +316,7 @@ def poses_between(
     nodes: Steps,
     cross: Float[np.ndarray, "k 3 3"],
 ) -> Steps:
-    """Return all poses of a path and their covariances, from those of its nodes.
-
-    ``ends``: first step of each leg, and the one after its last; ``cross``: covariance of each node
-    with the one before.
-    """
+    """Return all poses of a trajectory and their covariances, from its smoothed nodes."""
     legs, count = Legs(*legs), ends[-1, 1]
     mean, covariance = np.empty((1 + count, 3)), np.empty((1 + count, 3, 3))
     mean[0], covariance[0] = nodes[0][0], nodes[1][0]
@@ -358,11 +343,7 @@ def _place_between(
     pose: Float[np.ndarray, "3"],
     work: Float[np.ndarray, "6 3 3"],
 ) -> None:
-    """Write a pose between two nodes a and b; in ``work``: its slopes by both, and what is left.
-
-    ``leg``: the motion from a to b and its noise; ``step``: that from a to the pose. Left is what
-    covariance the pose has where both are known.
-    """
+    """Write a pose between nodes a and b, and to ``work`` its Jacobians and covariance."""
     (a, b), (way, N), (d, P) = poses, leg, step
     by_a, by_b, left, G, R, L = work[0], work[1], work[2], work[3], work[4], work[5]
     c, s = math.cos(a[2]), math.sin(a[2])
@@ -406,7 +387,7 @@ def _spread_between(
     work: Float[np.ndarray, "6 3 3"],
     covariance: Float[np.ndarray, "3 3"],
 ) -> None:
-    """Write the covariance of a pose between two nodes, from theirs and that of both (b, a)."""
+    """Write the covariance of a pose between two nodes, from theirs and their cross-covariance."""
     (own_a, own_b, both), by_a, by_b, left = spreads, work[0], work[1], work[2]
     turned, half, cross = work[3], work[4], work[5]
     congruent(by_a, own_a, half, left)

@@ -1,13 +1,8 @@
-"""Records of arrays that the smoother's kernels take, and where each number stands.
+"""Array records, shared stacks and small-matrix routines of the smoother's kernels.
 
-Arrays that grow: what a drive has heard is kept once, and shared by all beliefs about it.
-
-A belief is never changed, and each frame makes a new one. Were its history copied, a mission would
-cost the square of its length. A `Stack` is the first so many entries of arrays that have room for
-more. What one belief adds stands behind the entries of all earlier ones, in the same arrays, unless
-another belief has written there before: then it gets copies.
-
-Products and factors of small matrices by loops, whose order of additions is always the same.
+The *separator* (`border`) holds the landmarks and parameters that all poses share. A `span` is a
+node, its first measurement and the end of its range. The matrix routines are loops with a fixed
+order of additions, so that results are reproducible.
 """
 
 import math
@@ -20,12 +15,16 @@ from jaxtyping import Bool, Float, Int
 from pipistrelle.jit import Whole, kernel, no_alloc
 
 ROOM = 64
-"""How many entries a first array holds."""
+"""Initial capacity of a stack."""
 
 
 @dataclass(frozen=True, slots=True)
 class Stack:
-    """The first entries of arrays that grow together along their first axes.
+    """Append-only arrays that grow together along their first axes, shared by successive beliefs.
+
+    Copying the history of each immutable belief would cost the square of a mission's length. A
+    stack is a prefix of arrays with spare capacity: extending it shares them, or copies them if
+    another stack has already written behind the prefix.
 
     >>> stack = Stack((np.zeros((4, 2)),))
     >>> one, other = stack.extended(1), stack.extended(1)
@@ -37,10 +36,10 @@ class Stack:
     arrays: tuple[np.ndarray, ...]
     size: int = 0
     written: list[int] = field(default_factory=lambda: [0])
-    """How many entries of the arrays some stack has; stacks of the same arrays share it."""
+    """Number of entries written by any stack of these arrays, shared between them."""
 
     def extended(self, count: int) -> Self:
-        """Return a stack with so many entries more, which are yet to be written."""
+        """Return a stack extended by unwritten entries."""
         arrays, written, size = self.arrays, self.written, self.size + count
         if written[0] != self.size or size > len(arrays[0]):
             room = max(ROOM, len(arrays[0]), 2 * size if size > len(arrays[0]) else 0)
@@ -50,12 +49,12 @@ class Stack:
         return type(self)(arrays, size, written)
 
     def entries(self, number: int) -> np.ndarray:
-        """Return the entries of an array."""
+        """Return the valid entries of an array."""
         return self.arrays[number][: self.size]
 
 
 def _copied(array: np.ndarray, size: int, room: int) -> np.ndarray:
-    """Return the first entries of an array, in one with more room."""
+    """Copy the first entries of an array into a larger array."""
     copied = np.zeros((room, *array.shape[1:]), array.dtype)
     copied[:size] = array[:size]
     return copied
@@ -63,7 +62,7 @@ def _copied(array: np.ndarray, size: int, room: int) -> np.ndarray:
 
 @no_alloc
 def write(A: Float[np.ndarray, "d n"], B: Float[np.ndarray, "d n"]) -> None:
-    """Write A to B."""
+    """Copy A to B."""
     for a in range(B.shape[0]):
         for j in range(B.shape[1]):
             B[a, j] = A[a, j]
@@ -71,7 +70,7 @@ def write(A: Float[np.ndarray, "d n"], B: Float[np.ndarray, "d n"]) -> None:
 
 @no_alloc
 def add(A: Float[np.ndarray, "d n"], B: Float[np.ndarray, "d n"], sign: float) -> None:
-    """Add A, times a sign, to B, as many columns as both have."""
+    """Add A times a sign to B, over their common columns."""
     for a in range(B.shape[0]):
         for j in range(min(A.shape[1], B.shape[1])):
             B[a, j] += sign * A[a, j]
@@ -79,7 +78,7 @@ def add(A: Float[np.ndarray, "d n"], B: Float[np.ndarray, "d n"], sign: float) -
 
 @no_alloc
 def transpose(A: Float[np.ndarray, "d e"], B: Float[np.ndarray, "e d"]) -> None:
-    """Write the transposed of A to B."""
+    """Write the transpose of A to B."""
     for a in range(A.shape[0]):
         for b in range(A.shape[1]):
             B[b, a] = A[a, b]
@@ -87,7 +86,7 @@ def transpose(A: Float[np.ndarray, "d e"], B: Float[np.ndarray, "e d"]) -> None:
 
 @no_alloc
 def write_identity(A: Float[np.ndarray, "d d"]) -> None:
-    """Write the identity."""
+    """Write the identity matrix."""
     for a in range(A.shape[0]):
         for b in range(A.shape[0]):
             A[a, b] = 1.0 if a == b else 0.0
@@ -97,7 +96,7 @@ def write_identity(A: Float[np.ndarray, "d d"]) -> None:
 def write_image(
     A: Float[np.ndarray, "d e"], x: Float[np.ndarray, " e"], image: Float[np.ndarray, " d"]
 ) -> None:
-    """Write A x."""
+    """Write A x to ``image``."""
     for a in range(image.size):
         image[a] = 0.0
     add_image(A, x, image, 1.0)
@@ -107,7 +106,7 @@ def write_image(
 def multiply(
     A: Float[np.ndarray, "d e"], B: Float[np.ndarray, "e n"], product: Float[np.ndarray, "d n"]
 ) -> None:
-    """Write A B."""
+    """Write A B to ``product``."""
     product[:] = 0.0
     add_product(A, B, product, 1.0)
 
@@ -119,10 +118,7 @@ def add_product(
     total: Float[np.ndarray, "d n"],
     sign: float,
 ) -> None:
-    """Add A B, times a sign, to what stands there, as many columns as both have.
-
-    Three rows of B, those of a pose, are read at once.
-    """
+    """Add A B times a sign to ``total``, over their common columns; three rows of B at once."""
     columns = min(B.shape[1], total.shape[1])
     for a in range(A.shape[0]):
         first = 0
@@ -141,7 +137,7 @@ def add_product(
 
 @no_alloc
 def add_multiple(x: Float[np.ndarray, " n"], share: float, total: Float[np.ndarray, " n"]) -> None:
-    """Add a share of x to what stands there, as far as that goes."""
+    """Add a multiple of x to ``total``, over its length."""
     for j in range(total.size):
         total[j] += share * x[j]
 
@@ -153,7 +149,7 @@ def add_image(
     total: Float[np.ndarray, " d"],
     sign: float,
 ) -> None:
-    """Add A x, times a sign, to what stands there."""
+    """Add A x times a sign to ``total``."""
     for a in range(total.size):
         for e in range(x.size):
             total[a] += sign * A[a, e] * x[e]
@@ -166,7 +162,7 @@ def congruent(
     A: Float[np.ndarray, "d d"],
     P: Float[np.ndarray, "d d"],
 ) -> None:
-    """Add F M F^T to P; in A is F M."""
+    """Add F M F^T to P, and write F M to A."""
     multiply(F, M, A)
     for a in range(P.shape[0]):
         for b in range(a + 1):
@@ -178,10 +174,7 @@ def congruent(
 
 @no_alloc
 def cholesky(A: Float[np.ndarray, "d d"], L: Float[np.ndarray, "d d"]) -> None:
-    """Write the lower factor of a positive semidefinite matrix; a pivot that is not above 0 is 0.
-
-    All of L that is above its diagonal is left as it is.
-    """
+    """Write the Cholesky factor of a positive semidefinite matrix; pivots not above 0 become 0."""
     for j in range(A.shape[0]):
         pivot = A[j, j]
         for e in range(j):
@@ -196,7 +189,7 @@ def cholesky(A: Float[np.ndarray, "d d"], L: Float[np.ndarray, "d d"]) -> None:
 
 @no_alloc
 def solve_with(L: Float[np.ndarray, "d d"], x: Float[np.ndarray, " d"]) -> None:
-    """Replace x by (L L^T)^-1 x; by 0 along what a pivot of 0 does not know (`cholesky`)."""
+    """Replace x by (L L^T)^-1 x; components with a pivot of 0 become 0."""
     d = x.size
     for a in range(d):
         for b in range(a):
@@ -219,7 +212,7 @@ def posterior(
     ],
     M: Float[np.ndarray, "d d"],
 ) -> None:
-    """Write (P^-1 + T)^-1 as L (I + L^T T L)^-1 L^T, with P = L L^T: P may be singular."""
+    """Write (P^-1 + T)^-1 as L (I + L^T T L)^-1 L^T, with P = L L^T; P may be singular."""
     (L, A, B), d = work, P.shape[0]
     L[:] = 0.0
     cholesky(P, L)
@@ -246,13 +239,13 @@ def posterior(
 
 
 POSE = 3
-"""Numbers of the chain's state that are the pose."""
+"""Size of the pose in a state of the chain."""
 CALLER = 4
-"""Numbers of each moving caller: its place and its velocity."""
+"""Size of each moving caller in a state of the chain: position and velocity."""
 
 
 class Front(NamedTuple):
-    """The last state of the chain, given the border, and the evidence about the border."""
+    """Last state of the chain given the separator: mean C beta, covariance P, evidence."""
 
     C: Float[np.ndarray, "d n"]
     P: Float[np.ndarray, "d d"]
@@ -260,52 +253,51 @@ class Front(NamedTuple):
 
 
 class Legs(NamedTuple):
-    """How the vehicle came to each node of the chain; the first is the start."""
+    """Preintegrated motion to each node of the chain; entry 0 is the start."""
 
     mean: Float[np.ndarray, "k 3"]  # motion since the node before, in its axes
     noise: Float[np.ndarray, "k 3 3"]
     seconds: Float[np.ndarray, " k"]
-    rows: Int[np.ndarray, "k 2"]  # what was heard from it: first row, and the one after the last
+    rows: Int[np.ndarray, "k 2"]  # first measurement of the node, and the end of its range
     slopes: Float[np.ndarray, "k 3 q"]
-    """Of the motion, by the parameters of odometry, which stand first in the border."""
+    """Jacobian of the motion by the odometry parameters, which come first in the separator."""
     scale: Int[np.ndarray, "1"]
-    """Column of the speed's scale where nothing else tells how large the world is, or 0."""
+    """Separator column of the speed scale if nothing else fixes the size of the world, else 0."""
 
 
 class Rows(NamedTuple):
-    """Measurements in the order of their nodes."""
+    """Measurements sorted by node."""
 
     ends: Int[np.ndarray, "m 4"]
-    """Slots of the landmark, and of the excess path's caller or -1; the node; the row of the
-    landmark's bearing before, or -1."""
-    numbers: Float[np.ndarray, "m 8"]  # as those of a scan
+    """Slots of landmark and caller (-1: no excess path), node, and row of the previous bearing or
+    -1."""
+    numbers: Float[np.ndarray, "m 8"]  # columns of a scan
 
 
 class Places(NamedTuple):
-    """Where each slot, a landmark or a caller, stands among the unknowns, and the parameters."""
+    """Variable of each slot (landmark or caller), and parameters of moving callers and sensor."""
 
-    index: Int[np.ndarray, " s"]  # column of the border; minus the index in the chain; 0: nowhere
+    index: Int[np.ndarray, " s"]  # separator column; minus the index in the chain; 0: no variable
     first: Int[np.ndarray, " v"]  # node at which each moving caller joins the chain
-    begun: Float[np.ndarray, "v 2"]  # where it was placed then
+    begun: Float[np.ndarray, "v 2"]  # initial position of each moving caller [m]
     sensor: Int[np.ndarray, "4"]
-    """Columns of the speed of sound, of the sensor's heading, of its place and of how late its
-    clock is; 0: not estimated."""
+    """Columns of speed of sound, sensor heading, sensor position and clock delay; 0: known."""
     way: Float[np.ndarray, "k 3"]  # as `Legs.mean`
     seconds: Float[np.ndarray, " k"]
 
 
 class NoiseModel(NamedTuple):
-    """Assumptions about measurements and moving callers."""
+    """Noise of measurements and moving callers."""
 
-    believed: float  # Huber's bound in standard deviations, or infinity
-    place_std: float  # of a moving caller when it joins the chain [m]
-    speed_std: float  # of its velocity then, along an axis [m/s]
-    walk_std: float  # of its velocity after 1 s [m/s]
-    damping: float = 0.0  # information that holds every unknown at its point (Levenberg)
+    believed: float  # Huber threshold [standard deviations], or infinity
+    place_std: float  # std of a moving caller's initial position [m]
+    speed_std: float  # std of a moving caller's initial velocity along each axis [m/s]
+    walk_std: float  # std of a moving caller's velocity change after 1 s [m/s]
+    damping: float = 0.0  # Levenberg damping: added information of every unknown
 
 
 class Links(NamedTuple):
-    """What elimination leaves of each node's predecessor: D beta + G x, with the covariance S."""
+    """Conditional of each node's predecessor: D beta + G x with covariance S."""
 
     D: Float[np.ndarray, "k d n"]
     G: Float[np.ndarray, "k d d"]
@@ -313,12 +305,12 @@ class Links(NamedTuple):
 
 
 class Work(NamedTuple):
-    """Arrays to work in."""
+    """Workspace of the elimination."""
 
     F: Float[np.ndarray, "d d"]
     u: Float[np.ndarray, " d"]
     Q: Float[np.ndarray, "d d"]
-    by: Float[np.ndarray, "d q"]  # slopes of a transition by the parameters of odometry
+    by: Float[np.ndarray, "d q"]  # Jacobian of a transition by the odometry parameters
     T: Float[np.ndarray, "d d"]
     G: Float[np.ndarray, "d n"]
     C: Float[np.ndarray, "d n"]
@@ -326,21 +318,21 @@ class Work(NamedTuple):
     M: Float[np.ndarray, "d d"]
     A: Float[np.ndarray, "d d"]
     B: Float[np.ndarray, "d d"]
-    at: Int[np.ndarray, " e"]  # entries of one row: where they stand in the chain, then the border
+    at: Int[np.ndarray, " e"]  # unknowns of a Jacobian row: chain entries, then separator columns
     slope: Float[np.ndarray, " e"]
-    alone: Bool[np.ndarray, "1"]  # whether each row corrects alone
+    alone: Bool[np.ndarray, "1"]  # whether measurements update the frontal state individually
     w: Float[np.ndarray, " n"]
 
 
 Arrays = tuple[np.ndarray, ...]
-"""A record as kernels are handed it: a plain tuple costs nothing at their door."""
+"""A record as a plain tuple, which kernels take without overhead."""
 PointArrays = tuple[Float[np.ndarray, "k d"], Float[np.ndarray, " n"]]
-"""Points of linearisation: states of the chain, and the border (the first number is not used)."""
+"""Linearisation points: states of the chain, and the separator (its first number is unused)."""
 
 
 @kernel
 def work_of(d: Whole, n: Whole, q: Whole) -> Work:
-    """Return arrays to work in: a state of d numbers, a border of n, q parameters of odometry."""
+    """Allocate a workspace: state of size d, separator of size n, q odometry parameters."""
     return Work(
         np.zeros((d, d)),
         np.zeros(d),

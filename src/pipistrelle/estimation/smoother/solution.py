@@ -1,24 +1,19 @@
-r"""The border of the arrow, solved by a factor of its information, and joint covariances.
+r"""Solution for the separator (`border`), and covariances of all states by a backward pass.
 
 The information is factored from its last row to its first, :math:`\Lambda = R^T R` with R lower
-triangular, so that every loop runs along a row. The first column of R is then the right-hand side.
-Columns in which nothing stands have a pivot of 1, and are 0.
-
-Back along the chain: means and covariances of all states and places.
-
-Elimination left each state, and each place that has left the border, as a linear function of the
-state after it and the border (`elimination.Links`, `elimination.leave`), with D, G and S:
+triangular, so that every loop runs along a row; the first column of R is then the right-hand side.
+Unused columns have a pivot of 1. Elimination left each state, and each landmark that has left the
+separator, with the conditional (`elimination.Links`, `elimination.leave`)
 
 .. math:: x_k = D \beta + G x_{k+1} + s, \qquad s \sim N(0, S) .
 
-The last state and the border are solved first (`solution`). With :math:`\Sigma` the covariance of
-the border, X that of a state with it and P its own, a node further back
+With :math:`\Sigma` the covariance of the separator, X a state's covariance with it and P the
+state's covariance, the previous node has
 
 .. math:: X_k = D \Sigma + G X_{k+1}, \quad \operatorname{Cov}(x_{k+1}, x_k) = X_{k+1} D^T +
           P_{k+1} G^T, \quad P_k = S + X_k D^T + G \operatorname{Cov}(x_{k+1}, x_k) .
 
-Nothing is subtracted, and places that entered later are dropped by leaving out their columns.
-Source: Rauch, Tung & Striebel, AIAA Journal 3, 1965, with a border.
+Source: Rauch, Tung & Striebel, AIAA Journal 3, 1965, extended by the separator.
 """
 
 import math
@@ -39,7 +34,7 @@ from pipistrelle.estimation.smoother.records import (
 from pipistrelle.jit import Whole, kernel, no_alloc, optimised_once
 
 Left = tuple[Float[np.ndarray, "g 2 n"], Float[np.ndarray, "g 2 d"], Float[np.ndarray, "g 2 2"]]
-"""D, G and S of places that have left the border."""
+"""D, G and S of landmarks that have left the separator."""
 
 
 @optimised_once
@@ -49,7 +44,7 @@ def trace_back(
     last: Float[np.ndarray, " d"],
     count: Whole,
 ) -> Float[np.ndarray, "k d"]:
-    """Return the states before the last so many links, the first of them first, and the last."""
+    """Return the last ``count`` + 1 states, in order, by a backward pass over links."""
     links, d = Links(*links), last.size
     states = np.empty((count + 1, d))
     for a in range(d):
@@ -65,7 +60,7 @@ def places_left(
     left: Left, column: Int[np.ndarray, " g"], beta: Float[np.ndarray, " n"],
     state: Float[np.ndarray, " d"],
 ) -> None:  # fmt: skip
-    """Write where places that left are, as differences from their points, into ``beta``."""
+    """Write solved landmarks that left the separator, relative to their points, to ``beta``."""
     place = np.empty(2)
     for g in range(column.size - 1, -1, -1):
         beta[column[g]] = beta[column[g] + 1] = 0.0
@@ -78,7 +73,7 @@ def places_left(
 def spread_with_border(
     C: Float[np.ndarray, "d n"], border: Float[np.ndarray, "n n"]
 ) -> Float[np.ndarray, "d n"]:
-    """Return the covariance of a state, of slopes C by the border, with the border of its own."""
+    """Return the cross-covariance of the separator and a state with derivatives C by it."""
     X = np.zeros(C.shape)
     multiply(C, border, X)
     return X
@@ -92,10 +87,9 @@ def spread_back(
     ],
     count: Whole,
 ) -> tuple[Float[np.ndarray, "k d d"], Float[np.ndarray, "k d d"]]:
-    """Return the covariances of the states before the last so many links, and with those after.
+    """Return covariances of the states before ``count`` links, and their cross-covariances.
 
-    ``covariances``: P of the last, X of it with the border, and that of the border; P and X become
-    those of the first.
+    ``covariances``: P, X (both replaced by the first state's) and the separator's covariance.
     """
     links, (P, X, border) = Links(*links), covariances
     d, n = X.shape
@@ -120,7 +114,7 @@ def spread_back(
 
 @no_alloc
 def _transpose_slopes(D: Float[np.ndarray, "d n"], turned: Float[np.ndarray, "n d"]) -> None:
-    """Write the transposed of D without its first column, that of the constant."""
+    """Write the transpose of D, with 0 for its constant column."""
     for a in range(D.shape[0]):
         turned[0, a] = 0.0
         for j in range(1, D.shape[1]):
@@ -129,7 +123,7 @@ def _transpose_slopes(D: Float[np.ndarray, "d n"], turned: Float[np.ndarray, "n 
 
 @no_alloc
 def _make_symmetric(P: Float[np.ndarray, "d d"]) -> None:
-    """Replace a matrix by its mean with its transposed."""
+    """Make a matrix symmetric by averaging it with its transpose."""
     for a in range(P.shape[0]):
         for b in range(a):
             P[a, b] = P[b, a] = 0.5 * (P[a, b] + P[b, a])
@@ -143,7 +137,7 @@ def spread_left(
         Float[np.ndarray, "d d"], Float[np.ndarray, "d n"], Float[np.ndarray, "n n"]
     ],
 ) -> Float[np.ndarray, "g 2 2"]:
-    """Add places that left to the covariances (`spread_back`); return their own."""
+    """Add landmarks that left the separator to the covariances; return their 2 x 2 blocks."""
     P, X, border = covariances
     (d, n), own = X.shape, np.zeros((column.size, 2, 2))
     by_border, by_state = np.zeros((2, n)), np.zeros((2, d))
@@ -172,7 +166,7 @@ def spread_left(
 def _add_by_slopes(
     D: Float[np.ndarray, "e n"], X: Float[np.ndarray, "d n"], total: Float[np.ndarray, "e d"]
 ) -> None:
-    """Add D X^T, without the first column."""
+    """Add D X^T to ``total``, without the constant column."""
     for e in range(total.shape[0]):
         for a in range(total.shape[1]):
             for j in range(1, D.shape[1]):
@@ -181,10 +175,7 @@ def _add_by_slopes(
 
 @no_alloc
 def factor(R: Float[np.ndarray, "n n"], n: Whole) -> None:
-    """Factor an information of n columns, R^T R, in place; its first column becomes R b.
-
-    Four rows at a time: that reads and writes the rows above a quarter as often.
-    """
+    """Factor an information matrix of n columns to R^T R in place; its first column becomes R b."""
     i = n - 1
     while i >= 4:
         _factor_rows(R, i, 4)
@@ -201,7 +192,7 @@ def factor(R: Float[np.ndarray, "n n"], n: Whole) -> None:
 
 @no_alloc
 def _factor_rows(R: Float[np.ndarray, "n n"], i: Whole, count: Whole) -> None:
-    """Factor so many rows from row i up, and take each from those of them that are above it."""
+    """Factor ``count`` rows from row i upwards, and subtract each from the others above it."""
     for p in range(i, i - count, -1):
         row = R[p]
         _divide(row, p)
@@ -213,7 +204,7 @@ def _factor_rows(R: Float[np.ndarray, "n n"], i: Whole, count: Whole) -> None:
 
 @no_alloc
 def _divide(row: Float[np.ndarray, " n"], i: Whole) -> None:
-    """Divide a row by the root of its pivot at i."""
+    """Divide a row by the root of its pivot."""
     inverse = 1.0 / math.sqrt(row[i])
     for j in range(i + 1):
         row[j] *= inverse
@@ -221,7 +212,7 @@ def _divide(row: Float[np.ndarray, " n"], i: Whole) -> None:
 
 @no_alloc
 def minimise(R: Float[np.ndarray, "n n"], n: Whole, beta: Float[np.ndarray, " n"]) -> None:
-    """Write (1, b) of the least cost, from the factor."""
+    """Write the minimiser (1, b) of the cost, from the factor R."""
     beta[0] = 1.0
     for i in range(1, n):
         total = 0.0
@@ -232,7 +223,7 @@ def minimise(R: Float[np.ndarray, "n n"], n: Whole, beta: Float[np.ndarray, " n"
 
 @no_alloc
 def rooted(R: Float[np.ndarray, "n n"], w: Float[np.ndarray, " n"], n: Whole) -> None:
-    """Replace a slope w by the border by R^-T w, whose square is the variance of w b."""
+    """Replace a separator derivative w by R^-T w; its squared norm is the variance of w b."""
     w[0] = 0.0
     for i in range(n - 1, 0, -1):
         if w[i] != 0.0:
@@ -246,10 +237,7 @@ def rooted(R: Float[np.ndarray, "n n"], w: Float[np.ndarray, " n"], n: Whole) ->
 def solve(
     front: Arrays, n: Whole, R: Float[np.ndarray, "n n"], beta: Float[np.ndarray, " n"]
 ) -> tuple[Float[np.ndarray, " d"], Float[np.ndarray, "d d"]]:
-    """Solve for the border; return the state's difference from its point, and its covariance.
-
-    R and ``beta`` are written: the factor, and (1, b).
-    """
+    """Solve for the separator; return the last state relative to its point, and its covariance."""
     C, P, information = front
     d = P.shape[0]
     state, covariance, Z = np.zeros(d), np.empty((d, d)), np.empty((d, n))
@@ -265,7 +253,7 @@ def solve(
 def write_lower(
     information: Float[np.ndarray, "w w"], n: Whole, R: Float[np.ndarray, "n n"]
 ) -> None:
-    """Write the lower triangle of an information of n columns to R, 1 where nothing stands."""
+    """Copy the lower triangle of an information matrix to R, with pivot 1 for unused columns."""
     for i in range(n):
         for j in range(i + 1):
             R[i, j] = information[i, j]
@@ -282,7 +270,7 @@ def spread(
     Z: Float[np.ndarray, "d n"],
     covariance: Float[np.ndarray, "d d"],
 ) -> None:
-    """Write the covariance of a state, P given the border and with slopes C by it."""
+    """Write the covariance of a state: P given the separator, with derivatives C by it."""
     for a in range(P.shape[0]):
         for j in range(n):
             Z[a, j] = C[a, j]
@@ -302,7 +290,7 @@ def joint(
     by_chain: Float[np.ndarray, "q d"],
     by_border: Float[np.ndarray, "q n"],
 ) -> Float[np.ndarray, "q q"]:
-    """Return the covariance of linear functions of the last state and the border together."""
+    """Return the covariance of linear functions of the last state and the separator."""
     C, P, _ = front
     q, d = by_chain.shape
     Z, covariance, last = by_border.copy(), np.empty((q, q)), np.zeros(q, np.int64)
@@ -329,7 +317,7 @@ def joint(
 
 @optimised_once
 def border_covariance(R: Float[np.ndarray, "n n"]) -> Float[np.ndarray, "n n"]:
-    """Return the covariance of the border from its factor; row and column of the constant are 0."""
+    """Return the covariance of the separator from its factor, with 0 for the constant."""
     n = R.shape[0]
     Z, covariance = np.zeros((n, n)), np.zeros((n, n))
     for i in range(1, n):

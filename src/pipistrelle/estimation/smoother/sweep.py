@@ -1,7 +1,6 @@
-"""A front on its way along the chain: landmarks enter and leave the border, stretches are left.
+"""Forward elimination along the chain, with landmarks that enter and leave the separator.
 
-A `Sweep` is worked on by one frame, or by one elimination of all or of the end of the chain, and
-ends as a `Solution`, which is never changed.
+A `Sweep` is mutable, used for a single frame or elimination, and ends as an immutable `Solution`.
 """
 
 from collections.abc import Sequence
@@ -16,84 +15,84 @@ from pipistrelle.estimation.smoother.records import CALLER, POSE, Arrays, Stack
 from pipistrelle.estimation.smoother.solution import Left, solve
 
 Noise = tuple[float, ...]
-"""As `records.Noise`."""
+"""Fields of `records.NoiseModel`."""
 COLUMNS = 32
-"""The border has room for a multiple of so many columns."""
+"""Increment of the separator's capacity [columns]."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Points:
-    """Where all unknowns are linearised."""
+    """Linearisation points of all unknowns."""
 
     at: Stack
     """States of the chain."""
     spots: Float[np.ndarray, "l 2"]
-    """Landmarks of the border, by their numbers [m]."""
+    """Positions of the separator's landmarks, by their numbers [m]."""
     parameters: Float[np.ndarray, " p"]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Stretch:
-    """Some nodes of the chain in a row: what they began with, and what elimination left of them."""
+    """Segment of the chain: its initial frontal state, and conditionals left by its elimination."""
 
     first: int
-    """The first node."""
+    """First node."""
     front: Arrays
-    """`records.Front` at the node before, after what left there; of the start, one of zeros."""
+    """`records.Front` before the segment, after landmarks left it; zeros at the start."""
     columns: Int[np.ndarray, " l"]
-    """Columns of the landmarks then; 0 of those that are not in the border."""
+    """Columns of the landmarks at its start; 0 if not in the separator."""
     cost: float
-    """Of all before, times two."""
+    """Twice the cost of all before."""
     links: Stack
-    """`records.Links` to each of its nodes from the one before."""
+    """`records.Links` between its nodes, and from the node before."""
     gone: Int[np.ndarray, " g"]
-    """Numbers of the landmarks that left the border after its last node, in order."""
+    """Numbers of the landmarks that left the separator after its last node, in order."""
     freed: Int[np.ndarray, " g"]
-    """Their columns."""
+    """Columns of these landmarks."""
     left: Left
-    """What is left of them."""
+    """Conditionals of these landmarks."""
 
     @property
     def last(self) -> int:
-        """The last node."""
+        """Last node of the segment."""
         return self.first + self.links.size - 1
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Solution:
-    """A chain that is solved up to its last node."""
+    """Solved chain up to its last node."""
 
     points: Points
     columns: Int[np.ndarray, " l"]
-    """Columns of the landmarks that stand in the border now; 0: not yet, or no more."""
+    """Columns of the landmarks now in the separator; 0: not in it."""
     border: Float[np.ndarray, " w"]
-    """Points of the border's columns."""
+    """Linearisation points of the separator's columns."""
     stretches: tuple[Stretch, ...]
     front: Arrays
-    """`records.Front`."""
+    """`records.Front` of the last node."""
     factor: Float[np.ndarray, "n n"]
     beta: Float[np.ndarray, " n"]
     state: Float[np.ndarray, " d"]
-    """State of the last node: pose, then place and velocity of each moving caller."""
+    """State of the last node: pose, then position and velocity of each moving caller."""
     covariance: Float[np.ndarray, "d d"]
     cost: float
-    """Twice that at the points, where all was linearised there."""
+    """Twice the cost at the linearisation points, if all are current."""
     places: Arrays
-    """Where each slot stands (`records.Places`)."""
+    """Variable of each slot (`records.Places`)."""
 
 
 class Sweep:
-    """A front, and the columns of the border, at a node of the chain."""
+    """Forward elimination: the frontal state and the separator's columns at a node of the chain."""
 
     def __init__(self, history: History, noise: Noise, points: Points) -> None:
-        """Make a border of parameters alone."""
+        """Start with a separator that contains only parameters."""
         self.history, self.noise, self.points = history, noise, points
         self.columns = np.zeros(len(history.placed), np.int64)
         self.stretches: list[Stretch] = []
         self.cost = 0.0
 
     def begin(self) -> None:
-        """Begin at the start."""
+        """Begin the elimination at the start of the chain."""
         w, d = _room(1 + self.points.parameters.size), self.history.dimension
         self.front: Arrays = np.zeros((d, w)), np.zeros((d, d)), np.zeros((w, w))
         self.border = _padded(np.append(0.0, self.points.parameters), (w,))
@@ -104,7 +103,7 @@ class Sweep:
         )  # fmt: skip
 
     def take_up(self, kept: Sequence[Stretch], first: int) -> None:
-        """Keep the stretches before one, and begin as that has begun."""
+        """Resume the elimination at a segment, keeping the segments before it."""
         self.stretches, begun = list(kept[:first]), kept[first]
         self.columns[: begun.columns.size] = begun.columns
         self.front, self.cost = tuple(map(np.copy, begun.front)), begun.cost
@@ -114,14 +113,14 @@ class Sweep:
         self._write_spots(np.flatnonzero(self.columns))
 
     def go_on(self, solution: Solution) -> None:
-        """Begin where a solution is."""
+        """Resume the elimination at the end of a solution."""
         self.stretches, self.cost = list(solution.stretches), solution.cost
         self.columns[: solution.columns.size] = solution.columns
         self.front, self.border = tuple(map(np.copy, solution.front)), solution.border.copy()
         self._settle()
 
     def go_to_the_end(self) -> None:
-        """Go through all further stretches."""
+        """Eliminate all remaining segments."""
         entering = self.history.entering
         for number in range(len(self.stretches), 1 + (self.history.nodes - 1) // STRETCH):
             self._open()
@@ -134,7 +133,7 @@ class Sweep:
                 self.part()
 
     def step(self) -> None:
-        """Step to the last node, before anything is heard there."""
+        """Predict to the last node, before its measurements."""
         k = self.history.nodes - 1
         if k % STRETCH == 0:
             self.part()
@@ -148,12 +147,12 @@ class Sweep:
         )  # fmt: skip
 
     def hear(self) -> None:
-        """Hear what the last node has heard."""
+        """Apply the measurements of the last node."""
         k = self.history.nodes - 1
         self._eliminate(k, k, k + 1)
 
     def join(self, numbers: Int[np.ndarray, " l"]) -> None:
-        """Let landmarks enter the border, with what is known of them."""
+        """Add landmarks with their priors to the separator."""
         if not numbers.size:
             return
         taken, column = {*self.columns.tolist()}, 1 + self.points.parameters.size
@@ -168,7 +167,7 @@ class Sweep:
         self.cost += enter(self.front[2], at, known, self.border, self.noise[4])
 
     def admit(self, history: History) -> None:
-        """Take a history with more landmarks, which may join, and moving callers, which do now."""
+        """Adopt a history with new landmarks, which join later, and new moving callers."""
         before, self.history = self.history, history
         more = len(history.placed) - len(before.placed)
         self.columns = np.append(self.columns, np.zeros(more, np.int64))
@@ -183,7 +182,7 @@ class Sweep:
             P[range(i, i + 4), range(i, i + 4)] = np.square(np.repeat(self.noise[1:3], 2))
 
     def part(self) -> None:
-        """Let landmarks leave the border that leave after the last stretch."""
+        """Eliminate the landmarks scheduled to leave the separator after the last segment."""
         stretch = self.history.leaves == len(self.stretches) - 1
         gone = np.flatnonzero(stretch & (self.columns > 0))
         if not gone.size:
@@ -216,7 +215,7 @@ class Sweep:
         )
 
     def _open(self) -> None:
-        """Open a stretch."""
+        """Begin a new segment."""
         d, w = self.front[0].shape
         none = np.empty(0, np.int64)
         self.stretches.append(
@@ -233,12 +232,12 @@ class Sweep:
         )
 
     def _extend(self, count: int) -> None:
-        """Let the last stretch have so many nodes more."""
+        """Extend the last segment by nodes."""
         last = self.stretches[-1]
         self.stretches[-1] = replace(last, links=last.links.extended(count))
 
     def _eliminate(self, stands: int, first: int, last: int) -> None:
-        """Carry the front on, in the last stretch."""
+        """Eliminate nodes of the last segment."""
         stretch = self.stretches[-1]
         span = stands, first, last, self.size, stretch.first
         self.cost += eliminate(
@@ -247,24 +246,24 @@ class Sweep:
         )  # fmt: skip
 
     def _settle(self) -> None:
-        """Note where each slot stands (`records.Places`), and how many columns there are."""
+        """Update the variable index of all slots and the number of columns."""
         self.places = self.history.places(self.columns)
         last = int(self.columns.max()) + 2 if self.columns.size else 0
         self.size = max(1 + self.points.parameters.size, last)
 
     def _linearised(self) -> tuple[np.ndarray, np.ndarray]:
-        """Return the points of the chain's states and of the border's columns."""
+        """Return the linearisation points of states and separator."""
         return self.points.at.arrays[0], self.border
 
     def _write_spots(self, numbers: Int[np.ndarray, " l"]) -> None:
-        """Write the points of landmarks to their columns; make room where there is none."""
+        """Write landmarks' linearisation points to their columns, with more room if necessary."""
         if self.size > len(self.border):
             self._widen(self.history.dimension, _room(self.size))
         for e in range(2):
             self.border[self.columns[numbers] + e] = self.points.spots[numbers, e]
 
     def _widen(self, d: int, w: int) -> None:
-        """Make room for states of d numbers and a border of w columns."""
+        """Enlarge all arrays to states of size d and a separator of w columns."""
         if self.front[0].shape == (d, w):
             return
         if d > len(self.front[0]):
@@ -284,7 +283,7 @@ class Sweep:
 
 
 def _wider(stretch: Stretch, d: int) -> Stretch:
-    """Return a stretch with states of d numbers."""
+    """Enlarge a segment to states of size d."""
     D, G, S = stretch.links.arrays
     by_border, by_state, own = stretch.left
     (k, _, w), size = D.shape, stretch.links.size
@@ -299,17 +298,17 @@ def _wider(stretch: Stretch, d: int) -> Stretch:
 
 
 def _links(k: int, d: int, w: int) -> Stack:
-    """Return room for so many links."""
+    """Allocate k conditionals of the backward pass (`records.Links`)."""
     return Stack((np.zeros((k, d, w)), np.zeros((k, d, d)), np.zeros((k, d, d))))
 
 
 def _room(columns: int) -> int:
-    """Return a multiple of `COLUMNS` that has room for so many."""
+    """Round a number of columns up to a multiple of `COLUMNS`."""
     return -(-columns // COLUMNS) * COLUMNS
 
 
 def _padded(array: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
-    """Return an array in the corner of a larger one of zeros."""
+    """Pad an array with zeros to a shape."""
     padded = np.zeros(shape)
     padded[tuple(map(slice, array.shape))] = array
     return padded
