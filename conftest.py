@@ -26,7 +26,9 @@ def pytest_sessionstart(session: pytest.Session) -> None:
 
 
 @pytest.fixture
-def undrawn(monkeypatch):
-    """Leave out the picture, which is most of a short mission's time."""
-    monkeypatch.setattr("pipistrelle.figures.mission.draw_mission", lambda *_, **__: None)
-    monkeypatch.setattr("pipistrelle.figures.style.save_figure", lambda *_: None)
+def undrawn():
+    """Leave out the picture of missions."""
+    from reference.pictures import without_picture
+
+    with without_picture():
+        yield

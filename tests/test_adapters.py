@@ -69,7 +69,7 @@ def test_the_score_is_of_the_lidar_after_alignment(park, tmp_path, capsys):
     assert "RMSE 0.00" not in capsys.readouterr().out
 
 
-def test_what_is_not_victoria_park_is_refused_by_its_line(park, tmp_path):
+def test_invalid_victoria_park_files_are_refused_by_line(park, tmp_path):
     files, _ = park
     (files / "inputs.dat").write_text("0.0 1.0 0.0\n0.1 fast 0.0\n")
     with pytest.raises(InputError, match=r"inputs\.dat, line 2: found speed 'fast'"):
@@ -101,7 +101,7 @@ def world(tmp_path):
     return files, path, posts
 
 
-def test_the_published_draw_is_taken_as_it_is_and_a_seed_draws_another(world, tmp_path):
+def test_the_published_draw_is_used_and_a_seed_draws_another(world, tmp_path):
     files, path, posts = world
     write = functions("phd_slam")["log"]
     write(files, tmp_path / "log")
@@ -120,7 +120,7 @@ def test_the_published_draw_is_taken_as_it_is_and_a_seed_draws_another(world, tm
     assert not np.array_equal(other.controls, log.controls)
 
 
-def test_gospa_is_that_of_the_authors(world, tmp_path, capsys):
+def test_gospa_matches_the_authors_formula(world, tmp_path, capsys):
     # One post is 3 m off, one missed, one false: 9 + 2 * 20^2 / 2.
     files, path, _ = world
     result = tmp_path / "result"

@@ -51,7 +51,7 @@ def test_the_import_contracts_are_kept():
     assert done.returncode == 0, done.stdout + done.stderr
 
 
-def test_the_rooms_of_the_readme_are_those_of_the_package_in_their_own_words():
+def test_the_readme_lists_the_rooms_with_their_docstrings():
     rows = re.findall(r"^\| `(\w+)` \| (.*) \|$", (ROOT / "README.md").read_text(), re.MULTILINE)
     doors = {room: import_module(f"pipistrelle.{room}").__doc__ or "" for room in ROOMS}
     assert rows == [(room, doc.splitlines()[0] if doc else "") for room, doc in doors.items()]
@@ -59,7 +59,7 @@ def test_the_rooms_of_the_readme_are_those_of_the_package_in_their_own_words():
 
 
 @pytest.mark.parametrize("room", ROOMS)
-def test_a_door_is_narrow(room):
+def test_a_room_exports_at_most_eight_names(room):
     door = import_module(f"pipistrelle.{room}")
     offered = [
         name
@@ -84,7 +84,7 @@ def test_the_body_of_a_function_fits_on_a_screen():
     assert long == []
 
 
-def test_no_module_is_a_drawer():
+def test_no_module_has_a_catch_all_name():
     drawers = {"utils", "util", "common", "helpers", "helper", "manager", "misc"}
     assert [path for path in SOURCES if path.stem in drawers] == []
 

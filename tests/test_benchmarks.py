@@ -115,7 +115,7 @@ def test_a_run_is_compared_with_the_newest_one_kept_or_a_named_one(measured_noth
     assert "frame_alone_ms: was 2.00 times better in faster.json" in capsys.readouterr().out
 
 
-def test_the_rate_of_a_study_is_told_from_the_worlds_after_the_first_of_each_worker():
+def test_the_rate_of_a_study_excludes_each_workers_first_world():
     start_up, world = 3.0, 4.0
     for workers, done in ((1, [7.0, 11.0, 15.0]), (2, [7.0, 7.0, 11.0, 11.0, 15.0, 15.0])):
         whole = study.whole_study(done, workers)
@@ -134,7 +134,7 @@ def test_the_rate_of_a_study_is_told_from_the_worlds_after_the_first_of_each_wor
         (1.1, ">=", True),
     ],
 )
-def test_a_promise_is_kept_on_its_own_side_of_the_target_and_on_it(value, relation, kept):
+def test_a_promise_is_kept_on_its_side_of_the_target_inclusive(value, relation, kept):
     found = replace(row("help_ratio", value, ""), target=1.0, relation=relation)
     assert met(found) is kept
     assert cells(found)[HEADINGS.index("met")] == ("yes" if kept else "NO")
@@ -169,12 +169,7 @@ def test_a_row_that_was_nothing_is_worse_when_it_breaks_its_promise():
 
 def test_growth_is_the_power_of_the_larger_sizes(monkeypatch):
     sizes = [
-        {
-            "arrivals": n,
-            "landmarks": n,
-            "frame_s": 1e-4 + 1e-5 * n,
-            "fastslam_s": 1e-6,
-        }
+        {"arrivals": n, "landmarks": n, "frame_s": 1e-4 + 1e-5 * n, "fastslam_s": 1e-6}
         for n in (10.0, 1e4, 1e5, 1e6)
     ]
     sizes += [{"states": n, "ekf_s": 1.0 + 1e-9 * n**2} for n in (10.0, 1e4, 1e5, 1e6)]

@@ -19,7 +19,7 @@ def told(tmp_path: Path, message: str) -> tuple[int, str]:
     return done.returncode, done.stderr
 
 
-def test_a_message_says_what_and_why(tmp_path):
+def test_a_sound_message_is_accepted(tmp_path):
     assert told(tmp_path, SOUND) == (0, "")
     assert told(tmp_path, SOUND + f"# what git adds of {HOME}/project\n") == (0, "")
     assert told(tmp_path, SOUND + "A full device is /dev/full; see docs/study.md.\n") == (0, "")
@@ -45,7 +45,7 @@ def test_a_message_says_what_and_why(tmp_path):
         ("Bags: mend it\n\nAs ~/try.py shows.\n", "'~/try.py' is a folder of one machine"),
     ],
 )
-def test_a_message_that_does_not_is_refused_with_the_reason(tmp_path, message, fault):
+def test_a_faulty_message_is_refused_with_the_reason(tmp_path, message, fault):
     status, said = told(tmp_path, message)
     assert status == 1
     assert said.startswith("commit message: ")

@@ -32,7 +32,7 @@ dev.set_up()
 """
 
 
-def test_of_those_who_start_at_once_one_makes_the_environment_and_the_others_wait(tmp_path):
+def test_only_one_of_several_starters_makes_the_environment(tmp_path):
     command = [sys.executable, "-c", START, str(DEV), str(tmp_path)]
     started = [
         subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
@@ -43,7 +43,7 @@ def test_of_those_who_start_at_once_one_makes_the_environment_and_the_others_wai
     assert sorted(told for told, _ in ended) == ["", "", "", "made\n"]
 
 
-def test_its_help_names_that_of_the_verbs():
+def test_the_help_names_the_verbs_help():
     for asked in ("help", "--help"):
         done = subprocess.run([sys.executable, DEV, asked], capture_output=True, text=True)
         assert done.returncode == 0

@@ -56,7 +56,7 @@ def test_each_rung_is_short_and_leads_on_to_the_next():
         assert linked[-1] == following.stem
 
 
-def test_the_echo_stands_above_the_noise_as_the_sonar_equation_says(play):
+def test_the_echos_level_over_noise_follows_the_sonar_equation(play):
     done, config = play("01_one_echo"), Config()
     place = 8.0 * np.array([[np.cos(done["angle"]), np.sin(done["angle"])]])
     callers = done["callers_of"](config, np.zeros(2))[:1]
@@ -72,7 +72,7 @@ def test_the_echo_stands_above_the_noise_as_the_sonar_equation_says(play):
     assert abs(done["answer"] - still) > 3 * spread, "without the Doppler shift it is another"
 
 
-def test_the_frame_tells_the_range_of_landmark_1_to_a_centimetre(play):
+def test_the_frame_gives_the_range_of_landmark_1_to_a_centimetre(play):
     done = play("02_one_frame")
     gain = 10 * np.log10(done["length"] * 10)  # of matched filter and beam
     level = done["arrivals"].level_db[done["arrivals"].landmark == 1].max()
@@ -80,7 +80,7 @@ def test_the_frame_tells_the_range_of_landmark_1_to_a_centimetre(play):
     assert done["answer"] < 0.01
 
 
-def test_the_mission_is_as_far_above_the_bound_as_its_track_and_the_truth_say(play):
+def test_the_missions_ratio_to_the_bound_follows_from_its_track(play):
     done = play("03_one_mission")
     track = done["done"].tracks[1:]
     off = [track[f"{axis}_m"] - track[f"true_{axis}_m"] for axis in "xy"]
@@ -90,14 +90,14 @@ def test_the_mission_is_as_far_above_the_bound_as_its_track_and_the_truth_say(pl
 
 
 @pytest.mark.filterwarnings("ignore:.*times the bound")  # as is said of it
-def test_the_fused_mission_knows_what_either_strategy_knows(play):
+def test_the_fused_mission_maps_the_landmarks_of_both_strategies(play):
     done = play("04_three_strategies")
     known = done["known"]
     assert known["fused"] == known["active"] | known["passive"]
     assert done["answer"] == len(known["passive"] - known["active"]) > 0
 
 
-def test_the_posts_of_the_corridor_are_where_the_filter_says(play):
+def test_the_posts_of_the_corridor_are_within_their_ellipses(play):
     done = play("05_your_own_world")
     places = dict(enumerate(np.array(done["posts"]), start=1))
     rows = [row for row in done["mapped"].iter_rows(named=True) if row["landmark"] in places]
@@ -117,7 +117,7 @@ def test_the_posts_of_the_corridor_are_where_the_filter_says(play):
     assert max(surprises(-1.0)) > limit, "posts half a turn round must fail"
 
 
-def test_the_log_is_mapped_as_well_as_the_filter_says(play, tmp_path_factory):
+def test_the_map_error_of_the_log_matches_its_covariance(play, tmp_path_factory):
     done = play("06_your_own_log")
     mapped = done["done"].landmarks
     stated = np.sqrt((mapped["xx_m2"] + mapped["yy_m2"]).mean())
@@ -137,7 +137,7 @@ def test_the_log_is_mapped_as_well_as_the_filter_says(play, tmp_path_factory):
 
 
 @pytest.mark.filterwarnings("ignore:.*times the bound")  # as is said of it
-def test_dead_reckoning_is_as_far_off_as_what_was_commanded(play):
+def test_dead_reckoning_follows_the_commanded_path(play):
     done = play("07_your_own_filter")
     config, (x, y, heading) = Config(), Config().scenario.start
     reckoned = []
@@ -198,7 +198,7 @@ def test_one_process_shards_and_a_cluster_find_the_same(play, tmp_path_factory, 
     assert not other.equals(done["tables"][0]), "another seed finds something else"
 
 
-def test_two_excess_paths_place_a_landmark_as_surely_as_the_information_of_all_says(play):
+def test_two_excess_paths_place_a_landmark_with_the_deviation_of_information(play):
     """Bearings, ranges and excess paths by differences about what made them: all are exact."""
     done = play("10_when_not_only_where")
     places = np.concatenate([done["vehicle"], done["callers"].ravel(), done["landmark"]])
@@ -246,7 +246,7 @@ def test_the_small_sonar_finds_its_way_in_the_harbour(tmp_path, capsys):
 
 
 @pytest.mark.slow
-def test_the_small_sonar_does_what_its_page_says(tmp_path):
+def test_the_small_sonars_table_matches_its_page(tmp_path):
     runs, page = sonar(tmp_path / "whole"), (EXAMPLES.parent / "docs" / "water.md").read_text()
     columns = [runs[name] for name in ("active", "fused", "passive")]
     for title, key, digits in (

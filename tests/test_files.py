@@ -25,7 +25,7 @@ def names(folder):
 
 
 @pytest.mark.parametrize("kind", ["pipe", "device", "folder", "link to a device"])
-def test_what_is_no_file_is_refused_by_name_and_never_waited_for(tmp_path, kind):
+def test_pipes_devices_and_folders_are_refused_without_waiting(tmp_path, kind):
     path = tmp_path / "one.txt"
     if kind == "pipe":
         os.mkfifo(path)
@@ -81,9 +81,7 @@ def test_nothing_is_written_through_a_link(tmp_path, monkeypatch):
 
 
 @pytest.mark.parametrize("hard_links", [True, False])
-def test_what_appeared_meanwhile_is_not_replaced_unless_it_may_be(
-    tmp_path, monkeypatch, hard_links
-):
+def test_a_file_that_appeared_meanwhile_is_not_replaced(tmp_path, monkeypatch, hard_links):
     path = tmp_path / "one.txt"
     if not hard_links:
 
@@ -104,7 +102,7 @@ def test_what_appeared_meanwhile_is_not_replaced_unless_it_may_be(
     assert names(tmp_path) == ["one.txt"]
 
 
-def test_who_was_overtaken_is_content_and_who_lost_a_file_is_not(tmp_path):
+def test_an_overtaken_writer_succeeds_and_a_lost_file_raises(tmp_path):
     path, partial = tmp_path / "one.txt", tmp_path / "one.txt.partial"
     with pytest.raises(FileNotFoundError):
         put_in_place(partial, path)
@@ -113,7 +111,7 @@ def test_who_was_overtaken_is_content_and_who_lost_a_file_is_not(tmp_path):
     assert path.read_text() == "by another"
 
 
-def test_only_our_own_partial_names_are_taken_for_what_a_kill_left(tmp_path):
+def test_only_pipistrelles_partial_names_count_as_leftovers(tmp_path):
     path = tmp_path / "one.txt"
     assert partial_of(path) != partial_of(path)
     assert whole_name(partial_of(path).name) == "one.txt"

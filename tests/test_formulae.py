@@ -68,7 +68,7 @@ def test_a_formula_becomes_mathml_of_glyphs_that_the_font_has(glyphs):
     assert bare <= {"\ufe00"}, "but for the mark of a variant"
 
 
-def test_lines_stand_below_each_other_and_a_matrix_is_none():
+def test_only_line_breaks_outside_a_matrix_make_rows():
     two = mathml(r"a &= b \\ c &= d", displayed=True)
     assert (two.count("<mtr>"), "&amp;" in two) == (2, False)
     assert mathml(r"a \\ b", displayed=True).count("<mtr>") == 2
@@ -76,14 +76,14 @@ def test_lines_stand_below_each_other_and_a_matrix_is_none():
     assert matrix.count("<mtable") == 1
 
 
-def test_what_is_no_formula_is_refused():
+def test_an_invalid_formula_is_refused():
     from math_core import LatexError
 
     with pytest.raises(LatexError):
         mathml(r"\frac{a}{", displayed=False)
 
 
-def test_a_label_bears_one_or_several_numbers():
+def test_a_label_has_one_or_several_numbers():
     text = cleandoc(
         r"""
         Head.

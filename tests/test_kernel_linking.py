@@ -83,7 +83,7 @@ def by_numba_alone(function):
     return njit(error_model="numpy")(own)
 
 
-def test_linked_kernels_give_the_bits_that_numba_alone_gives():
+def test_linked_kernels_give_the_bits_of_plain_numba():
     values = np.random.default_rng(0).standard_normal(1000)
     values[::50], values[7] = 0.0, np.nan
     ours, alone = mixed(values), by_numba_alone(mixed)(values)
@@ -163,7 +163,7 @@ def by_a_numba_that_lacks(what, tmp_path, words, code):
 
 
 @pytest.mark.parametrize("what", LACKING)
-def test_kernels_are_the_same_by_a_numba_that_lacks_what_is_private(tmp_path, what):
+def test_kernels_work_without_numbas_private_parts(tmp_path, what):
     (tmp_path / "linked.py").write_text(LINES)
     code = f"from linked import rows, np; {SHOW.split(', rows.stats')[0]})"
     done = by_a_numba_that_lacks(what, tmp_path, [], code)
@@ -182,7 +182,7 @@ def test_kernels_are_the_same_by_a_numba_that_lacks_what_is_private(tmp_path, wh
 
 
 @pytest.mark.slow
-def test_a_mission_is_the_same_by_a_numba_that_lacks_what_is_private(tmp_path):
+def test_a_mission_is_the_same_without_numbas_private_parts(tmp_path):
     run = ["-m", "pipistrelle", "run", "--duration", "2", "--filter", "ekf", "--quiet", "-o"]
     assert subprocess.run([sys.executable, *run, str(tmp_path / "as_it_is")]).returncode == 0
     done = by_a_numba_that_lacks("a class", tmp_path, [*run, str(tmp_path / "plain")], "")

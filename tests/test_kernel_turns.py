@@ -55,7 +55,7 @@ def test_of_processes_that_need_a_kernel_at_once_one_compiles_it(tmp_path):
     assert sorted(int(process.communicate()[0]) for process in started) == [0, 0, 1]
 
 
-def test_another_kernel_has_a_turn_of_its_own(tmp_path, holder):
+def test_another_kernel_has_a_separate_turn(tmp_path, holder):
     began, turn = time.monotonic(), Turn()
     turn.take(tmp_path / "other.nbi")
     turn.end()
@@ -70,7 +70,7 @@ def test_a_turn_ends_with_the_process_that_has_it(tmp_path, holder, monkeypatch)
     turn.end()
 
 
-def test_nobody_waits_for_ever_for_a_process_that_stands_still(tmp_path, holder, monkeypatch):
+def test_waiting_for_a_stalled_process_is_limited(tmp_path, holder, monkeypatch):
     waited = []
     monkeypatch.setattr(kernel_turns, "_LONGEST_S", 0.2)
     monkeypatch.setattr(kernel_turns.time, "sleep", waited.append)

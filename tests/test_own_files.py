@@ -67,7 +67,7 @@ def test_one_kind_never_replaces_another(own, tmp_path):
     assert OwnFiles(tmp_path / "empty", REPORT).there is None
 
 
-def test_what_we_wrote_is_known_again_and_makes_way_for_what_is_new(own, tmp_path):
+def test_written_files_are_recognised_and_replaced(own, tmp_path):
     (tmp_path / "notes.txt").write_text("mine")
     again = OwnFiles(tmp_path, REPORT)
     again.replace({"index.html": "zweite Fassung: µ"})
@@ -79,7 +79,7 @@ def test_what_we_wrote_is_known_again_and_makes_way_for_what_is_new(own, tmp_pat
     assert OwnFiles(tmp_path, REPORT).read("index.html") == "zweite Fassung: µ".encode()
 
 
-def test_what_is_read_is_as_it_was_written_or_refused_by_name(own, tmp_path):
+def test_changed_files_are_refused_by_name_when_read(own, tmp_path):
     assert OwnFiles(tmp_path, REPORT).read("index.html") == b"first"
     assert ("index.html" in own, "summary.json" in own) == (True, False)
     (tmp_path / "summary.json").write_text("mine")
@@ -96,7 +96,7 @@ def test_what_is_read_is_as_it_was_written_or_refused_by_name(own, tmp_path):
 
 
 @pytest.mark.skipif(which("sha256sum") is None, reason="this system has no sha256sum")
-def test_anybody_can_check_the_sums(own, tmp_path):
+def test_sha256sum_can_check_the_sums(own, tmp_path):
     own.add("index.html", b"second")
     found = subprocess.run(["sha256sum", "-c", SUMS], cwd=tmp_path, capture_output=True, text=True)
     assert (found.returncode, sorted(found.stdout.splitlines())) == (
@@ -128,7 +128,7 @@ def test_a_file_of_ours_that_is_changed_is_refused_by_name_and_nothing_is_remove
 
 
 @pytest.mark.parametrize("kind", ["file", "folder", "link to nothing", "pipe"])
-def test_what_is_not_ours_is_refused_by_name(own, tmp_path, kind):
+def test_foreign_files_are_refused_by_name(own, tmp_path, kind):
     path = tmp_path / "summary.json"
     if kind == "folder":
         path.mkdir()
@@ -223,7 +223,7 @@ def test_a_list_that_is_a_link_is_a_users(tmp_path):
         claim(folder, LOG, overwrite=True)
 
 
-def test_what_a_kill_left_is_swept_by_the_next_who_writes_and_nothing_else(own, tmp_path):
+def test_only_leftovers_of_a_kill_are_swept_by_the_next_writer(own, tmp_path):
     left = [partial_of(tmp_path / name) for name in ("index.html", "figures/two.png", SUMS)]
     users = [tmp_path / n for n in ("index.html.partial", "a.0a1b2c3d.partial", "figures/x.png")]
     for path in (*left, *users):
@@ -267,7 +267,7 @@ def _die_at(step):
 
 @pytest.mark.parametrize("before", ["nothing", "an earlier report"])
 @pytest.mark.parametrize("room", range(3))
-def test_a_full_disk_leaves_all_as_it_was(tmp_path, monkeypatch, before, room):
+def test_a_full_disk_leaves_all_files_unchanged(tmp_path, monkeypatch, before, room):
     own = OwnFiles(tmp_path / "new", REPORT)
     if before != "nothing":
         own.replace({"figures/two.png": b"two", "index.html": "first"})
@@ -289,7 +289,7 @@ def test_a_full_disk_leaves_all_as_it_was(tmp_path, monkeypatch, before, room):
     assert tree(tmp_path) == was
 
 
-def test_what_somebody_wrote_since_a_folder_was_claimed_is_not_replaced(tmp_path):
+def test_files_written_after_a_claim_are_not_replaced(tmp_path):
     one, two = (claim(tmp_path / "new", LOG, overwrite=False) for _ in "ab")
     one.replace({"log.toml": "one"})
     with pytest.raises(InputError, match="somebody else wrote into it meanwhile"):
@@ -302,7 +302,7 @@ def test_what_somebody_wrote_since_a_folder_was_claimed_is_not_replaced(tmp_path
         three.replace({"log.toml": "three"})
 
 
-def test_a_claim_leaves_nothing_and_says_what_it_cannot_have(tmp_path):
+def test_a_claim_leaves_no_file_and_refuses_occupied_folders(tmp_path):
     own = claim(tmp_path / "a" / "b", LOG, overwrite=False)
     assert tree(tmp_path) == {}
     own.replace({"log.toml": "one"})

@@ -20,7 +20,7 @@ def fault_of(**kite):
     return refused.value.errors(include_url=False)[0]
 
 
-def test_a_refusal_says_where_found_expected_and_the_fix():
+def test_a_refusal_contains_where_found_expected_and_fix():
     error = refusal("kite.toml, key 'length'", "-1.0", "greater than 0", "correct the value")
     assert str(error) == (
         "kite.toml, key 'length': found -1.0, expected greater than 0; correct the value"
@@ -47,7 +47,7 @@ def test_values_are_counted_where_their_number_is_the_fault_and_only_there():
     assert values_expected({"type": "missing", "loc": ("wind",)}, wind) is None
 
 
-def test_what_was_meant_is_spelt_alike_or_ends_alike_or_is_nothing():
+def test_a_suggestion_has_similar_spelling_or_the_same_ending():
     known = ["rays.power", "rays.prune", "air.pressure_kpa"]
     assert meant("rays.powr", known) == "rays.power"
     assert meant("scenario.association.prune", known) == "rays.prune"

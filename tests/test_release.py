@@ -42,7 +42,7 @@ def package_files(root: Path) -> set[str]:
     return {path.relative_to(root).as_posix() for path in paths}
 
 
-def test_the_wheel_holds_every_file_of_the_package_and_none_beside_it(built):
+def test_the_wheel_contains_exactly_the_files_of_the_package(built):
     unpacked, wheel = built
     here = package_files(ROOT / "src" / "pipistrelle")
     assert {"py.typed", "experiments/studies/paper.toml", "report/page.html"} <= here
@@ -81,7 +81,7 @@ def test_every_python_that_is_promised_is_tried_by_the_workflows():
     assert [job["strategy"]["matrix"]["python-version"] for job in jobs] == [promised] * 2
 
 
-def test_only_what_was_tested_and_tried_is_published_and_nothing_else_may_publish():
+def test_only_a_tested_release_is_published_by_one_job():
     jobs = WORKFLOWS["release"]["jobs"]
     assert jobs["publish"]["needs"] == ["test", "try", "lowest"]
     assert jobs["try"]["needs"] == "build"
@@ -103,7 +103,7 @@ def test_the_build_of_a_release_knows_the_tags():
     assert checkout["with"]["fetch-depth"] == 0
 
 
-def test_what_an_extra_installs_is_used():
+def test_every_extras_package_is_imported_and_documented():
     sources = [path.read_text() for path in (ROOT / "src" / "pipistrelle").rglob("*.py")]
     for extra, needed in PROJECT["optional-dependencies"].items():
         for requirement in needed:

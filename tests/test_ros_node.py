@@ -94,7 +94,7 @@ def off(found, expected):
 @pytest.mark.filterwarnings("ignore::UserWarning")  # what looks odd in a log that was made odd
 @pytest.mark.parametrize("estimator", ["iekf", "ekf", "smoother"])
 @pytest.mark.parametrize("name", ["mission", "unicycle", "poses"])
-def test_what_the_node_tells_is_what_slam_finds_of_the_log(started, logs, name, estimator):
+def test_the_nodes_messages_equal_slam_on_the_log(started, logs, name, estimator):
     folder, poses = logs[name]
     node = driven(started(folder / "log.toml", estimator=estimator), folder, poses)
     done = pipistrelle.slam(folder, filters=estimator)
@@ -179,7 +179,7 @@ KINDS = {"/odom": ODOMETRY, "/seen": LABELLED, "/tf_static": TRANSFORMS}
 
 
 @pytest.mark.parametrize("what", ODD)
-def test_what_is_late_or_odd_is_said_and_changes_nothing(started, logs, what):
+def test_late_or_odd_messages_are_reported_and_ignored(started, logs, what):
     topic, fields, words = ODD[what]
     node, other = (started(logs["mission"][0] / "log.toml") for _ in range(2))
     for one in (node, other):
@@ -211,7 +211,7 @@ def test_echoes_wait_for_the_odometry_and_not_without_end(started, logs):
     assert len(node.warned) == 2
 
 
-def test_a_vehicle_that_odometry_does_not_tell_is_refused_at_the_start(started, tmp_path):
+def test_a_log_without_usable_odometry_is_refused_at_the_start(started, tmp_path):
     with pytest.raises(pipistrelle.InputError, match=r"nowhere\.toml: found no such file"):
         started(tmp_path / "nowhere.toml")
     with pytest.raises(pipistrelle.InputError, match="'bicycle', expected 'poses' or 'unicycle'"):

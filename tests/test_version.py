@@ -58,7 +58,7 @@ def test_the_tag_of_a_release_is_its_version(clone):
     assert version_of_clone(clone) == built(clone) == "0.1.0"
 
 
-def test_a_commit_says_how_far_it_is_from_the_last_release_and_which_it_is(clone):
+def test_a_commits_version_has_distance_and_hash(clone):
     one = git(clone, "rev-parse", "--short=9", "HEAD")
     assert version_of_clone(clone) == built(clone) == f"0.1.dev1+g{one}"
     git(clone, "tag", "v0.1.0")
@@ -117,7 +117,7 @@ def test_without_git_a_clone_has_the_version_that_was_installed(clone, monkeypat
     assert built(clone) == UNKNOWN
 
 
-def test_whoever_says_the_version_says_the_same(tmp_path):
+def test_all_places_state_the_same_version(tmp_path):
     from pipistrelle.config import Config
     from pipistrelle.experiments.drives import NO_TRUTH
     from pipistrelle.experiments.results.writing import write_results

@@ -94,7 +94,7 @@ def test_active_echoes_come_first_then_passive_ones_then_the_beacons_call(seed):
 
 @given(seed=SEEDS)
 @law
-def test_delays_and_bearings_are_those_of_the_straight_paths(seed):
+def test_delays_and_bearings_match_the_straight_paths(seed):
     pose, velocity, landmarks, beacon = world(seed)
     heard = sounds_of_emission(pose, velocity, landmarks, beacon, CONFIG)
     points = np.vstack([landmarks, beacon])
@@ -112,7 +112,7 @@ def test_delays_and_bearings_are_those_of_the_straight_paths(seed):
 
 @given(seed=SEEDS)
 @law
-def test_the_baffle_hides_what_is_behind_from_the_vehicles_call_alone(seed):
+def test_the_baffle_hides_points_behind_the_vehicle_from_its_call_only(seed):
     pose, velocity, landmarks, beacon = world(seed)
     heard = sounds_of_emission(pose, velocity, landmarks, beacon, CONFIG)
     _, bearing = range_and_bearing(pose, np.vstack([landmarks, beacon]))
@@ -120,7 +120,7 @@ def test_the_baffle_hides_what_is_behind_from_the_vehicles_call_alone(seed):
     assert heard.landmark[heard.caller == VEHICLE].tolist() == ahead.tolist()
 
 
-def test_levels_of_one_world_are_those_worked_out_by_hand():
+def test_levels_of_one_world_match_a_calculation_by_hand():
     # Vehicle (0, 0) facing +x; landmark (5, 0); beacon (5, 12): legs 12, 5 and 13 m, a right
     # angle at the landmark. Source levels 53 and 50 dB; absorption 1.133 and 0.937 dB/m; turned by
     # a right angle a 2.5 cm cylinder throws -1.386 dB re backscatter at 30 kHz.
@@ -137,7 +137,7 @@ def test_levels_of_one_world_are_those_worked_out_by_hand():
         np.testing.assert_allclose(heard.level_db, expected, atol=0.015)
 
 
-def test_a_landmark_between_beacon_and_vehicle_throws_forward():
+def test_a_landmark_between_beacon_and_vehicle_scatters_forward():
     # Straight on, a cylinder throws 10 log(4kr / pi) re backscatter.
     landmarks, beacon = np.array([[5.0, 0.0]]), np.array([15.0, 0.0])
     heard = sounds_of_emission(ORIGIN, STILL, landmarks, beacon, as_by_hand("paper"))
@@ -189,7 +189,7 @@ def test_landmarks_in_another_order_sound_the_same_under_other_labels(seed):
         np.testing.assert_allclose(getattr(one, name), getattr(two, name)[by_label], rtol=1e-12)
 
 
-def test_the_motion_shifts_each_tone_by_its_own_law():
+def test_motion_shifts_echo_and_direct_call_by_different_doppler_laws():
     landmarks, beacon = np.array([[4.0, 0.0], [0.0, 4.0]]), np.array([0.0, -9.0])
     heard = sounds_of_emission(ORIGIN, np.array([0.75, 0.0]), landmarks, beacon, CONFIG)
     ahead, abeam = 343.75 / 342.25, 1.0
@@ -198,7 +198,7 @@ def test_the_motion_shifts_each_tone_by_its_own_law():
     np.testing.assert_allclose(heard.frequency, np.concatenate([own, other]), rtol=1e-14)
 
 
-def test_motion_changes_the_frequencies_alone():
+def test_motion_changes_only_the_frequencies():
     pose, velocity, landmarks, beacon = world(5)
     moving = sounds_of_emission(pose, velocity, landmarks, beacon, CONFIG)
     still = sounds_of_emission(pose, STILL, landmarks, beacon, CONFIG)
@@ -210,9 +210,7 @@ def test_motion_changes_the_frequencies_alone():
 
 @given(seed=SEEDS, spreading=LAWS, pace=st.floats(0.5, 2.0))
 @law
-def test_where_sound_is_faster_all_comes_sooner_and_alike_if_motion_and_targets_keep_pace(
-    seed, spreading, pace
-):
+def test_arrivals_scale_with_the_speed_of_sound_if_motion_and_targets_do(seed, spreading, pace):
     pose, velocity, landmarks, beacon = world(seed)
     config = as_by_hand(spreading)
     quick = config.model_copy(
@@ -260,7 +258,7 @@ def test_a_heading_or_a_velocity_that_is_not_finite_is_refused():
 @given(seed=SEEDS)
 @law
 @pytest.mark.shapes
-def test_a_piston_changes_the_levels_of_active_echoes_alone(seed):
+def test_a_piston_changes_only_the_levels_of_active_echoes(seed):
     heard = sounds_of_emission(*world(seed), CONFIG)
     before = {name: column.copy() for name, column in rows(heard, slice(None)).items()}
     beamed = through_piston(heard, **PISTON)
@@ -274,7 +272,7 @@ def test_a_piston_changes_the_levels_of_active_echoes_alone(seed):
             np.testing.assert_array_equal(getattr(beamed, name), column)
 
 
-def test_taken_for_a_power_the_pistons_pressure_costs_half_the_decibels_and_none_of_anothers():
+def test_off_axis_loss_as_power_is_half_the_loss_as_pressure():
     heard = sounds_of_emission(*world(5), CONFIG)
     whole, half = (
         through_piston(heard, **PISTON, off_axis=way).level_db - heard.level_db
@@ -284,7 +282,7 @@ def test_taken_for_a_power_the_pistons_pressure_costs_half_the_decibels_and_none
     assert whole.min() < -3.0
 
 
-def test_a_piston_far_smaller_than_the_wave_sends_alike_in_all_directions():
+def test_a_piston_far_smaller_than_the_wave_is_omnidirectional():
     heard = sounds_of_emission(*world(5), CONFIG)
     beamed = through_piston(heard, **{**PISTON, "radius": 1e-6})
     np.testing.assert_allclose(beamed.level_db, heard.level_db, atol=1e-6)
@@ -305,7 +303,7 @@ def test_a_null_of_the_piston_is_deep_but_finite():
 
 @given(seed=SEEDS, spreading=LAWS, count=st.integers(1, 6))
 @law
-def test_many_emissions_bring_bit_for_bit_what_each_brings_alone(seed, spreading, count):
+def test_emissions_are_bit_identical_in_a_batch_and_single(seed, spreading, count):
     config = Config(air=AirConfig(spreading=spreading))
     _, _, landmarks, beacon = world(seed)
     rng = np.random.default_rng(seed)
@@ -320,7 +318,7 @@ def test_many_emissions_bring_bit_for_bit_what_each_brings_alone(seed, spreading
             assert getattr(among, name).tobytes() == getattr(alone, name).tobytes()
 
 
-def test_of_many_emissions_the_impossible_one_is_named():
+def test_an_impossible_emission_of_a_batch_is_named():
     poses = np.array([[0.0, 0.0, 0.0], [1.0, 1.0, 0.5]])
     with pytest.raises(InputError, match=r"pose \[1\. +1\. +0\.5\]: found vehicle to landmark 1"):
         sounds_of_emissions(poses, 0 * poses[:, :2], poses[1:, :2], np.array([5.0, 0.0]), CONFIG)
@@ -337,7 +335,7 @@ def through(bodies, config, pose=ORIGIN):
 
 
 @pytest.mark.parametrize("shape", ["cylinder", "sphere"])
-def test_bodies_whose_size_is_not_stated_are_the_usual_points_to_the_bit(shape):
+def test_bodies_without_a_stated_size_are_default_points_to_the_bit(shape):
     config = Config(target=TargetConfig(shape=shape, radius=0.04))
     usual = Bodies(radius=np.full(3, np.nan), shape=np.full(3, shape))
     for name in ("delay", "bearing", "frequency", "landmark"):
@@ -347,7 +345,7 @@ def test_bodies_whose_size_is_not_stated_are_the_usual_points_to_the_bit(shape):
     np.testing.assert_allclose(found, expected, rtol=0, atol=1e-12)
 
 
-def test_an_own_echo_of_a_body_has_its_bearing_and_the_way_to_its_surface():
+def test_an_own_echo_of_a_body_is_delayed_to_its_surface():
     trunks = Bodies(radius=np.array([0.3, 0.15, np.nan]), shape=np.full(3, "cylinder"))
     centre, surface = through(None, CONFIG), through(trunks, CONFIG)
     own = surface.caller == VEHICLE
@@ -357,7 +355,7 @@ def test_an_own_echo_of_a_body_has_its_bearing_and_the_way_to_its_surface():
     assert surface.landmark[own].tolist() == [1, 2, 3, 4]
 
 
-def test_a_larger_body_is_louder_by_its_shapes_law_and_its_nearer_surface_and_only_that_one():
+def test_only_the_larger_body_is_louder_by_shape_and_nearer_surface():
     usual, reach = through(None, CONFIG), math.hypot(5.0, 0.5)
     nearer = 40.0 * math.log10(reach / (reach - 0.25)) + 0.5 * 1.1329
     for shape, gain in (("cylinder", 10.0), ("sphere", 20.0)):
@@ -373,7 +371,7 @@ def test_a_larger_body_is_louder_by_its_shapes_law_and_its_nearer_surface_and_on
         assert passive[0] > 0.5 * gain
 
 
-def test_spheres_among_cylinders_throw_as_spheres_do():
+def test_spheres_among_cylinders_scatter_as_spheres():
     cylinders = Config()
     spheres = Config(target=TargetConfig(shape="sphere"))
     mixed = Bodies(radius=np.full(3, np.nan), shape=np.array(["sphere", "cylinder", "sphere"]))
@@ -445,7 +443,7 @@ def test_echoes_of_bodies_come_by_the_least_way_over_their_surface(seed):
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_among_bodies_many_emissions_bring_bit_for_bit_what_each_brings_alone(seed):
+def test_emissions_among_bodies_are_bit_identical_in_a_batch_and_single(seed):
     poses, velocities, places, callers, config, bodies = orchard(seed, 6)
     heard, count = arrivals_of_emissions(poses, velocities, places, callers, config, bodies)
     rows, (vehicle, boat) = np.repeat(np.arange(6), count), callers
@@ -458,7 +456,7 @@ def test_among_bodies_many_emissions_bring_bit_for_bit_what_each_brings_alone(se
             assert getattr(among, name).tobytes() == getattr(alone, name).tobytes()
 
 
-def test_nothing_jumps_where_a_body_comes_between_beacon_and_vehicle():
+def test_arrivals_are_continuous_where_a_body_hides_the_beacon():
     sideways, still = np.linspace(-0.6, 0.6, 2401), np.zeros((2401, 2))
     poses = np.column_stack((0.0 * sideways, sideways, 0.0 * sideways))
     config = as_by_hand("bistatic").model_copy(update={"target": TargetConfig(radius=0.3)})
@@ -486,7 +484,7 @@ def test_nothing_jumps_where_a_body_comes_between_beacon_and_vehicle():
         ([5.0, 0.25], [5.0, 0.0], r"beacon to landmark 2: 0\.25 m, within its radius of 0\.3 m"),
     ],
 )
-def test_nobody_may_be_within_a_body_or_touch_it(landmark, beacon, found):
+def test_a_vehicle_or_beacon_within_a_body_is_refused(landmark, beacon, found):
     landmarks, callers = np.array([[3.0, 3.0], landmark]), callers_of(CONFIG, np.array(beacon))
     sized = Bodies(radius=np.array([np.nan, 0.3]), shape=np.full(2, "cylinder"))
     world = ORIGIN[None], STILL[None], landmarks, callers, CONFIG

@@ -32,7 +32,7 @@ def test_frequency_or_period_is_linear_in_time(law, band):
 
 
 @pytest.mark.parametrize("law", LAWS)
-def test_a_call_that_is_scaled_in_time_is_as_much_shorter_and_higher(law):
+def test_a_doppler_scaled_call_is_shorter_and_higher(law):
     call, scale = Sweep(60e3, 35e3, LENGTH, law, taper=0.3), 1.0044
     heard = call.waveform(TIME, scale * call.frequency)
     sent = call.waveform(TIME * scale, call.frequency)
@@ -40,7 +40,7 @@ def test_a_call_that_is_scaled_in_time_is_as_much_shorter_and_higher(law):
     assert not heard[TIME * scale > LENGTH].any()
 
 
-def test_a_hyperbolic_sweep_is_itself_at_another_time_whatever_the_motion():
+def test_a_hyperbolic_sweep_in_motion_is_a_delayed_copy():
     call, scale = Sweep(60e3, 35e3, LENGTH, "hyperbolic"), 1.0044
     bend = (1.0 / call.end - 1.0 / call.start) / LENGTH
     ahead = (1.0 - scale) / (scale * bend * call.start)
@@ -66,7 +66,7 @@ def answer(call, scale):
 
 @pytest.mark.parametrize("law", LAWS)
 @pytest.mark.parametrize("band", [(60e3, 35e3), (35e3, 60e3)])
-def test_the_coupling_is_what_a_doppler_shift_delays_the_peak_by(law, band):
+def test_the_range_doppler_coupling_is_the_delay_of_the_shifted_peak(law, band):
     call, scale = Sweep(*band, LENGTH, law), 1.0044
     lags, found = answer(call, scale)
     expected = coupling(call) * (scale - 1.0)
@@ -88,7 +88,7 @@ def test_a_hyperbolic_sweep_stays_as_loud_in_motion_and_a_tone_does_not():
     assert loud[2] < 0.4
 
 
-def test_a_taper_of_one_is_hanns_window_and_of_none_a_rectangle():
+def test_full_taper_is_a_hann_window_and_zero_taper_a_rectangle():
     share = np.linspace(0.0, 1.0, 101)
     hann = np.abs(Sweep(60e3, 35e3, LENGTH, taper=1.0).waveform(share * LENGTH, 47.5e3))
     np.testing.assert_allclose(hann, np.sin(np.pi * share) ** 2, atol=1e-9)
@@ -97,7 +97,7 @@ def test_a_taper_of_one_is_hanns_window_and_of_none_a_rectangle():
 
 
 @pytest.mark.parametrize("call", [None, *(Sweep(60e3, 35e3, LENGTH, law, 0.2) for law in LAWS)])
-def test_settings_give_a_call_again(call):
+def test_settings_of_a_call_rebuild_it(call):
     given = CallConfig.model_validate(settings_of(call))
     assert sound_of(given, LENGTH, "emitter") == call
 
@@ -109,7 +109,7 @@ def written(folder, samples, rate=250_000):
 
 
 @pytest.mark.parametrize("scale", [1.0, 1.0044])
-def test_a_call_of_a_file_is_the_one_that_was_written_at_any_rate_and_motion(tmp_path, scale):
+def test_a_call_read_from_a_file_matches_the_written_call_under_motion(tmp_path, scale):
     wave = Sweep(60e3, 35e3, LENGTH, "hyperbolic", taper=0.5)
     time = np.arange(700) / 250e3
     path = written(tmp_path, 0.3 * wave.waveform(time, wave.frequency).real)
@@ -142,7 +142,7 @@ def test_a_file_that_holds_no_call_is_refused(tmp_path, samples, message):
     assert str(refused.value).startswith("emitter.")
 
 
-def test_what_is_no_sound_file_is_refused_by_the_settings_name(tmp_path):
+def test_a_file_without_sound_is_refused_with_the_settings_name(tmp_path):
     (tmp_path / "empty.wav").touch()
     (tmp_path / "text.wav").write_text("call")
     (tmp_path / "link.wav").symlink_to("nowhere")

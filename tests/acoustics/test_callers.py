@@ -43,7 +43,7 @@ def bits(arrivals):
 
 @given(seed=SEEDS)
 @law
-def test_each_caller_is_heard_directly_and_by_way_of_all_landmarks_and_all_other_callers(seed):
+def test_each_caller_arrives_directly_and_via_all_landmarks_and_callers(seed):
     poses, velocities, landmarks, callers = crowd(seed)
     heard = arrivals_of_emission(poses[0], velocities[0], landmarks, callers, CONFIG)
     points = np.vstack((landmarks, [caller.place for caller in callers[1:]]))
@@ -77,7 +77,7 @@ def test_the_order_of_the_other_callers_changes_labels_and_nothing_else(seed, mo
 
 @given(seed=SEEDS)
 @law
-def test_a_caller_that_stands_sounds_to_the_bit_as_one_on_a_constant_path(seed):
+def test_a_caller_at_rest_equals_a_constant_path_to_the_bit(seed):
     poses, velocities, landmarks, callers = crowd(seed)
     time, steps = 0.5 * np.arange(5), np.arange(1, 5)
     tied = [replace(c, place=np.tile(c.place, (5, 1))) for c in callers[1:]]
@@ -90,7 +90,7 @@ def test_a_caller_that_stands_sounds_to_the_bit_as_one_on_a_constant_path(seed):
 
 @given(seed=SEEDS)
 @law
-def test_many_emissions_of_moving_callers_bring_bit_for_bit_what_each_brings_alone(seed):
+def test_emissions_of_moving_callers_are_bit_identical_in_a_batch_and_single(seed):
     poses, velocities, landmarks, callers = crowd(seed, moving=2)
     heard, count = arrivals_of_emissions(poses, velocities, landmarks, callers, CONFIG)
     end = np.cumsum(count)
@@ -140,7 +140,7 @@ def test_the_shift_of_a_tone_is_the_derivative_of_the_time_of_arrival(seed):
         assert frequency == pytest.approx(callers[caller].frequency * shift, rel=1e-8)
 
 
-def test_a_moving_callers_shifts_are_those_worked_out_by_hand():
+def test_doppler_shifts_of_a_moving_caller_match_a_calculation_by_hand():
     # The vehicle at the origin drives east at 1 m/s, the boat on the x axis comes at 2 m/s, a
     # landmark stands behind the boat: all along one line.
     vehicle, _ = callers_of(CONFIG, np.zeros(2))
@@ -172,7 +172,7 @@ def test_a_path_gives_places_and_the_velocities_of_the_steps_that_end_there():
     assert given_.velocity.tolist() == [[5.0, 7.0]]
 
 
-def test_callers_that_make_no_list_or_no_path_are_refused():
+def test_invalid_lists_and_paths_of_callers_are_refused():
     vehicle, beacon = callers_of(CONFIG, np.ones(2))
     time, steps = np.arange(4.0), np.array([1])
     for callers in ((), (beacon,), (beacon, vehicle), (vehicle, vehicle)):
@@ -205,7 +205,7 @@ def test_callers_that_make_no_list_or_no_path_are_refused():
         ("velocity", np.full((4, 2), np.nan), "velocity: found nan, expected finite x and y [m/s]"),
     ],
 )
-def test_a_caller_that_is_no_numbers_is_refused_wherever_it_is_asked_for(part, value, said):
+def test_a_non_numeric_caller_is_refused_by_every_function(part, value, said):
     vehicle, beacon = callers_of(CONFIG, np.ones(2))
     odd = replace(beacon, name="boat", place=np.zeros((4, 2)), velocity=np.zeros((4, 2)))
     odd = replace(odd, **{part: value})
@@ -251,7 +251,7 @@ def test_callers_at_one_point_are_refused_by_their_names():
         arrivals_of_emission(np.zeros(3), np.zeros(2), landmarks, callers, CONFIG)
 
 
-def test_a_vehicle_alone_hears_its_own_echoes_where_there_are_any():
+def test_a_vehicle_without_other_callers_receives_only_echoes_ahead():
     vehicle, _ = callers_of(CONFIG, np.zeros(2))
     poses = np.array([[0.0, 0.0, 0.0], [0.0, 0.0, np.pi]])
     landmarks = np.array([[5.0, 0.0]])
@@ -261,7 +261,7 @@ def test_a_vehicle_alone_hears_its_own_echoes_where_there_are_any():
 
 @given(seed=SEEDS, moving=st.integers(0, 3))
 @law
-def test_what_the_callers_call_at_counts_and_not_the_tones_and_levels_of_the_settings(seed, moving):
+def test_callers_frequencies_and_levels_override_the_settings(seed, moving):
     poses, velocities, landmarks, callers = crowd(seed, moving=moving)
     other = Config(
         emitter=EmitterConfig(frequency=50e3, level_db=90.0),
@@ -276,7 +276,7 @@ def test_what_the_callers_call_at_counts_and_not_the_tones_and_levels_of_the_set
 
 @given(seed=SEEDS)
 @law
-def test_a_call_is_spread_and_absorbed_as_a_call_of_its_own_tone_and_level(seed):
+def test_each_callers_level_falls_by_spreading_and_absorption_at_its_tone(seed):
     poses, velocities, landmarks, callers = crowd(seed)
     heard = arrivals_of_emission(poses[0], velocities[0], landmarks, callers, CONFIG)
     air = {"temperature_c": 20.0, "relative_humidity": 0.5, "pressure_kpa": 101.325}

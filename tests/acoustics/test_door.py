@@ -6,7 +6,7 @@ import pytest
 from pipistrelle import acoustics
 
 
-def test_the_door_is_narrow_and_opens_on_what_it_names():
+def test_the_package_exports_at_most_eight_callables():
     from pipistrelle.acoustics.arrivals import Arrivals
     from pipistrelle.acoustics.emitter import beamwidth
 
@@ -17,11 +17,11 @@ def test_the_door_is_narrow_and_opens_on_what_it_names():
     assert (acoustics.Arrivals, acoustics.beamwidth) == (Arrivals, beamwidth)
 
 
-def test_the_door_refuses_what_is_not_behind_it():
+def test_the_package_refuses_unknown_attributes():
     with pytest.raises(AttributeError, match="attribute whisper"):
         acoustics.whisper  # noqa: B018
 
 
-def test_the_door_is_lazy():
+def test_importing_the_package_does_not_import_numpy():
     code = "import sys, pipistrelle.acoustics; sys.exit('numpy' in sys.modules)"
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0

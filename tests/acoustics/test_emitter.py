@@ -62,7 +62,7 @@ def test_directivity_is_1_on_the_axis(radius):
 
 @given(bearing=st.floats(-math.pi / 2, math.pi / 2), radius=RADII)
 @law
-def test_nothing_is_sent_backwards_and_the_baffle_takes_nothing_forwards(bearing, radius):
+def test_the_baffle_blocks_only_the_backward_half(bearing, radius):
     forward = piston_directivity(bearing, radius=radius, **CALL)
     x = 2 * math.pi * 35e3 / 343.0 * radius * math.sin(bearing)
     assert forward == pytest.approx(abs(float(jinc(x))), abs=1e-12)
@@ -70,7 +70,7 @@ def test_nothing_is_sent_backwards_and_the_baffle_takes_nothing_forwards(bearing
         assert piston_directivity(math.pi - bearing, radius=radius, **CALL) == 0.0
 
 
-def test_the_baffle_is_at_90_degrees_however_often_the_bearing_is_wound():
+def test_the_baffle_is_at_90_degrees_for_unwrapped_bearings():
     edge = math.pi / 2
     just_behind = math.nextafter(edge, 4.0)
     assert in_front(np.array([edge, -edge])).all()
@@ -97,13 +97,13 @@ def test_a_small_piston_never_falls_to_half_power():
 
 @given(radius=st.floats(0.00253, 0.2))
 @law
-def test_radius_undoes_beamwidth(radius):
+def test_the_radius_of_a_beamwidth_is_recovered(radius):
     assert piston_radius(beamwidth(radius, **CALL), **CALL) == pytest.approx(radius, rel=1e-13)
 
 
 @given(width=st.floats(0.01, math.pi))
 @law
-def test_beamwidth_undoes_radius(width):
+def test_the_beamwidth_of_a_radius_is_recovered(width):
     # The arc sine loses half of the digits at pi.
     tolerance = 1e-14 + 4e-16 / max(math.cos(width / 2), 1e-8)
     assert beamwidth(piston_radius(width, **CALL), **CALL) == pytest.approx(width, abs=tolerance)

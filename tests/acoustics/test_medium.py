@@ -15,7 +15,7 @@ def speed(temperature, salinity, depth=0.0):
     ("temperature", "salinity", "printed"),
     [(0, 25, 1435.790), (0, 35, 1449.139), (30, 30, 1540.416)],
 )
-def test_sound_is_as_fast_as_unesco_says_at_the_surface(temperature, salinity, printed):
+def test_speed_at_the_surface_matches_the_unesco_table(temperature, salinity, printed):
     # Wong and Zhu, J. Acoust. Soc. Am. 97 (1995), 1732, Table III: Chen and Millero's equation for
     # the temperatures of 1990. Coppens fits Del Grosso's, a tenth of a metre slower.
     assert speed(temperature, salinity) == pytest.approx(printed, abs=0.15)
@@ -38,7 +38,7 @@ def test_sound_in_fresh_water_is_as_fast_as_in_pure_water(temperature):
         (2000.0, (1475.70, 1516.96, 1549.09, 1573.47)),
     ],
 )
-def test_the_speed_is_that_of_another_program_for_coppens_equation(depth, printed):
+def test_speed_matches_another_program_for_coppens_equation(depth, printed):
     # SonarDocs (gorbatschow.github.io/SonarDocs), its table for a salinity of 30.
     for temperature, other in zip((0.0, 10.0, 20.0, 30.0), printed, strict=True):
         assert speed(temperature, 30.0, depth) == pytest.approx(other, abs=0.006)
@@ -62,7 +62,7 @@ def test_the_medium_is_the_section_that_the_scenario_names():
     assert WaterConfig(speed_of_sound=1234.0).sound_speed == 1234.0
 
 
-def test_a_medium_loses_what_its_formula_says():
+def test_a_medium_takes_absorption_and_spreading_from_its_settings():
     pool = WaterConfig(temperature_c=28.0, salinity=0.5, depth=2.0, ph=7.2)
     of_pool = {"temperature_c": 28.0, "salinity": 0.5, "depth": 2.0, "ph": 7.2}
     medium = medium_of(pool)

@@ -30,7 +30,7 @@ def test_ten_times_as_far_loses_20_db_one_way_and_40_db_both(path):
 
 @given(distance=DISTANCES)
 @law
-def test_an_active_echo_is_a_bistatic_one_whose_source_is_the_vehicle(distance):
+def test_an_active_echo_is_bistatic_with_the_vehicle_as_source(distance):
     active = spreading_loss_db(2 * distance, ways=2)
     bistatic = passive_spreading_loss_db(distance, distance, law="bistatic")
     mirror = passive_spreading_loss_db(distance, distance, law="paper")
@@ -40,14 +40,14 @@ def test_an_active_echo_is_a_bistatic_one_whose_source_is_the_vehicle(distance):
 
 @given(outward=DISTANCES, homeward=DISTANCES, name=st.sampled_from(["paper", "bistatic"]))
 @law
-def test_sound_may_go_either_way_round(outward, homeward, name):
+def test_passive_loss_is_symmetric_in_the_two_legs(outward, homeward, name):
     there = passive_spreading_loss_db(outward, homeward, law=name)
     assert there == passive_spreading_loss_db(homeward, outward, law=name)
 
 
 @given(outward=DISTANCES, homeward=DISTANCES)
 @law
-def test_a_scatterer_loses_the_parallel_sum_of_the_legs_more_than_a_mirror(outward, homeward):
+def test_bistatic_loss_exceeds_the_mirrors_by_the_parallel_sum_of_legs(outward, homeward):
     mirror = passive_spreading_loss_db(outward, homeward, law="paper")
     bistatic = passive_spreading_loss_db(outward, homeward, law="bistatic")
     apart = outward * homeward / (outward + homeward)
@@ -88,7 +88,7 @@ def test_absorption_agrees_with_pyfar_to_four_digits(temperature, humidity, pres
         (15.0, 0.8, [0.1, 0.3, 1.1, 2.4, 4.1, 8.3, 23.7, 82.8]),
     ],
 )
-def test_absorption_is_that_of_the_octave_table_of_iso_9613_2(temperature, humidity, printed):
+def test_absorption_in_air_matches_the_octave_table_of_iso_9613_2(temperature, humidity, printed):
     octaves = 1e3 * 10 ** (0.3 * np.arange(-4, 4))
     db_per_km = 1e3 * absorption_db_per_m(
         octaves, temperature_c=temperature, relative_humidity=humidity, pressure_kpa=101.325
@@ -132,7 +132,7 @@ def test_absorption_scales_with_pressure_at_the_same_molar_humidity(frequency, h
     assert dense == pytest.approx(scale * thin, rel=1e-12)
 
 
-def test_humidity_decides_what_a_target_at_20_m_loses():
+def test_dry_air_changes_the_loss_at_20_m_by_29_db():
     loss = [
         40 * float(absorption_db_per_m(35e3, **{**STANDARD, "relative_humidity": rh}))
         for rh in (0.1, 0.5)
@@ -169,7 +169,7 @@ SEA = {"salinity": 35.0, "depth": 0.0, "ph": 8.0}
         (1e6, 30.0, 35.0, "344"),
     ],
 )
-def test_absorption_of_the_sea_is_that_of_table_iv_of_francois_and_garrison(
+def test_absorption_in_seawater_matches_table_iv_of_francois_and_garrison(
     frequency, temperature, salinity, printed
 ):
     # J. Acoust. Soc. Am. 72 (1982), part II, Table IV: dB/km at the surface, pH 8; as transcribed
@@ -257,7 +257,7 @@ def test_doppler_of_approach_and_of_retreat_undo_each_other(speed):
 
 @given(speed=SPEEDS, distance=st.floats(1.0, 50.0))
 @law
-def test_doppler_is_the_rate_at_which_crests_arrive(speed, distance):
+def test_doppler_frequency_is_the_arrival_rate_of_crests(speed, distance):
     c, period = 343.0, 1e-3
 
     def echo(start):  # a crest sent towards a fixed target that the vehicle approaches
@@ -273,7 +273,7 @@ def test_doppler_is_the_rate_at_which_crests_arrive(speed, distance):
     assert period / (call(period) - call(0.0)) == pytest.approx(float(passive), rel=1e-10)
 
 
-def test_at_rest_the_tone_is_exactly_the_one_sent():
+def test_the_tone_is_unchanged_at_rest():
     assert doppler_frequency(35e3, receiver_speed=0.0, speed_of_sound=343.0) == 35e3
 
 

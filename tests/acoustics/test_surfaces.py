@@ -27,7 +27,7 @@ def reflected(source, receiver, centre, radius):
 
 @given(seed=SEEDS)
 @law
-def test_on_the_lit_side_the_angles_with_the_normal_are_the_same_and_sharp(seed):
+def test_angles_of_incidence_and_reflection_are_equal_on_the_lit_side(seed):
     source, receiver, centre, radius = around_a_body(seed)
     point = reflected(source, receiver, centre, radius)
     normal = (point - centre) / radius
@@ -48,7 +48,7 @@ def test_on_the_lit_side_the_angles_with_the_normal_are_the_same_and_sharp(seed)
 
 @given(seed=SEEDS)
 @law
-def test_there_and_back_are_the_same_way(seed):
+def test_reflection_points_are_symmetric_in_source_and_receiver(seed):
     source, receiver, centre, radius = around_a_body(seed)
     there = reflected(source, receiver, centre, radius)
     back = reflected(receiver, source, centre, radius)
@@ -57,7 +57,7 @@ def test_there_and_back_are_the_same_way(seed):
 
 @given(seed=SEEDS)
 @law
-def test_from_where_it_is_heard_a_call_comes_straight_back(seed):
+def test_an_own_echo_reflects_at_the_nearest_surface_point(seed):
     _, receiver, centre, radius = around_a_body(seed)
     offset = centre - receiver
     point = reflected(receiver, receiver, centre, radius) - receiver
@@ -65,14 +65,14 @@ def test_from_where_it_is_heard_a_call_comes_straight_back(seed):
     np.testing.assert_allclose(point, offset * (reach - radius) / reach, rtol=0, atol=1e-14 * 20)
 
 
-def test_a_point_is_its_own_to_the_bit():
+def test_a_body_of_zero_radius_reflects_at_its_centre_to_the_bit():
     centre = np.random.default_rng(7).uniform(-9.0, 9.0, (1, 5, 2))
     source, receiver = centre[:, 3:4], np.ones((4, 1, 2))
     found = reflecting_points(source, receiver, centre, np.zeros(5))
     assert found.tobytes() == np.broadcast_to(centre, (4, 5, 2)).tobytes()
 
 
-def test_a_point_hangs_on_no_other_body_or_emission_by_a_bit():
+def test_reflection_points_are_bit_identical_single_and_in_a_batch():
     rng = np.random.default_rng(7)
     centre, radius = rng.uniform(-9.0, 9.0, (1, 200, 2)), rng.uniform(0.05, 0.6, 200)
     source, receiver = np.full((1, 1, 2), 12.0), rng.uniform(-13.0, -10.0, (5, 1, 2))

@@ -74,12 +74,12 @@ def test_strength_is_within_the_bounds_of_the_exact_series(shape, frequency):
 
 
 @pytest.mark.parametrize(("shape", "other"), [SHAPES, SHAPES[::-1]])
-def test_one_shape_is_not_the_other(shape, other):
+def test_the_formula_of_a_shape_does_not_fit_the_other(shape, other):
     assert all(rms_error_db(shape, r, 35e3, truth=other) > 0.45 for r in (0.02, 0.05, 0.10))
 
 
 @pytest.mark.parametrize(("shape", "total"), [("cylinder", 8.0), ("sphere", 4.0)])
-def test_a_short_wave_loses_twice_what_the_body_covers(shape, total):
+def test_a_short_wave_loses_twice_the_power_on_the_cross_section(shape, total):
     # Lit side and shadow each scatter the power that falls on the body: 2r or pi r^2.
     angle = np.linspace(0.0, np.pi, 400_001)
     ratio = 10 ** (
@@ -90,7 +90,7 @@ def test_a_short_wave_loses_twice_what_the_body_covers(shape, total):
     assert np.trapezoid(ratio * solid, angle) == pytest.approx(total, rel=2e-3)
 
 
-def test_off_the_shadow_a_large_cylinder_is_a_mirror_and_a_large_sphere_throws_alike():
+def test_large_cylinders_mirror_and_large_spheres_scatter_evenly_off_the_shadow():
     at = {"radius": 1.0, "frequency": 35e3, "speed_of_sound": C}
     angle = np.radians([60.0, 90.0, 120.0])
     cylinder = target_strength_db(angle, shape="cylinder", **at)
@@ -124,7 +124,7 @@ def test_strength_is_even_periodic_and_finite(angle, radius, shape):
 
 @given(angle=st.floats(0.05, math.pi), radius=st.floats(1e-3, 0.2), shape=st.sampled_from(SHAPES))
 @law
-def test_strength_is_the_formula_as_it_is_documented(angle, radius, shape):
+def test_target_strength_matches_the_documented_formula(angle, radius, shape):
     from scipy.special import j1
 
     k = wave_number(30e3)

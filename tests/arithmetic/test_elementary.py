@@ -71,7 +71,7 @@ def test_exponential_is_good_to_the_last_place_or_two(low, high):
     assert worst(made(_exponentials, x), np.exp(x.astype(np.longdouble))) < 2
 
 
-def test_exponential_of_zero_is_one_and_of_what_is_far_below_is_zero():
+def test_the_exponential_is_1_at_zero_and_0_far_below():
     x = np.array([0.0, -0.0, -709.0, -1e300, -np.inf])
     assert made(_exponentials, x).tolist() == [1, 1, 0, 0, 0]
 
@@ -83,7 +83,7 @@ def test_logarithm_is_good_to_the_last_three_places(decades):
     assert worst(made(_logarithms, x), np.log(x.astype(np.longdouble))) < 3
 
 
-def test_logarithm_of_one_is_zero():
+def test_the_logarithm_of_1_is_0():
     assert made(_logarithms, np.ones(3)).tolist() == [0, 0, 0]
 
 
@@ -109,14 +109,14 @@ def test_cosine_and_sine_are_good_to_the_last_places_over_some_turns():
     assert made(_cosines_and_sines, np.zeros(1), results=2) == [1, 0]
 
 
-def test_angles_are_wrapped_as_one_by_one():
+def test_wrapped_arrays_equal_wrapped_scalars():
     edges = np.array([-np.pi, np.nextafter(np.pi, 0), np.pi, -3 * np.pi, 0.0])
     x = np.concatenate([spread(-20, 20), edges])
     np.testing.assert_array_equal(made(_wrapped, x), [wrap_angle(angle) for angle in x])
 
 
 @pytest.mark.parametrize("function", [_exponentials, _logarithms])
-def test_many_at_once_are_the_same_to_the_last_bit_as_one_by_one(function):
+def test_arrays_and_scalars_give_the_same_bits(function):
     x = spread(1e-3, 5.0)[:1003]
     alone = [made(function, x[i : i + 1])[0] for i in range(x.size)]
     np.testing.assert_array_equal(made(function, x), alone)

@@ -53,7 +53,7 @@ def tail_is_exponential(power, tails):
     return bool(np.all(seen >= low) and np.all(seen <= high))
 
 
-def test_noise_cannot_be_told_from_independent_complex_normals():
+def test_noise_is_indistinguishable_from_independent_complex_normals():
     assert flaws(drawn(2**18)) == []
 
 
@@ -76,7 +76,7 @@ def test_noise_cannot_be_told_from_independent_complex_normals():
         ("phase's law", lambda z: np.abs(z) * np.exp(1j * np.round(10.0 * np.angle(z)) / 10.0)),
     ],
 )
-def test_the_same_examination_finds_a_small_flaw(flaw, spoilt):
+def test_the_same_tests_find_a_small_flaw(flaw, spoilt):
     assert flaw in flaws(spoilt(drawn(2**18)))
 
 
@@ -103,7 +103,7 @@ def test_the_energy_of_ten_samples_is_gamma_distributed():
     assert kstest(energy, gamma(10.15).cdf).pvalue < CHANCE
 
 
-def test_one_sample_says_nothing_about_the_next():
+def test_successive_samples_are_independent():
     noise = drawn(2**19)
     octant = np.floor((np.angle(noise) / np.pi + 1.0) * 4.0).clip(0, 7).astype(int)
     octile = np.floor(8.0 * np.exp(-(np.abs(noise) ** 2))).clip(0, 7).astype(int)
@@ -114,7 +114,7 @@ def test_one_sample_says_nothing_about_the_next():
 
 
 @pytest.mark.parametrize("lag", [1, 2, 3, 10, 20, 80, 512, 1024])
-def test_samples_some_way_apart_are_uncorrelated(lag):
+def test_samples_at_a_lag_are_uncorrelated(lag):
     noise = drawn(2**19)
     correlation = np.mean(noise[lag:] * noise[:-lag].conj())
     assert abs(correlation) * math.sqrt(noise.size) < SIGMAS
@@ -179,7 +179,7 @@ def test_keys_of_a_whole_study_are_distinct():
     assert all(0 <= key < 2**64 for key in keys)
 
 
-def test_a_keys_arguments_do_not_stand_in_for_each_other():
+def test_a_key_depends_on_the_order_of_its_arguments():
     assert stream_key(1, 2, "noise", 3) != stream_key(2, 1, "noise", 3)
     assert stream_key(1, 2, "noise", 3) != stream_key(1, 3, "noise", 2)
     assert stream_key(1, 2, "noise", 0) != stream_key(1, 2, "noise", 2**32)

@@ -48,7 +48,7 @@ REFUSED = {
 
 
 @pytest.mark.parametrize("text", REFUSED, ids=range(len(REFUSED)))
-def test_what_is_no_array_is_refused_with_its_place(tmp_path, text):
+def test_an_invalid_array_file_is_refused_with_file_and_line(tmp_path, text):
     path = tmp_path / "array.csv"
     path.write_text(text)
     with pytest.raises(InputError) as refused:
@@ -68,7 +68,7 @@ def test_a_folder_a_pipe_a_link_to_nothing_and_a_huge_file_are_not_read(tmp_path
             read_array(path)
 
 
-def test_rows_are_ordered_by_channel_and_what_is_left_out_says_nothing(tmp_path):
+def test_rows_are_sorted_by_channel_and_empty_cells_take_defaults(tmp_path):
     path = tmp_path / "array.csv"
     path.write_text("# ours\nchannel,x,y,gain_db,face\n1,0.1,0.2,,\n\n0,0.3,0.4,-3,left\n")
     found = read_array(path)
@@ -135,7 +135,7 @@ def test_xml_in_another_encoding_than_it_declares_is_refused(tmp_path, encoding,
 
 
 @pytest.mark.parametrize("data", [b"\xff\xfe", b"\xff\xfec\0h\0", b"\0<\0?", b"<", b"<?xml", b""])
-def test_what_is_neither_xml_nor_a_table_is_refused(tmp_path, data):
+def test_a_file_that_is_neither_xml_nor_table_is_refused(tmp_path, data):
     (tmp_path / "array.xml").write_bytes(data)
     with pytest.raises(InputError, match=r"array\.xml"):
         read_array(tmp_path / "array.xml")
@@ -157,7 +157,7 @@ def test_acoulars_xml_is_the_same_array_as_its_rows(tmp_path):
     gain=st.floats(-100.0, 100.0),
     face=st.sampled_from(("", "left", "2")),
 )
-def test_what_is_written_is_read_again(tmp_path_factory, places, gain, face):
+def test_written_arrays_are_read_back_exactly(tmp_path_factory, places, gain, face):
     position = np.array(places) * 1e-3
     path = tmp_path_factory.mktemp("arrays") / "array.csv"
     written = Microphones(
@@ -173,7 +173,7 @@ def test_what_is_written_is_read_again(tmp_path_factory, places, gain, face):
     assert found.face == written.face
 
 
-def test_writing_replaces_nothing(tmp_path):
+def test_writing_does_not_replace_a_file(tmp_path):
     path = tmp_path / "array.csv"
     path.write_text(PAIR)
     with pytest.raises(InputError, match="new name"):

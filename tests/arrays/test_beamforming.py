@@ -29,7 +29,7 @@ def lobes(steered, frequency, position=POSITION):
 
 @given(angle=ANGLES, frequency=TONES)
 @law
-def test_a_plane_wave_reaches_each_element_as_much_earlier_as_the_geometry_says(angle, frequency):
+def test_a_steering_vector_has_the_geometric_lead_of_each_element(angle, frequency):
     toward = np.array([np.cos(angle), np.sin(angle)])  # of the source
     lead = np.column_stack((np.zeros(POSITION.size), POSITION)) @ toward / 343.0
     wave = steering_vector(angle, **ears(frequency))
@@ -77,7 +77,7 @@ def test_side_lobes_stay_13_db_down_and_no_grating_lobe_rises_for_any_steering_t
         assert 10.0 * np.log10(power.max()) < -12.9
 
 
-def test_elements_half_a_wavelength_of_the_beacon_apart_would_raise_a_grating_lobe_at_35_khz():
+def test_elements_spaced_for_30_khz_raise_a_grating_lobe_at_35_khz():
     wide = POSITION * (35.0 / 30.0)
     assert lobes(np.radians(40.0), 35e3, wide)[0].max() < 0.1
     power, angle = lobes(np.radians(60.0), 35e3, wide)
@@ -86,7 +86,7 @@ def test_elements_half_a_wavelength_of_the_beacon_apart_would_raise_a_grating_lo
     assert angle[power.argmax()] == pytest.approx(alias, abs=np.radians(0.1))
 
 
-def test_at_80_degrees_the_main_lobe_reaches_round_to_the_other_end_so_the_ends_are_no_peaks():
+def test_a_main_lobe_at_80_degrees_wraps_to_the_other_end():
     # Half a wavelength apart, -90 degrees looks like +90: 10 degrees beyond where it is steered.
     power = beampattern(np.radians([-90.0, 90.0]), steered=np.radians(80.0), **ears(35e3))
     assert power[0] == pytest.approx(power[1], abs=1e-9)

@@ -112,7 +112,7 @@ def test_every_face_meets_the_bound_at_every_angle_tone_and_level(face, angle_de
 
 
 @pytest.mark.slow
-def test_the_bound_is_exceeded_as_the_arcsine_bends_and_approached_as_echoes_grow():
+def test_errors_exceed_the_bound_by_the_arcsines_curvature():
     # A normal error s of the sine has, to fourth order, E[error^2] = s^2/c^2 (1 + s^2 k), with
     # k = c^2 (3 b^2 + 6 d / c), b = sin / 2c^3 and d = (1 + 2 sin^2) / 6c^5 of the angle.
     angle = np.radians(70.0)
@@ -127,7 +127,7 @@ def test_the_bound_is_exceeded_as_the_arcsine_bends_and_approached_as_echoes_gro
 
 
 @pytest.mark.slow
-def test_a_main_peak_past_the_cut_leaves_a_side_lobe_to_be_taken_for_the_echo():
+def test_a_main_peak_past_the_scan_limit_leaves_a_side_lobe():
     # At 70 degrees and 8 dB noise carries the main peak past 75 degrees in one echo of a hundred.
     # Mostly nothing is left; in some four of ten thousand a side lobe within 8 dB is, wrong by a
     # radian, and those few outweigh all the others in the rms.

@@ -13,14 +13,14 @@ def test_four_faces_look_to_the_front_left_back_and_right():
     assert np.all((LAYOUT.normal >= -np.pi) & (LAYOUT.normal < np.pi))
 
 
-def test_ten_elements_stand_half_a_wavelength_of_the_vehicles_call_apart_around_the_middle():
+def test_ten_centred_elements_are_spaced_by_half_the_vehicles_wavelength():
     config = Config()
     half = config.air.sound_speed / config.emitter.frequency / 2.0
     np.testing.assert_allclose(np.diff(LAYOUT.position), [half] * 9, rtol=1e-12)
     assert LAYOUT.position.sum() == pytest.approx(0.0, abs=1e-15)
 
 
-def test_every_direction_lies_within_75_degrees_of_a_face_and_most_within_two():
+def test_every_direction_is_within_75_degrees_of_one_or_two_faces():
     bearing = np.radians(np.arange(-180.0, 180.0, 0.5))
     off = np.abs(np.angle(np.exp(1j * (bearing[:, None] - LAYOUT.normal))))
     faces = np.sum(off <= np.radians(75.0), axis=1)

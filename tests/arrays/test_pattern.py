@@ -19,7 +19,7 @@ def rows(places, face=""):
 HALF_WAVE = [(0.0, 0.5 * LENGTH * i) for i in range(10)]
 
 
-def test_a_lines_beam_is_that_of_its_kind():
+def test_a_lines_beam_matches_the_beampattern_of_a_line():
     line, angle = rows(HALF_WAVE), np.radians(np.linspace(-80.0, 80.0, 41))
     known = beampattern(angle, steered=0.3, position=np.array(HALF_WAVE)[:, 1], **WAVE)
     assert np.allclose(beam_power(line, 0, 0.3, angle, **WAVE), known)
@@ -36,7 +36,7 @@ def test_many_microphones_on_a_circle_have_bessels_beam():
     assert found.alike == 0.0
 
 
-def test_a_free_line_has_doubles_everywhere_and_on_a_face_none():
+def test_only_a_free_line_has_ambiguous_bearings():
     free, faced = (pattern_of(rows(HALF_WAVE, face), 0, **WAVE) for face in ("", "front"))
     assert free.alike > 0.9  # near its axis a bearing and its double are one lobe
     assert faced.alike == 0.0
@@ -45,7 +45,7 @@ def test_a_free_line_has_doubles_everywhere_and_on_a_face_none():
     assert faced.std[0] == pytest.approx(known, rel=1e-3)
 
 
-def test_a_face_a_wave_apart_has_doubles():
+def test_a_face_with_full_wavelength_spacing_has_ambiguous_bearings():
     wide = pattern_of(rows([(0.0, LENGTH * i) for i in range(10)], "front"), 0, **WAVE)
     assert wide.alike > 0.9
     first, other = np.sin(wide.worst)

@@ -70,13 +70,13 @@ def both(arrivals, blocks, layout=LAYOUT, settled=SETTLED):
 @example(delay=8.4e-3 - 5e-6, bearing=0.0, shift=1.0, source=BEACON)  # one sample, at the end
 @example(delay=2.8e-3, bearing=np.pi / 2, shift=0.7, source=BEACON)  # long, along two faces
 @law
-def test_block_sums_of_an_arrival_are_those_of_its_samples(delay, bearing, shift, source):
+def test_block_sums_of_an_arrival_match_its_samples(delay, bearing, shift, source):
     fast, dense = both(one(delay, bearing, shift, source), 28)
     assert np.abs(fast - dense).max() <= 1e-10 * SETTLED.block  # a whole block of amplitude 1
 
 
 @pytest.mark.parametrize("seed", range(4))
-def test_block_sums_of_a_whole_world_are_those_of_its_samples(seed):
+def test_block_sums_of_a_whole_world_match_its_samples(seed):
     rng = np.random.default_rng(seed)
     pose = np.array([*rng.uniform(-9.0, 9.0, 2), rng.uniform(-np.pi, np.pi)])
     landmarks, beacon = rng.uniform(-18.0, 18.0, (50, 2)), rng.uniform(-10.0, 10.0, 2)
@@ -88,7 +88,7 @@ def test_block_sums_of_a_whole_world_are_those_of_its_samples(seed):
 
 @pytest.mark.parametrize("source", [VEHICLE, BEACON])
 @pytest.mark.parametrize("shift", [0.8, 1.0, 1.25])
-def test_a_call_that_is_heard_higher_is_over_sooner(shift, source):
+def test_a_call_received_at_a_higher_frequency_is_shorter(shift, source):
     heard = one(4e-3, bearing=0.0, shift=shift, source=source)
     samples = record_samples(28, heard, LAYOUT, SETTLED, None)
     count = np.count_nonzero(samples[:, 0, 0])
@@ -116,7 +116,7 @@ def test_other_settings_keep_the_engines_equal():
 
 @given(bearing=st.floats(-np.pi, np.pi))
 @law
-def test_a_face_hears_what_lies_within_90_degrees_of_its_normal_and_nothing_else(bearing):
+def test_a_face_receives_only_arrivals_within_90_degrees_of_its_normal(bearing):
     fast, _ = both(one(5e-3, bearing), 28)
     hears = np.abs(fast).max(axis=(0, 2, 3)) > 0.0
     assert hears.tolist() == (np.cos(bearing - LAYOUT.normal) >= 0.0).tolist()
@@ -167,7 +167,7 @@ def test_block_noise_has_forty_times_the_variance_of_a_sample_in_each_tone():
     assert np.abs(variance - 1.0).max() < SIGMAS / np.sqrt(2000 * 10)
 
 
-def test_block_sums_of_sampled_noise_are_as_independent_as_those_drawn():
+def test_sampled_and_drawn_noise_have_independent_block_sums():
     face = square_of_four(CONFIG.receiver)
     sampled = block_sums(record_samples(1500, one(0.0), face, SETTLED, np.random.default_rng(5)))
     for noise in (sampled, noise_blocks(1500, face, SETTLED, key=5)):
@@ -179,7 +179,7 @@ def test_block_sums_of_sampled_noise_are_as_independent_as_those_drawn():
             assert np.abs(product).max() < np.sqrt(np.log(product.size / 1e-6))
 
 
-def test_neighbouring_bins_alone_are_uncorrelated():
+def test_only_tones_on_whole_bins_are_uncorrelated():
     # 32 kHz is no whole bin of a block: its sums would carry part of 30 kHz's noise.
     samples = record_samples(1500, one(0.0), LAYOUT, SETTLED, np.random.default_rng(5))
     n = np.arange(samples.shape[0])
@@ -257,7 +257,7 @@ def test_every_sample_is_recorded_where_blocks_do_not_hold_the_calls(settings, d
         ({"beacon": {"frequency": 35.1e3}}, "beacon: found a call that is 77% the vehicle's"),
     ],
 )  # fmt: skip
-def test_calls_that_samples_do_not_hold_or_tell_apart_are_refused(settings, message):
+def test_calls_that_samples_cannot_represent_or_separate_are_refused(settings, message):
     config = Config.model_validate(settings)
     with pytest.raises(InputError, match=f"^{message}"):
         sampling(config, callers_of(config, np.zeros(2)))
@@ -268,7 +268,7 @@ THREE = (*CALLERS, Caller(name="whistle", frequency=25e3, level_db=40.0, place=n
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_block_sums_of_three_callers_one_of_them_moving_are_those_of_their_samples(seed):
+def test_block_sums_of_two_fixed_and_one_moving_caller_match_their_samples(seed):
     rng = np.random.default_rng(seed)
     landmarks = rng.uniform(-18.0, 18.0, (20, 2))
     callers = [
@@ -309,12 +309,12 @@ def test_noise_of_three_tones_has_the_same_variance_in_each():
         (np.nan, "caller whistle: frequency: found nan, expected one finite number"),
     ],
 )
-def test_a_third_tone_that_cannot_be_told_apart_is_refused_by_the_callers_name(frequency, message):
+def test_an_inseparable_third_tone_is_refused_with_the_callers_name(frequency, message):
     with pytest.raises(InputError, match=f"^{message}"):
         sampling(BLOCKS_ALONE, (*CALLERS, replace(THREE[2], frequency=frequency)))
 
 
-def test_tones_a_sampling_rate_apart_fall_into_one_bin_of_a_block():
+def test_tones_that_differ_by_the_sampling_rate_share_a_bin():
     n = np.arange(SETTLED.block)
     low, high = (np.exp(2j * np.pi * tone * n / SETTLED.rate) for tone in (35e3, 235e3))
     assert np.abs(low - high).max() < 1e-12

@@ -37,14 +37,14 @@ def fourier(samples, tone, first=560):
     return 2.0 * np.einsum("bnm,n->bm", blocks.reshape(-1, 40, samples.shape[1]), wave)
 
 
-def test_twice_the_transform_of_each_block_is_what_was_heard_in_it():
+def test_twice_the_transform_of_each_block_is_its_block_sum():
     sums, samples = heard()
     for c, tone in enumerate(SETTLED.tones):
         found = fourier(samples, tone)[:300].reshape(300, 4, 10)
         np.testing.assert_allclose(found, sums[:, :, c], atol=1e-3 * abs(sums).max() / 100)
 
 
-def test_noise_is_white_from_a_tone_to_where_there_is_none_and_goes_on_after_the_last_sum():
+def test_noise_is_white_at_all_frequencies_and_after_the_last_block():
     _, samples = heard(level_db=-300.0)
     noise = 40 * SETTLED.noise_std**2  # of a sum
     for tone in (10e3, 30e3, 35e3, 60e3):
@@ -53,7 +53,7 @@ def test_noise_is_white_from_a_tone_to_where_there_is_none_and_goes_on_after_the
             assert abs(power.mean() / noise - 1.0) < 5.0 / np.sqrt(power.size)
 
 
-def test_a_microphone_hears_the_call_alone_while_it_lasts():
+def test_a_microphone_receives_only_the_call_while_it_lasts():
     _, samples = heard()
     wave = 50.0 * np.cos(2.0 * np.pi * 35e3 * np.arange(560) / 200e3)
     rest = samples[:560] - wave[:, None]

@@ -123,7 +123,7 @@ def config_of(method, **sections):
     )
 
 
-def test_without_labels_excess_paths_reach_the_filter_with_the_caller_as_it_was_labelled(written):
+def test_excess_paths_without_labels_reach_the_filter_with_their_caller(written):
     method = f"{written(JOINT)}:Joint"
     labelled, found = (
         run_mission(config_of(name), ["passive", "fused"], ["iekf"]) for name in ("known", method)
@@ -144,7 +144,7 @@ def test_without_labels_excess_paths_reach_the_filter_with_the_caller_as_it_was_
     assert paths[1] > 0.3 * paths[0] > 100, "of those that a landmark was born for"
 
 
-def test_an_association_of_a_class_maps_a_mission_a_study_and_its_log(written):
+def test_an_association_of_a_class_maps_a_mission_a_study_and_its_log(written, undrawn):
     method = ("--association.method", f"{written(JOINT)}:Joint")
     timed = ("--listening.timing", "true", "--filter.noise", "measured")
     words = ("run", *SHORT, *timed)
@@ -181,7 +181,7 @@ def test_an_association_of_a_class_maps_a_mission_a_study_and_its_log(written):
         assert known["clutter_per_frame"] == own["clutter_per_frame"]
 
 
-def test_an_association_that_a_folder_names_is_run_only_if_its_reader_names_it_too(written, capsys):
+def test_a_folders_association_class_is_run_only_if_requested(written, capsys):
     method = f"{written(JOINT)}:Joint"
     assert main(["run", *SHORT, "--association.method", method, "-o", "own"]) == 0
     said = f"config.toml: association.method: found '{method}', whose code is not Pipistrelle's"
@@ -210,7 +210,7 @@ WRONG = {
 
 
 @pytest.mark.parametrize("case", WRONG)
-def test_what_cannot_be_had_or_built_is_refused_before_anything_is_heard(written, case, capsys):
+def test_a_missing_or_broken_association_is_refused_before_the_mission(written, case, capsys):
     text, expected = WRONG[case]
     name = written(text)
     assert main(["run", *SHORT, "--association.method", f"{name}:Own", "-o", "one"]) == 2

@@ -128,7 +128,7 @@ class EstimatorContract:
         np.testing.assert_array_equal(poses.mean[-1], belief.pose().mean)
         np.testing.assert_array_equal(poses.covariance[-1], belief.pose().covariance)
 
-    def test_map_has_rows_of_what_was_heard(self, slam):
+    def test_map_contains_the_landmarks_of_the_scans(self, slam):
         for scans, known in (
             ((), (3, 8, 1)),
             ((SECOND,), (3, 8, 1, 5)),
@@ -153,11 +153,11 @@ class EstimatorContract:
         assert_gaussian(poses, (0, 3))
         assert_same(belief, seen_from_outside(before))
 
-    def test_scan_that_heard_nothing_says_nothing(self, slam):
+    def test_empty_scan_leaves_the_belief_unchanged(self, slam):
         for before in (slam.init(START), self.heard(slam, SECOND)):
             assert_same(slam.update(before, scan_of(), rng()), seen_from_outside(before))
 
-    def test_nothing_that_is_given_is_changed(self, slam):
+    def test_inputs_are_not_changed(self, slam):
         start = Gaussian(mean=START.mean.copy(), covariance=START.covariance.copy())
         controls, dt, scan = CONTROLS.copy(), DT.copy(), with_columns(SECOND)
         for before in (slam.init(start), self.heard(slam), self.heard(slam, SECOND, THIRD)):
@@ -173,7 +173,7 @@ class EstimatorContract:
         np.testing.assert_array_equal(dt, DT)
         np.testing.assert_array_equal(scan.numbers, SECOND.numbers)
 
-    def test_belief_kept_aside_goes_on_to_the_same_bits(self, slam):
+    def test_kept_belief_continues_to_the_same_bits(self, slam):
         kept = self.heard(slam, SECOND)
         once = slam.update(slam.predict(kept, CONTROLS, DT, rng())[0], THIRD, rng())
         slam.update(slam.predict(once, CONTROLS, DT, rng())[0], SECOND, rng())
@@ -191,7 +191,7 @@ class EstimatorContract:
         np.testing.assert_array_equal(track.landmarks.mean, same.landmarks.mean)
 
     @pytest.mark.parametrize("noise_at_rest", [True, False])
-    def test_a_drive_told_by_poses_gives_the_same_track_and_map(self, slam, noise_at_rest):
+    def test_odometry_as_poses_gives_the_same_track_and_map(self, slam, noise_at_rest):
         motion = replace(slam.motion, noise_at_rest=noise_at_rest)
         drive, scans, _ = small_world(seed=5, frames=25)
         controls = drive.controls.copy()

@@ -59,13 +59,16 @@ if __name__ == "__main__":
 
 @pytest.fixture(scope="module")
 def plan(tmp_path_factory):
-    return plan_of(tmp_path_factory.mktemp("plan"), iterations=5)
+    return plan_of(tmp_path_factory.mktemp("plan"), iterations=3)
 
 
 @pytest.fixture(scope="module")
 def expected(plan, tmp_path_factory):
-    """The results of a study run in this process, without interruption."""
-    folder = tmp_path_factory.mktemp("inline")
+    return done_inline(plan, tmp_path_factory.mktemp("inline"))
+
+
+def done_inline(plan, folder):
+    """Return the results of a study run in this process, without interruption."""
     run_study(plan, folder)
     return results(folder)
 
@@ -97,7 +100,7 @@ class ExecutorContract:
     def run(self, plan, folder):
         raise NotImplementedError
 
-    def test_results_are_those_of_one_process(self, plan, folder, expected):
+    def test_results_equal_a_single_process_run(self, plan, folder, expected):
         self.run(plan, folder)
         assert done_worlds(folder) == set(range(plan.iterations))
         assert_same(results(folder), expected)
@@ -106,18 +109,19 @@ class ExecutorContract:
 
 class TestInline(ExecutorContract):
     def run(self, plan, folder):
-        assert run_study(plan, folder, workers=1).done == 5
+        assert run_study(plan, folder, workers=1).done == plan.iterations
 
 
 class TestThreads(ExecutorContract):
     def run(self, plan, folder):
         with ThreadPoolExecutor(2) as executor:
-            assert run_study(plan, folder, executor=executor).done == 5
+            assert run_study(plan, folder, executor=executor).done == plan.iterations
 
 
+@pytest.mark.slow
 class TestTwoProcesses(ExecutorContract):
     def run(self, plan, folder):
-        assert run_study(plan, folder, workers=2).done == 5
+        assert run_study(plan, folder, workers=2).done == plan.iterations
         assert active_children() == []
 
 
@@ -131,14 +135,17 @@ class TestSharesSideBySide(ExecutorContract):
 class TestTwoAtOnceOnTheSameWorlds(ExecutorContract):
     def run(self, plan, folder):
         with ThreadPoolExecutor(2) as both:
-            assert [s.done for s in both.map(lambda _: run_study(plan, folder), "ab")] == [5, 5]
+            assert [s.done for s in both.map(lambda _: run_study(plan, folder), "ab")] == 2 * [
+                plan.iterations
+            ]
 
 
 class TestTwoProcessesKilledOnce(ExecutorContract):
     def run(self, plan, folder):
         standing = run_study(plan, folder, workers=2, progress=after_first(kill_workers))
-        assert standing.done == 5
+        assert standing.done == plan.iterations
         assert set(standing.failed.values()) == {0}
+        assert active_children() == []
 
 
 class TestKilledInTheMiddleOfAFileAndContinued(ExecutorContract):
@@ -151,12 +158,20 @@ class TestKilledInTheMiddleOfAFileAndContinued(ExecutorContract):
             words = (folder.parent / "mortal.py", folder.parent / "plan.toml", folder, operation)
             killed = subprocess.run([sys.executable, *map(str, words)], check=False)
             assert killed.returncode in (-signal.SIGKILL, 0)
-        assert run_study(plan, folder).done == 5
+        assert run_study(plan, folder).done == plan.iterations
 
 
 @pytest.mark.slow
 class TestKilledAtEveryOperation(TestKilledInTheMiddleOfAFileAndContinued):
     operations = tuple(range(1, 19))
+
+    @pytest.fixture
+    def plan(self, tmp_path_factory):
+        return plan_of(tmp_path_factory.mktemp("plan"), iterations=5)
+
+    @pytest.fixture
+    def expected(self, plan, tmp_path_factory):
+        return done_inline(plan, tmp_path_factory.mktemp("inline"))
 
 
 class TestWorkersEndWithTheProcessThatIsKilled(ExecutorContract):
@@ -190,7 +205,7 @@ class TestWorkersEndWithTheProcessThatIsKilled(ExecutorContract):
         assert len(workers) == 2
         assert gone(workers)
         assert done_worlds(folder)
-        assert run_study(plan, folder).done == 5
+        assert run_study(plan, folder).done == plan.iterations
 
 
 def gone(processes, patience=30.0):
@@ -261,14 +276,14 @@ class Together(Mortal):
         return ended[iteration]
 
 
-def test_a_world_beside_one_that_kills_its_pool_is_tried_again_alone(monkeypatch):
+def test_a_world_that_shares_a_pool_with_a_fatal_world_is_retried(monkeypatch):
     monkeypatch.setattr(executors, "_pool", Together)
     found = executors.in_processes(partial(fatal, {3}), lost, deque(range(6)), 2)
     names = [(f"world {i}", "lost" if i == 3 else None) for i in range(6)]
     assert sorted(found) == [[name] for name in names]
 
 
-def test_pools_that_never_get_anywhere_are_an_error(mortal):
+def test_pools_that_finish_no_world_are_an_error(mortal):
     with pytest.raises(InputError, match="their processes end before a world is done"):
         list(executors.in_processes(partial(fatal, {0, 1}), lost, deque([0, 1]), 2))
 
@@ -287,20 +302,20 @@ def test_a_world_that_kills_its_process_twice_is_recorded_and_the_others_are_not
 
 
 @pytest.mark.slow
-def test_processes_that_never_get_anywhere_are_an_error():
+def test_processes_that_finish_no_world_are_an_error():
     with pytest.raises(InputError, match="their processes end before a world is done"):
         list(executors.in_processes(partial(fatal, {0, 1}), lost, deque([0, 1]), 2))
 
 
-def test_a_world_that_was_given_up_is_a_failed_world(plan, folder):
+def test_an_abandoned_world_counts_as_failed(plan, folder):
     study.open_store(folder, plan)
-    study._give_up(folder, plan, 3)
-    standing = run_study(plan, folder, shard=(3, 5))
+    study._give_up(folder, plan, 2)
+    standing = run_study(plan, folder, shard=(2, 3))
     assert standing.failed == standing.trials
     assert standing.first_error == study.KILLED.strip()
 
 
-def test_an_interrupt_stops_the_workers_and_keeps_what_is_done(plan, folder):
+def test_an_interrupt_stops_the_workers_and_keeps_finished_worlds(plan, folder):
     def interrupt(standing):
         if standing.done:
             raise KeyboardInterrupt
@@ -311,7 +326,13 @@ def test_an_interrupt_stops_the_workers_and_keeps_what_is_done(plan, folder):
     assert done_worlds(folder)
 
 
-def test_results_that_cannot_be_written_by_a_worker_end_the_study(plan, folder):
+@pytest.mark.parametrize(
+    "pool", [ThreadPoolExecutor, pytest.param(None, marks=pytest.mark.slow, id="processes")]
+)
+def test_results_that_cannot_be_written_by_a_worker_end_the_study(plan, folder, monkeypatch, pool):
+    if pool:
+        monkeypatch.setattr(executors, "_pool", pool)
+
     def spoil():
         (folder / "steps").rename(folder / "taken")
         (folder / "steps").write_text("no folder")
@@ -329,7 +350,7 @@ class Elsewhere(ThreadPoolExecutor):
         return super().submit(lost, iteration)
 
 
-def test_results_that_went_to_another_disk_are_missed(plan, folder, monkeypatch):
+def test_results_written_to_another_disk_are_reported_missing(plan, folder, monkeypatch):
     monkeypatch.setattr(study, "_advanced", lambda standing, _: replace(standing, done=1))
     with (
         Elsewhere(1) as executor,
@@ -385,7 +406,7 @@ class TestDask(ExecutorContract):
 
     def run(self, plan, folder):
         standing = run_study(plan, folder, scheduler=self.address)
-        assert (standing.done, set(standing.failed.values())) == (5, {0})
+        assert (standing.done, set(standing.failed.values())) == (plan.iterations, {0})
 
 
 MINE = """
@@ -408,14 +429,14 @@ def test_workers_of_a_cluster_find_an_estimator_where_the_study_was_started(
     monkeypatch.chdir(tmp_path / "here")  # the cluster was started elsewhere
     plan = plan_of(tmp_path, 'filters = ["mine_of_dask:Mine"]\n' + SMALL)
     standing = run_study(plan, tmp_path / "study", scheduler=cluster[0])
-    assert (standing.done, set(standing.failed.values())) == (3, {0})
+    assert (standing.done, set(standing.failed.values())) == (plan.iterations, {0})
 
 
 class TestDaskWithAWorkerKilled(TestDask):
     def run(self, plan, folder):
         kill = after_first(self.workers[1].kill)
         standing = run_study(plan, folder, scheduler=self.address, progress=kill)
-        assert (standing.done, set(standing.failed.values())) == (5, {0})
+        assert (standing.done, set(standing.failed.values())) == (plan.iterations, {0})
         assert self.workers[1].wait(10) == -signal.SIGKILL
 
 
@@ -424,7 +445,7 @@ class TestDaskLosesItsScheduler(TestDask):
         kill = after_first(self.scheduler.kill)
         with pytest.raises(InputError, match="the cluster is gone"):
             run_study(plan, folder, scheduler=self.address, progress=kill)
-        assert run_study(plan, folder).done == 5
+        assert run_study(plan, folder).done == plan.iterations
 
 
 class TestDaskOnThisMachine(ExecutorContract):
@@ -436,7 +457,7 @@ class TestDaskOnThisMachine(ExecutorContract):
         monkeypatch.setattr(dask, "LocalCluster", partial(dask.LocalCluster, processes=False))
 
     def run(self, plan, folder):
-        assert run_study(plan, folder, workers=2, scheduler="local").done == 5
+        assert run_study(plan, folder, workers=2, scheduler="local").done == plan.iterations
 
 
 @pytest.mark.slow
@@ -466,7 +487,7 @@ for address in sys.argv[1:]:
 
 
 @pytest.mark.slow
-def test_nobody_else_on_the_machine_is_let_into_a_cluster_that_is_started_here():
+def test_a_local_cluster_refuses_other_users_of_the_machine():
     pytest.importorskip("distributed", reason="no Dask: the extra [cluster]")
     with executors._client("local", 1) as client:
         known = client.scheduler_info()

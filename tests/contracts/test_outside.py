@@ -76,7 +76,7 @@ def test_an_installed_estimator_runs_a_mission_and_solves_its_log(toys):
     np.testing.assert_allclose(*tracks, rtol=0, atol=1e-9)
 
 
-def test_a_path_that_is_revised_is_scored_and_written_beside_the_one_believed_online(toys):
+def test_a_revised_path_is_scored_and_written_next_to_the_online_path(toys):
     words = ("run", *SHORT, "--strategy", "fused")
     for name in (RECKONING, SHIFTED):
         assert main([*words, "--filter", name, "-o", name[15:]]) == 0
@@ -101,9 +101,7 @@ def test_a_path_that_is_revised_is_scored_and_written_beside_the_one_believed_on
     assert not list(Path("Shifted").glob("*_online.tum"))
 
 
-def test_a_study_tries_it_beside_the_papers_two_and_leaves_their_results_as_they_are(
-    toys, tmp_path
-):
+def test_an_outside_estimator_in_a_study_leaves_the_papers_results_unchanged(toys, tmp_path):
     small = SMALL.replace("iterations = 3", "iterations = 2").replace("0.0025, 0.025", "0.0088")
     plans = [
         plan_of(tmp_path, f"filters = {json.dumps(names)}\n{small}")
@@ -137,7 +135,7 @@ def test_a_study_from_the_command_line_in_this_process_or_in_others(toys, worker
     assert read_plan(Path("study/plan.toml")).filters == (RECKONING,)
 
 
-def test_its_study_has_a_page(toys, tmp_path, monkeypatch):
+def test_a_study_with_an_outside_estimator_has_a_report(toys, tmp_path, monkeypatch):
     draw_only(monkeypatch)
     small = SMALL.replace("iterations = 3", "iterations = 2")
     run_study(
@@ -147,7 +145,7 @@ def test_its_study_has_a_page(toys, tmp_path, monkeypatch):
     assert "Shifted" in (tmp_path / "s" / "report" / "index.html").read_text()
 
 
-def test_its_title_is_its_own_once_it_has_been_looked_up_and_else_its_class(toys, monkeypatch):
+def test_the_title_is_the_class_name_until_the_class_is_imported(toys, monkeypatch):
     monkeypatch.delitem(sys.modules, "toy_estimators", raising=False)
     before = [*sys.path]
     assert title_of(SHIFTED) == "Shifted"
@@ -168,7 +166,7 @@ class Mine(DeadReckoning):
 """
 
 
-def test_workers_find_it_in_the_folder_in_which_the_study_was_started(toys, written, tmp_path):
+def test_workers_import_an_estimator_from_the_studys_start_folder(toys, written, tmp_path):
     name = f"{written(RECKONS)}:Mine"
     small = SMALL.replace("iterations = 3", "iterations = 2").replace("0.0025, 0.025", "0.0088")
     plan = plan_of(tmp_path, f'filters = ["ekf", "{name}"]\nstrategies = ["active"]\n{small}')
@@ -178,7 +176,7 @@ def test_workers_find_it_in_the_folder_in_which_the_study_was_started(toys, writ
     assert_same(*(results(tmp_path / f"by_{workers}") for workers in (1, 2)))
 
 
-def test_one_in_the_current_folder_goes_before_one_that_is_installed(toys, written):
+def test_the_current_folder_takes_precedence_over_an_installed_estimator(toys, written):
     Path("toy_estimators.py").write_text("class DeadReckoning: pass\n")
     sys.modules.pop("toy_estimators", None)
     with pytest.raises(InputError, match="lacks init, predict, update"):
@@ -186,7 +184,7 @@ def test_one_in_the_current_folder_goes_before_one_that_is_installed(toys, writt
     sys.modules.pop("toy_estimators")
 
 
-def test_the_current_folder_goes_first_wherever_it_stood(toys, written):
+def test_the_current_folder_comes_first_in_the_search_path(toys, written):
     name = written("class DeadReckoning: pass\n")
     sys.path[:] = [*sys.path, str(Path.cwd())]
     other = Path("installed")
@@ -218,7 +216,7 @@ class Mine:
 """
 
 
-def test_its_fields_are_given_what_they_ask_for(written):
+def test_the_fields_of_an_estimator_receive_settings_by_name(written):
     config = Config(filter=FilterConfig(gate=0.9), rays=RayConfig(power=5.0, density=2.0))
     slam = entry(f"{written(GREEDY)}:Mine").build(config, BICYCLE)
     assert (slam.gate, slam.rays, slam.config, slam.own) == (0.9, config.rays, config, 3)
@@ -285,7 +283,7 @@ ODD = {
 
 
 @pytest.mark.parametrize("case", ODD)
-def test_what_cannot_be_had_built_or_begun_is_refused_in_a_line(toys, written, case, capsys):
+def test_a_missing_or_broken_estimator_is_refused_in_a_line(toys, written, case, capsys):
     text, said = ODD[case]
     name = written(text)
     assert main(["run", *SHORT, "--filter", f"{name}:Mine", "-o", "one"]) == 2
@@ -295,27 +293,27 @@ def test_what_cannot_be_had_built_or_begun_is_refused_in_a_line(toys, written, c
     assert not Path("one").exists()
 
 
-def test_a_module_that_is_nowhere_is_refused_with_where_it_was_looked_for(written, capsys):
+def test_a_missing_module_is_refused_with_the_places_searched(written, capsys):
     for name in ("nowhere_at_all", "nowhere_at_all.deeper"):
         assert main(["run", *SHORT, "--filter", f"{name}:Mine", "-o", "one"]) == 2
         error = capsys.readouterr().err
         assert f"found no module nowhere_at_all, neither installed nor in {Path.cwd()}" in error
 
 
-def test_a_study_refuses_it_before_its_folder_is_made(written, tmp_path):
+def test_a_study_refuses_a_missing_class_before_making_its_folder(written, tmp_path):
     plan = plan_of(tmp_path, f'filters = ["ekf", "{written("")}:Mine"]\n{SMALL}')
     with pytest.raises(InputError, match="found no class Mine"):
         run_study(plan, tmp_path / "study")
     assert not (tmp_path / "study").exists()
 
 
-def test_two_classes_of_one_name_are_not_for_one_run(toys, written):
+def test_two_classes_of_the_same_name_in_one_run_are_refused(toys, written):
     names = (RECKONING, f"{written('from toy_estimators import *')}:DeadReckoning")
     with pytest.raises(InputError, match="would write the same files"):
         run_mission(Config(scenario=ScenarioConfig(steps=8)), ("fused",), names)
 
 
-def test_particles_are_refused_for_one_that_has_none(toys, capsys):
+def test_particles_are_refused_for_an_estimator_without_them(toys, capsys):
     assert main(["run", *SHORT, "--filter", RECKONING, "--particles", "9"]) == 2
     said = f"--particles: found 9, but --filter is {RECKONING}, which has none; add --filter fas"
     assert said in capsys.readouterr().err
@@ -323,11 +321,7 @@ def test_particles_are_refused_for_one_that_has_none(toys, capsys):
 
 FAILING = {
     "raises": ("update", "1 / 0", "ZeroDivisionError: division by zero"),
-    "forgets": (
-        "update",
-        "None",
-        "Mine.update: found NoneType returned, expected the belief",
-    ),
+    "forgets": ("update", "None", "Mine.update: found NoneType returned, expected the belief"),
     "shortens": (
         "predict",
         "(belief, Gaussian(mean=np.zeros((9, 3)), covariance=np.zeros((9, 3, 3))))",
@@ -342,7 +336,7 @@ FAILING = {
 
 
 @pytest.mark.parametrize("way", FAILING)
-def test_one_that_fails_on_the_way_is_a_failed_trial_of_a_run(toys, written, way, capsys):
+def test_an_estimator_that_fails_midway_is_a_failed_trial_of_a_run(toys, written, way, capsys):
     method, answer, said = FAILING[way]
     name = written(
         "from toy_estimators import *\nfrom toy_estimators import DeadReckoning, Gaussian, np\n"
@@ -360,7 +354,7 @@ def test_one_that_fails_on_the_way_is_a_failed_trial_of_a_run(toys, written, way
     assert (run["diverged"], run["position_rmse_m"]) == (True, None)
 
 
-def test_one_that_fails_on_the_way_is_a_failed_trial_of_a_study(toys, written, tmp_path):
+def test_an_estimator_that_fails_midway_is_a_failed_trial_of_a_study(toys, written, tmp_path):
     name = written(
         "from toy_estimators import *\n"
         "class Mine(Shifted):\n    def update(self, belief, scan, rng): return 1 / 0\n"
@@ -374,7 +368,7 @@ def test_one_that_fails_on_the_way_is_a_failed_trial_of_a_study(toys, written, t
     assert set(ONLINE) < set(trials.columns)
 
 
-def test_a_path_that_lacks_poses_is_said_to(toys, written, capsys):
+def test_a_path_without_all_poses_is_reported(toys, written, capsys):
     name = written(
         "from dataclasses import dataclass\nfrom toy_estimators import *\n"
         "@dataclass(frozen=True)\nclass Short(Kept):\n    def path(self): return self.at\n"

@@ -176,12 +176,12 @@ FAST = [(0, 0, 8.0), (40, 1, 13.0), (70, 0, 20.0), (0, 1, 5.0), (70, 1, 30.0)]
 
 
 @pytest.mark.parametrize(("angle_deg", "tone", "snr_db"), FAST)
-def test_isolated_bearings_are_off_by_as_much_as_they_say(angle_deg, tone, snr_db):
+def test_errors_of_isolated_bearings_match_their_deviations(angle_deg, tone, snr_db):
     check_bearing(alone(angle_deg, tone, snr_db, FEW), snr_db)
 
 
 @pytest.mark.parametrize(("angle_deg", "tone", "snr_db"), FAST)
-def test_isolated_delays_are_off_by_as_much_as_they_say(angle_deg, tone, snr_db):
+def test_errors_of_isolated_delays_match_their_deviations(angle_deg, tone, snr_db):
     told = alone(angle_deg, tone, snr_db, FEW)
     assert is_unit(late_of(told), *delay_share(snr_db), spread=WALK)
 
@@ -190,7 +190,7 @@ def test_isolated_delays_are_off_by_as_much_as_they_say(angle_deg, tone, snr_db)
 @pytest.mark.parametrize("angle_deg", ANGLES)
 @pytest.mark.parametrize("tone", [0, 1])
 @pytest.mark.parametrize("snr_db", LEVELS)
-def test_every_bearing_is_off_by_as_much_as_it_says(angle_deg, tone, snr_db):
+def test_bearing_errors_match_their_deviations_at_every_angle_and_level(angle_deg, tone, snr_db):
     check_bearing(alone(angle_deg, tone, snr_db, MANY), snr_db)
 
 
@@ -198,13 +198,13 @@ def test_every_bearing_is_off_by_as_much_as_it_says(angle_deg, tone, snr_db):
 @pytest.mark.parametrize("angle_deg", ANGLES)
 @pytest.mark.parametrize("tone", [0, 1])
 @pytest.mark.parametrize("snr_db", [*LEVELS, 40.0])
-def test_every_delay_is_off_by_as_much_as_it_says(angle_deg, tone, snr_db):
+def test_delay_errors_match_their_deviations_at_every_angle_and_level(angle_deg, tone, snr_db):
     told = alone(angle_deg, tone, snr_db, MANY)
     assert is_unit(late_of(told), *delay_share(snr_db), spread=WALK)
 
 
 @pytest.mark.parametrize("snr_db", [8.0, 20.0])
-def test_a_run_of_lags_is_almost_as_sure_of_its_bearing_as_its_loudest_lag(snr_db):
+def test_bearings_of_runs_are_nearly_as_precise_as_of_maxima(snr_db):
     # The lags at both ends of a run have less of the call in them, and the same noise.
     told = alone(40, 0, snr_db, FEW, "runs")
     assert is_unit(near(told.off / told.off_std), 1.05, 1.2)
@@ -212,7 +212,7 @@ def test_a_run_of_lags_is_almost_as_sure_of_its_bearing_as_its_loudest_lag(snr_d
 
 
 @pytest.mark.parametrize(("angle_deg", "tone", "snr_db"), FAST)
-def test_claims_for_twice_the_noise_fail_the_same_check(angle_deg, tone, snr_db):
+def test_bearing_deviations_for_twice_the_noise_fail_the_same_check(angle_deg, tone, snr_db):
     told = alone(angle_deg, tone, snr_db, FEW)
     z = told.off / by_noise_alone(told, tone)
     assert is_unit(near(z), *bearing_share(snr_db)), "the noise that there is passes"
@@ -221,14 +221,14 @@ def test_claims_for_twice_the_noise_fail_the_same_check(angle_deg, tone, snr_db)
 
 
 @pytest.mark.parametrize("snr_db", [8.0, 20.0, 30.0])
-def test_delays_said_for_twice_the_noise_fail_the_same_check(snr_db):
+def test_deviations_for_twice_the_noise_fail_the_same_check(snr_db):
     told = alone(0, 0, snr_db, FEW)
     claims = [BLOCK * delay_std(power / 2.0 - 1.0, SETTLED.pulse) for power in told.power]
     z = told.late / np.hypot(claims, SAMPLED)
     assert not is_unit(z, *delay_share(snr_db), spread=WALK)
 
 
-def test_a_delay_is_late_by_half_a_sample_which_only_the_loudest_echoes_tell():
+def test_a_delay_is_half_a_sample_late_visible_only_in_loud_echoes():
     loud = alone(0, 0, 40.0, FEW)
     assert np.mean(loud.late) == pytest.approx(0.5 * BLOCK / SETTLED.block, rel=0.1)
     assert not is_unit(loud.late / loud.late_std, *delay_share(40.0), spread=WALK)
@@ -241,7 +241,7 @@ def test_a_delay_is_late_by_half_a_sample_which_only_the_loudest_echoes_tell():
 
 @pytest.mark.parametrize("tone", [0, 1])
 @pytest.mark.parametrize("snr_db", [13.0, 20.0])
-def test_of_echoes_that_overlap_what_is_left_tells_and_the_receivers_noise_does_not(tone, snr_db):
+def test_residuals_and_not_receiver_noise_reveal_overlapping_echoes(tone, snr_db):
     told = in_pairs(15.0, tone, snr_db, FEW)
     left = np.abs(told.off / told.off_std) > 3.0
     noise = np.abs(told.off / by_noise_alone(told, tone)) > 3.0
@@ -252,7 +252,7 @@ def test_of_echoes_that_overlap_what_is_left_tells_and_the_receivers_noise_does_
     assert np.mean(noise[two]) > 0.35
 
 
-def test_two_echoes_that_are_heard_as_one_still_surprise():
+def test_two_echoes_in_a_single_peak_exceed_their_deviation():
     # One peak stands between them, and a good part of both is no noise beside it.
     told = in_pairs(15.0, 1, 20.0, FEW)
     one = told.peaks == 1.0
@@ -265,7 +265,7 @@ def test_two_echoes_that_are_heard_as_one_still_surprise():
 
 @pytest.mark.parametrize("angle", [0.0, 0.7, 1.2])
 @pytest.mark.parametrize("elements", [2, 10, 31])
-def test_a_loud_bearing_is_as_sure_as_the_cramer_rao_bound_allows(angle, elements):
+def test_the_deviation_of_a_loud_bearing_meets_the_cramer_rao_bound(angle, elements):
     slope = 2.0 * np.pi * 0.4 * np.cos(angle)
     for power in (1e3, 1e6, 1e9):
         bound = bearing_bound(
@@ -276,12 +276,12 @@ def test_a_loud_bearing_is_as_sure_as_the_cramer_rao_bound_allows(angle, element
         assert bound <= said
 
 
-def test_a_loud_delay_has_the_variance_of_two_edges_and_a_faint_one_that_of_a_walks_top():
+def test_delay_variance_has_the_limits_of_loud_and_faint_echoes():
     assert delay_std(1e9, 14) ** 2 == pytest.approx(14 / 1e9 / 4, rel=1e-6)
     assert delay_std(1e-6, 14) == pytest.approx(np.sqrt(26.0) / 4.0 * 14e6, rel=1e-6)
 
 
-def test_what_is_left_counts_only_where_noise_alone_hardly_explains_it():
+def test_residuals_count_only_above_the_loudest_noise():
     loudest = loudest_noise(ELEMENTS)
     quiet = 100.0 + 9.0 * loudest * (1.0 - 1e-9)
     assert over_noise(100.0, quiet, ELEMENTS, loudest) == 99.0
@@ -293,12 +293,12 @@ def test_what_is_left_counts_only_where_noise_alone_hardly_explains_it():
 
 
 @pytest.mark.parametrize("elements", [2, 10, 31])
-def test_noise_alone_leaves_more_beside_a_beam_in_a_thousandth_of_snapshots(elements):
+def test_the_noise_residual_limit_is_exceeded_with_probability_1e_3(elements):
     loudest = loudest_noise(elements)
     assert gamma.sf((elements - 1) * loudest, elements - 1) == pytest.approx(1e-3, rel=1e-9)
 
 
-def test_the_receivers_noise_leaves_more_beside_a_beam_in_a_thousandth_of_snapshots():
+def test_simulated_noise_exceeds_the_residual_limit_in_1_of_1000_snapshots():
     beam = steering_vector(
         0.3, position=SQUARE.position, frequency=SETTLED.tones[0], speed_of_sound=343.0
     )
@@ -315,7 +315,7 @@ def test_the_receivers_noise_leaves_more_beside_a_beam_in_a_thousandth_of_snapsh
     assert louder == pytest.approx(1e-3 * count, abs=SIGMAS * np.sqrt(1e-3 * count))
 
 
-def test_a_detector_that_does_not_say_how_sure_it_is_says_so():
+def test_detections_without_deviations_have_nan_deviations():
     nothing = np.zeros(2)
     found = Detections(
         face=np.zeros(2, int), caller=np.zeros(2, int), angle=nothing, bearing=nothing,
@@ -352,7 +352,7 @@ def world_errors(iteration, radii):
 
 
 @pytest.mark.slow
-def test_rows_of_the_papers_worlds_err_by_as_much_as_they_say():
+def test_errors_in_the_papers_worlds_match_their_deviations():
     # Beams from the widest to the narrowest of the study, as the floors were found with.
     radii = (0.0025, 0.0088, 0.025)
     rows = np.concatenate([world_errors(iteration, radii) for iteration in range(4)])

@@ -79,12 +79,12 @@ def test_the_first_of_a_tone_is_its_direct_call_though_an_echo_be_louder():
     )
 
 
-def test_what_is_much_fainter_than_the_loudest_is_no_direct_call():
+def test_a_peak_much_fainter_than_the_loudest_is_no_direct_call():
     found = detected((0.012, 0.3, BEACON, 12.0), (0.022, 1.9, BEACON, 32.0))
     assert abs(off_by(found, 0.022)) < 0.02
 
 
-def test_what_may_be_the_leakage_of_another_tone_is_no_direct_call():
+def test_possible_leakage_of_another_tone_is_no_direct_call():
     faint = (0.0200, 0.3, BEACON, 22.0)
     assert detected(faint).direct.detection[BEACON] >= 0
     beside = detected(faint, (0.0200, 0.35, OWN, 46.0))
@@ -93,7 +93,7 @@ def test_what_may_be_the_leakage_of_another_tone_is_no_direct_call():
 
 
 @pytest.mark.parametrize("apart", [0.15, 0.3, 0.6])
-def test_an_echo_at_the_heels_of_the_direct_call_does_not_move_its_front_edge(apart):
+def test_an_echo_overlapping_the_direct_call_does_not_move_its_front_edge(apart):
     worst, drawn = 0.0, 0.0
     for key in range(40):
         rng = np.random.default_rng(key)
@@ -121,7 +121,7 @@ def edges(snr_db, count=600):
 
 
 @pytest.mark.parametrize("snr_db", [21.0, 25.0, 30.0])
-def test_a_front_edge_is_as_sure_as_it_says(snr_db):
+def test_errors_of_front_edges_match_their_deviations(snr_db):
     off, std = edges(snr_db)
     heard = np.isfinite(off)
     assert heard.mean() > 0.95
@@ -130,7 +130,7 @@ def test_a_front_edge_is_as_sure_as_it_says(snr_db):
     assert np.mean(off[heard] ** 2 / (0.25 * std[heard] ** 2)) > 2.0, "half of that would not do"
 
 
-def test_rows_say_how_much_later_than_the_direct_call_they_came_and_how_surely():
+def test_rows_contain_excess_paths_with_deviations():
     delays = np.array([0.02, 0.031, 0.028])
     found = detected(
         (delays[0], 0.3, BEACON, 26.0), (delays[1], 1.2, BEACON, 20.0), (delays[2], -2.0, OWN, 20.0)
@@ -162,7 +162,7 @@ def test_an_excess_path_is_as_unsure_as_echo_and_direct_call_together():
     np.testing.assert_allclose(heard.rows.excess_path_std, spread, rtol=1e-12)
 
 
-def test_what_comes_while_the_direct_call_lasts_has_no_excess_path():
+def test_an_echo_during_the_direct_call_has_no_excess_path():
     for apart, heard_apart in ((0.8 * PULSE, False), (1.3 * PULSE, True)):
         found = detected((0.02, 0.0, BEACON, 26.0), (0.02 + apart, 3.1, BEACON, 20.0))
         late = found.delay > 0.02 + 0.5 * apart
@@ -206,7 +206,7 @@ def told_std(share, amplitude):
 
 
 @pytest.mark.parametrize("share", [0.0, 0.05, 0.25, 0.5, 0.9])
-def test_a_front_edge_without_noise_is_exact_and_as_sure_as_the_formula_says(share):
+def test_a_front_edge_without_noise_is_exact_with_the_formulas_deviation(share):
     lag, std = edge((BEGIN - share, M, 5.0))
     assert lag == pytest.approx(BEGIN - share, abs=1e-9)
     assert std == pytest.approx(told_std(share, 5.0), rel=1e-9)
@@ -222,7 +222,7 @@ def test_a_front_edge_of_a_long_call_is_sought_in_fourteenths_of_it(share):
 
 
 @pytest.mark.parametrize("share", [0.1, 0.5, 0.9])
-def test_a_front_edge_strays_in_noise_as_much_as_it_says(share):
+def test_the_scatter_of_front_edges_in_noise_matches_their_deviation(share):
     """In a third of the noise it allows for: so what the fit leaves is less, and does not count."""
     rng, noise_std, count = np.random.default_rng(5), 0.3, 4000
     found = [edge((BEGIN - share, M, 12.0), noise_std=noise_std, rng=rng) for _ in range(count)]
@@ -243,7 +243,7 @@ def test_a_front_edge_strays_in_noise_as_much_as_it_says(share):
         ([(BEGIN, 1, 3.0), (BEGIN + 1, 1, -3.0)], 18.0),
     ],
 )
-def test_what_a_fit_leaves_makes_an_edge_less_sure(rough, left):
+def test_residuals_of_the_fit_enlarge_an_edges_deviation(rough, left):
     """It is what the block before it, its own and the two behind it have beside a call."""
     lag, std = edge((BEGIN - 0.5, M, 50.0), *rough)
     assert lag == pytest.approx(BEGIN - 0.5, abs=1e-9)
@@ -258,13 +258,13 @@ def test_an_edge_is_found_from_a_call_and_two_lags_later():
 
 
 @pytest.mark.parametrize("odd", [(BEGIN - 1, 1, -1.2), (BEGIN, 1, 1.0)])
-def test_an_edge_is_nowhere_but_in_the_block_that_it_is_fitted_to(odd):
+def test_an_edge_is_limited_to_its_fitted_block(odd):
     """A block against the call's phase, or louder than the call, is no more or less of a call."""
     lag, _ = edge(odd, (BEGIN, M, 5.0))
     assert lag == pytest.approx(BEGIN, abs=1e-9)
 
 
-def test_what_was_heard_two_calls_before_is_no_part_of_an_edge():
+def test_a_sound_two_calls_earlier_does_not_move_an_edge():
     burst = BEGIN - M - 3, 1, 5.0
     assert edge(burst, (BEGIN, M, 5.0), b=BEGIN + M)[0] == pytest.approx(BEGIN, abs=1e-9)
 
@@ -277,13 +277,13 @@ def test_an_edge_with_sound_before_it_that_did_not_last_is_none():
     assert np.isnan(edge()).all()
 
 
-def test_a_block_before_an_edge_may_be_one_that_the_call_fills_in_part():
+def test_the_block_before_an_edge_may_be_partly_filled():
     lag, _ = edge((BEGIN - 1, 1, 1.8), (BEGIN, M, 6.2))
     assert lag == pytest.approx(BEGIN - 1.8 / 6.2, abs=1e-9)
     assert np.isnan(edge((BEGIN - 2, 1, 1.8), (BEGIN, M, 6.2))[0])
 
 
-def test_sound_stands_out_of_noise_from_three_times_its_energy_on():
+def test_sound_counts_from_three_times_the_noise_energy():
     for energy, stands_out in ((2.9, False), (3.1, True)):
         _, std = edge((BEGIN - 5, 1, np.sqrt(energy)), (BEGIN, M, 5.0))
         assert np.isinf(std) == stands_out
@@ -291,7 +291,7 @@ def test_sound_stands_out_of_noise_from_three_times_its_energy_on():
 
 
 @pytest.mark.parametrize("stride", [1, 3])
-def test_an_edge_of_less_than_three_tenths_of_what_comes_after_is_none(stride):
+def test_an_edge_below_three_tenths_of_the_following_sound_is_none(stride):
     for share, is_edge in ((0.28, False), (0.32, True)):
         before, lasts = (BEGIN - 6 * stride, 6 * stride, 50.0 * share), stride * M
         lag, std = edge(before, (BEGIN, lasts, 50.0), pulse=lasts, b=BEGIN)
@@ -347,13 +347,13 @@ def test_a_call_that_rises_too_little_has_the_time_of_the_wholes_best_fit():
     assert std[TONE] == 7.0 * INTERVAL
 
 
-def test_a_call_that_another_all_but_extinguished_is_none():
+def test_a_call_nearly_cancelled_by_another_is_not_found():
     found, when = calls_of((TONE, BEGIN, 9.0, 7.0), sounds=[(BEGIN - 5, 1, 1.8), (BEGIN, M, 5.0)])
     assert found[TONE] == -1
     assert np.isnan(when).all()
 
 
-def test_no_edge_is_sought_of_what_may_have_begun_before_the_record():
+def test_no_edge_is_sought_too_near_the_start_of_the_record():
     """A call and what two lags about the fit may hide: M + 2 lags must come before it."""
     for lag, sought in ((M + 2.4, False), (M + 2.6, True)):
         _, (delay, _) = calls_of((TONE, lag, 9.0, 7.0), sounds=[(M, M, 5.0)])
@@ -361,7 +361,7 @@ def test_no_edge_is_sought_of_what_may_have_begun_before_the_record():
         assert delay[TONE] == pytest.approx(START + INTERVAL * expected, abs=1e-12)
 
 
-def test_only_what_is_two_hundredfold_louder_within_a_callmay_leak():
+def test_only_a_tone_200_times_louder_within_a_call_may_leak():
     """A louder call of another tone at another time changes nothing, 10 ms away say."""
     for apart in (-100.0, -M - 0.5, -M + 0.5, 0.0, M - 0.5, M + 0.5, 100.0):
         for times in (190.0, 210.0):
@@ -420,7 +420,7 @@ def of_those_that_have_one(off, std):
     return off[told], std[told]
 
 
-def test_in_the_papers_worlds_the_direct_call_is_hardly_ever_another():
+def test_direct_calls_in_the_papers_worlds_are_hardly_ever_confused():
     direct, strongest, _ = in_worlds()
     known = np.isfinite(direct)
     assert known.mean() > 0.93
@@ -429,7 +429,7 @@ def test_in_the_papers_worlds_the_direct_call_is_hardly_ever_another():
     assert np.mean(np.abs(strongest) > 0.15) > 0.03, "the strongest alone is not enough"
 
 
-def test_in_the_papers_worlds_excess_paths_are_as_good_as_they_say():
+def test_errors_of_excess_paths_in_the_papers_worlds_match_their_deviations():
     off, std = of_those_that_have_one(*in_worlds()[2])
     assert off.size > 15000
     assert np.median(np.abs(off)) < 0.015
@@ -443,7 +443,7 @@ def test_in_the_papers_worlds_excess_paths_are_as_good_as_they_say():
     ("radius", "delay_gate", "least_share", "most_rms"),
     [(0.0088, 0.25, 0.9, 0.06), (0.0025, 0.25, 0.85, 0.06), (0.0088, 1.0, 0.9, 0.13)],
 )
-def test_in_many_of_the_papers_worlds_excess_paths_are_as_good(
+def test_excess_paths_are_as_good_in_many_of_the_papers_worlds(
     radius, delay_gate, least_share, most_rms
 ):
     """An oracle that takes what is off by a whole call for an echo lets wrong excess paths in."""
@@ -482,7 +482,7 @@ def test_the_dense_engine_times_as_the_block_engine_does():
     assert np.median(np.abs(apart)) < 0.03
 
 
-def test_with_timing_off_scans_are_to_the_bit_those_of_old():
+def test_scans_without_timing_are_unchanged_to_the_bit():
     from pipistrelle.experiments.runs.heard_world import scans_of
 
     config = Config.model_validate({"scenario": {"steps": 40}})

@@ -105,7 +105,7 @@ def is_near(off, snr_db):
 # The bounds
 
 
-def test_the_cramer_rao_bound_is_that_of_the_slopes_of_the_call():
+def test_the_cramer_rao_bound_follows_from_the_slopes_of_the_call():
     power, step = 300.0, 1e-6
     for q in (0.1, 0.5, 0.8):
         before, there, after = call_at(q - step), call_at(q), call_at(q + step)
@@ -130,7 +130,7 @@ def test_the_least_mean_square_is_the_cramer_rao_bound_of_loud_calls_and_more_of
     assert shares[0] > shares[1] > shares[2] > shares[3]
 
 
-def test_of_a_call_that_is_not_heard_the_least_mean_square_is_that_of_any_delay():
+def test_the_least_mean_square_of_an_inaudible_call_is_uniform():
     assert least_mean_square(1e-9, PULSE) == pytest.approx(8.0**2 / 12.0, rel=0.01)
 
 

@@ -73,7 +73,7 @@ def found_in(matched, layout, config=CONFIG):
 
 @pytest.mark.parametrize("layout", [CIRCLE, WIDE, LINE], ids=["circle", "wide", "line"])
 @pytest.mark.parametrize("shift", [1.0, 1.0045])
-def test_block_sums_are_those_of_every_sample_at_every_microphone(layout, shift):
+def test_block_sums_match_every_sample_at_every_microphone(layout, shift):
     sound = one(6.3217e-3, 0.7, 30.0, shift=shift)
     sums = np.zeros((40, 1, 2, layout.shape[1]), dtype=complex)
     add_echo_blocks(sums, sound, layout, SETTLED)
@@ -92,7 +92,7 @@ def test_each_microphone_hears_a_wave_when_it_passes():
     assert abs(apart - late) <= BLOCK
 
 
-def test_gain_is_heard_and_a_face_is_deaf_behind():
+def test_gains_scale_the_output_and_faces_receive_nothing_from_behind():
     loud = replace(CIRCLE, amplitude=np.full(8, 2.0))
     plain, doubled = (matched_of(one(8e-3, 0.4, 20.0), of) for of in (CIRCLE, loud))
     assert np.allclose(doubled, 2.0 * plain)
@@ -116,14 +116,14 @@ def exceeded(layout, chance, key, tests):
 
 
 @pytest.mark.parametrize("layout", [CIRCLE, LINE], ids=["circle", "line"])
-def test_noise_alone_is_as_loud_as_the_threshold_no_more_often_than_is_asked(layout):
+def test_pure_noise_exceeds_the_threshold_at_most_as_often_as_asked(layout):
     tests, chance = 20_000, 1e-2
     count = exceeded(layout, chance, 0, tests)
     assert count <= binom.ppf(1.0 - 1e-6, tests, chance)
     assert count >= binom.ppf(1e-6, tests, 0.3 * chance)
 
 
-def test_the_looks_of_a_pair_are_its_phase_turned_round():
+def test_the_looks_of_a_pair_are_its_phase_range():
     pair, equal = np.array([[0.0, 0.01], [0.0, -0.01]]), np.full(2, 0.5**0.5)
     around = np.linspace(-np.pi, np.pi, 10_000, endpoint=False)
     looks = 2.0 * np.pi * np.sqrt(spread_towards(around, pair, equal)).mean()
@@ -155,7 +155,7 @@ def test_a_wide_array_hears_a_call_that_reaches_its_microphones_at_unlike_times(
     assert abs(found.delay[0] - 7e-3) < 5.0 * found.delay_std[0]
 
 
-def test_the_dense_engine_says_the_same_as_the_blocks():
+def test_the_dense_engine_agrees_with_the_blocks():
     sound = one(6.81e-3, -1.1, 25.0)
     end = front_end(CONFIG, CIRCLE, SETTLED.tones)
     samples = record_samples(60, sound, CIRCLE, SETTLED, None)
@@ -181,14 +181,14 @@ def trials(layout, snr_db, count, seed=0):
     return np.array(rows).T
 
 
-def test_the_bound_of_a_line_is_that_of_its_kind():
+def test_the_bound_of_a_free_line_matches_the_bound_of_a_face():
     power, wave = 9 * 100.0, 2.0 * np.pi * 35e3 / C
     kappa = wave**2 * spread_towards(np.array([0.3]), LINE.position, np.full(9, 1 / 3))[0]
     known = bearing_bound(100.0, 0.3, elements=9, spacing=0.0049, wavelength=C / 35e3)
     assert 1.0 / math.sqrt(2.0 * power * kappa) == pytest.approx(known)
 
 
-def test_errors_are_as_large_as_the_rows_say():
+def test_errors_match_the_rows_deviations():
     bearing, _, bearing_std, _ = trials(CIRCLE, 20.0, 100)
     assert len(bearing) >= 98
     low, high = chi2.ppf([1e-4, 1.0 - 1e-4], len(bearing))
@@ -198,7 +198,7 @@ def test_errors_are_as_large_as_the_rows_say():
 @pytest.mark.slow
 @pytest.mark.parametrize("snr_db", [12.0, 16.0, 20.0, 30.0])
 @pytest.mark.parametrize("layout", [CIRCLE, WIDE], ids=["circle", "wide"])
-def test_errors_are_as_large_as_the_rows_say_at_every_level(layout, snr_db):
+def test_errors_match_the_rows_deviations_at_every_level(layout, snr_db):
     bearing, delay, bearing_std, delay_std = trials(layout, snr_db, 1500, seed=4)
     low, high = chi2.ppf([1e-4, 1.0 - 1e-4], len(bearing)) / len(bearing)
     assert 0.98 * low < np.mean((bearing / bearing_std) ** 2) < 1.1 * high
@@ -209,13 +209,13 @@ def test_errors_are_as_large_as_the_rows_say_at_every_level(layout, snr_db):
 # What an array cannot tell
 
 
-def test_a_line_that_hangs_free_does_not_know_front_from_back_and_says_so():
+def test_a_free_lines_deviation_covers_its_front_back_ambiguity():
     found = found_in(matched_of(one(7e-3, 0.5, 25.0), LINE, key=1), LINE)
     mirrored = np.pi - 2.0 * 0.5
     assert found.bearing_std[0] == pytest.approx(mirrored / math.sqrt(2.0), rel=0.02)
 
 
-def test_microphones_a_wave_apart_do_not_know_which_lobe_and_say_so():
+def test_microphones_spaced_by_a_wavelength_have_deviations_covering_other_lobes():
     corners = np.array([(0.0, 0.0), (0.0, 1.0), (1.0, 0.0), (1.0, 1.0)]) * C / 35e3
     unsure, sure = (
         found_in(matched_of(one(7e-3, 0.0, 25.0), of, key=1), of)
@@ -227,7 +227,7 @@ def test_microphones_a_wave_apart_do_not_know_which_lobe_and_say_so():
 # Groups
 
 
-def test_lines_on_faces_keep_the_fast_scan_and_say_what_a_layout_of_them_says():
+def test_lines_on_faces_give_the_detections_of_their_layout():
     normal, along = np.array([0.0, 2.0]), (np.arange(10) - 4.5) * 0.0049
     rows = [
         (-a * np.sin(n), a * np.cos(n), 0.0, 0.0, f"face{i}")
@@ -250,7 +250,7 @@ def test_lines_on_faces_keep_the_fast_scan_and_say_what_a_layout_of_them_says():
     assert got.bearing_std == pytest.approx(want.bearing_std[order], rel=0.05)
 
 
-def test_a_line_away_from_the_vehicles_centre_tells_the_delay_at_the_centre():
+def test_an_off_centre_line_gives_delays_at_the_vehicles_centre():
     rows = [(0.4, (i - 4.5) * 0.0049, 0.0, 0.0, "bow") for i in range(10)]
     bow = scattered(microphones_of([*rows, (-0.4, 0.0, 0.0, 0.0, ""), (-0.4, 0.02, 0.0, 0.0, "")]))
     found = found_in(matched_of(one(7e-3, 0.5, 30.0), bow, key=2), bow)
@@ -271,18 +271,18 @@ def test_a_face_looks_away_from_the_middle_whatever_the_order_of_its_channels():
 @pytest.mark.parametrize(
     ("setting", "value"), [("snapshots", "runs"), ("overlaps", "resolve")], ids=str
 )
-def test_what_only_lines_can_is_refused(setting, value):
+def test_settings_only_for_lines_are_refused(setting, value):
     config = Config(detection=DetectionConfig(**{setting: value}))
     with pytest.raises(InputError, match=f"detection.{setting}: found '{value}'"):
         front_end(config, CIRCLE, SETTLED.tones)
 
 
-def test_microphones_hundreds_of_waves_apart_are_refused_as_millimetres():
+def test_microphones_spaced_by_hundreds_of_wavelengths_are_refused_as_millimetres():
     with pytest.raises(InputError, match=r"5 m, 510 waves, from the next.*millimetres"):
         front_end(CONFIG, free([(0.0, 0.0), (5.0, 0.0)]), SETTLED.tones)
 
 
-def test_one_microphone_alone_hears_no_direction_and_is_refused():
+def test_a_single_microphone_is_refused_for_lack_of_direction():
     face = [(0.0, 0.005 * i, 0.0, 0.0, "bow") for i in range(3)]
     for name, words in {"": "that hangs free", "stern": "on face stern"}.items():
         with pytest.raises(InputError, match=f"one microphone {words}"):

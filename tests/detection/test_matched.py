@@ -46,7 +46,7 @@ def test_record_of_a_single_call_has_one_lag_and_a_shorter_one_none():
     assert filter_blocks(drawn(13, 4, 2, 10), **settled).shape[0] == 0
 
 
-def test_what_is_given_to_write_on_is_returned():
+def test_the_output_array_is_filled_and_returned():
     out = np.empty((7, 4, 2, 3), dtype=complex)
     blocks = drawn(20, 4, 2, 3)
     settled = {"pulse": 14, "block": 40, "noise_std": 1.0}

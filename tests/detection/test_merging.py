@@ -113,7 +113,7 @@ def test_the_order_of_the_detections_does_not_matter(seed, averaging):
 
 @given(seed=SEEDS, averaging=AVERAGING)
 @law
-def test_a_mean_is_as_sure_as_its_parts_and_their_weights_make_it(seed, averaging):
+def test_the_deviation_of_a_mean_follows_from_parts_and_weights(seed, averaging):
     rng = np.random.default_rng(seed)
     found, label = crowd(rng)
     found = sure(rng, found)
@@ -142,7 +142,7 @@ def test_a_plain_mean_of_n_has_the_root_of_the_summed_variances_over_n():
     np.testing.assert_allclose(heard.rows.range_std, expected, rtol=1e-12)
 
 
-def test_a_mean_of_which_one_part_says_nothing_says_nothing():
+def test_a_mean_with_an_unknown_deviation_has_none():
     found = detections((0, 0, 44, 0.02, 9), (1, 0, -46, 0.02, 8), (0, 0, 10, 0.03, 9))
     found = replace(found, bearing_std=np.array([0.03, NAN, 0.02]), delay_std=np.full(3, 1e-6))
     heard = heard_of(found, [5, 5, 6])
@@ -161,7 +161,7 @@ def test_directions_either_side_of_straight_back_average_straight_back():
 
 @given(seed=SEEDS, averaging=AVERAGING)
 @law
-def test_averaged_bearings_lie_from_minus_pi_to_below_pi(seed, averaging):
+def test_averaged_bearings_are_wrapped(seed, averaging):
     found, label = crowd(np.random.default_rng(seed))
     bearing = heard_of(found, label, averaging).rows.bearing
     assert np.all((bearing >= -np.pi) & (bearing < np.pi))
@@ -175,7 +175,7 @@ def test_unlabelled_detections_are_counted_and_change_nothing_else():
     assert heard.rows.bearing[0] == pytest.approx(np.radians(40.0), abs=1e-12)
 
 
-def test_silence_is_heard_as_nothing():
+def test_no_detections_give_empty_scans():
     nothing = np.zeros(0)
     found = Detections(
         face=nothing.astype(int), caller=nothing.astype(int), angle=nothing, bearing=nothing,
@@ -187,7 +187,7 @@ def test_silence_is_heard_as_nothing():
         assert scan_of(heard.rows, strategy).landmark.size == 0
 
 
-def test_weights_make_two_faces_as_good_as_one_looked_straight_at_whatever_the_direction():
+def test_weighting_makes_two_faces_as_precise_as_a_broadside_face():
     # A face's error goes with 1 / cos, the next one's with 1 / sin; their weighted mean's is 1.
     rng, count, error = np.random.default_rng(7), 4000, 1e-3
     for off in (16.0, 30.0, 45.0):
@@ -230,14 +230,14 @@ def heard_rows(*rows):
 BOTH = heard_rows((1, 0.1, NAN, 3.0), (2, NAN, 0.2, NAN), (7, 3.1, -3.1, 9.0), (9, -0.4, 0.2, 5.0))
 
 
-def test_active_takes_the_vehicles_tone_alone():
+def test_active_takes_only_the_vehicles_tone():
     scan = scan_of(BOTH.rows, "active")
     assert (scan.time, scan.landmark.tolist()) == (2.0, [1, 7, 9])
     assert scan.bearing.tolist() == [0.1, 3.1, -0.4]
     assert scan.range.tolist() == [3.0, 9.0, 5.0]
 
 
-def test_passive_takes_the_beacons_tone_alone_and_never_a_range():
+def test_passive_takes_only_the_beacons_tone_without_ranges():
     scan = scan_of(BOTH.rows, "passive")
     assert scan.landmark.tolist() == [2, 7, 9]
     assert scan.bearing.tolist() == [0.2, -3.1, 0.2]
@@ -253,7 +253,7 @@ def test_fused_takes_both_and_the_mean_direction_where_both_are_there():
 
 @given(seed=SEEDS, averaging=AVERAGING)
 @law
-def test_fused_sees_what_active_or_passive_see_and_measures_what_they_measure(seed, averaging):
+def test_fused_is_the_union_of_active_and_passive(seed, averaging):
     found, label = crowd(np.random.default_rng(seed), labels=14)
     heard = heard_of(found, label, averaging)
     active, fused, passive = (scan_of(heard.rows, s) for s in ("active", "fused", "passive"))
@@ -288,7 +288,7 @@ def test_detections_that_could_be_of_one_echo_are():
     assert same_echo(found, delay_gate=5e-5, bearing_gate=0.1).tolist() == [0, 2, 1]
 
 
-def test_without_labels_rows_are_what_they_were_and_nobodys():
+def test_hiding_labels_leaves_all_other_columns_unchanged():
     found, label = crowd(np.random.default_rng(3))
     heard = heard_of(found, label)
     hidden = without_labels(heard.rows, np.array([UNLABELLED, 4]))
@@ -299,7 +299,7 @@ def test_without_labels_rows_are_what_they_were_and_nobodys():
     assert fused.landmark.size == hidden.landmark.size, "nothing is merged without a label"
 
 
-def test_rows_of_one_landmark_fuse_by_inverse_variances_where_all_are_told_and_plainly_else():
+def test_rows_of_a_landmark_fuse_by_inverse_variance_if_all_are_known():
     rows = scan_with(
         [4, 4, 4], [3.1, -3.1, -3.0], [5.0, NAN, NAN], caller=np.arange(3),
         bearing_std=np.array([0.01, 0.02, 0.04]), range_std=0.3,
@@ -329,7 +329,7 @@ def test_three_callers_of_one_landmark_are_averaged_as_directions():
 
 @given(seed=SEEDS)
 @law
-def test_two_callers_fuse_to_the_bit_as_half_the_turn_from_one_to_the_other(seed):
+def test_bearings_of_two_callers_fuse_to_their_midpoint_to_the_bit(seed):
     own, other = np.random.default_rng(seed).uniform(-np.pi, np.pi, (2, 9))
     both = heard_rows(*zip(range(9), own, other, np.ones(9), strict=True))
     halfway = wrap(own + 0.5 * wrap(other - own))

@@ -20,7 +20,7 @@ from reference.missions import scan_with
 NAN = np.nan
 
 
-def test_rows_that_say_nothing_get_the_constant_and_those_that_do_keep_what_they_say():
+def test_constant_noise_fills_only_missing_deviations():
     scan = scan_with(
         [3, 8, 9], [0.1, 0.2, 0.3], [2.0, NAN, 4.0],
         bearing_std=np.array([NAN, 0.02, NAN]), range_std=np.array([0.5, NAN, NAN]),
@@ -49,7 +49,7 @@ def test_the_noise_of_the_settings_is_theirs(stds):
     assert hash(noise) == hash(noise_of(FilterConfig(**told)))
 
 
-def test_what_the_signal_says_is_hidden_and_what_an_association_states_is_not():
+def test_constant_noise_hides_measured_but_keeps_stated_deviations():
     heard = scan_with([3, 8], [0.1, 0.2], [2.0, NAN], bearing_std=0.02, range_std=0.1)
     stated = with_columns(heard, range=np.array([2.0, 9.0]), range_std=np.array([0.1, 1.8]))
     noise = ConstantNoise(range_std=0.2, bearing_std=0.15, excess_path_std=0.3, instead=True)
@@ -60,7 +60,7 @@ def test_what_the_signal_says_is_hidden_and_what_an_association_states_is_not():
     assert replace(noise, instead=False).hidden(heard, stated) is stated
 
 
-def test_an_excess_path_is_told_to_be_off_by_the_way_of_what_a_range_is():
+def test_the_excess_path_std_is_twice_the_range_std():
     noise = noise_of(FilterConfig())
     assert noise.excess_path_std == 2.0 * noise.range_std
 
@@ -80,7 +80,7 @@ HEARD = average_faces(
 ROWS = HEARD.rows
 
 
-def test_rows_are_as_sure_as_the_signal_tells_and_no_surer_than_the_floor_of_their_caller():
+def test_deviations_combine_the_signals_with_the_callers_floor():
     own, other = BEARING_FLOOR
     expected = np.hypot(TOLD[0], [own, other, other, own])
     np.testing.assert_allclose(ROWS.bearing_std, expected, rtol=1e-12)
@@ -98,7 +98,7 @@ def heard_with(**columns):
 
 
 @pytest.mark.parametrize("strategy", ["active", "fused", "passive"])
-def test_with_constant_noise_scans_are_to_the_bit_those_of_a_detector_that_tells_nothing(strategy):
+def test_constant_noise_ignores_the_detectors_deviations_to_the_bit(strategy):
     sure = scans_of([HEARD], strategy, settled("constant"))
     unsure = heard_with(bearing_std=NAN, range_std=NAN, excess_path_std=NAN)
     for one, other in zip(sure, scans_of(unsure, strategy, settled("constant")), strict=True):
@@ -107,7 +107,7 @@ def test_with_constant_noise_scans_are_to_the_bit_those_of_a_detector_that_tells
         assert set(one.bearing_std.tolist()) == {0.15}
 
 
-def test_with_measured_noise_a_scan_is_as_sure_as_its_rows_and_constants_fill_what_is_left():
+def test_measured_noise_merges_deviations_and_fills_gaps_with_constants():
     unsure = np.array([False, False, False, True])
     heard = heard_with(
         bearing_std=np.where(unsure, NAN, ROWS.bearing_std),
@@ -133,7 +133,7 @@ def test_measured_noise_merges_rows_by_their_inverse_variances_and_constant_nois
 
 @pytest.mark.parametrize("timing", [False, True])
 @pytest.mark.parametrize("noise", ["constant", "measured"])
-def test_an_estimator_is_told_what_the_settings_let_it_know_and_all_else_as_it_was(noise, timing):
+def test_settings_hide_only_their_columns_from_an_estimator(noise, timing):
     rows = replace(
         with_columns(
             ROWS, bearing_slope=0.5, excess_path=np.array([NAN, 4.0, NAN, NAN]), excess_path_std=0.1

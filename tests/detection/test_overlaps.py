@@ -97,13 +97,13 @@ def check_pairs(apart, snr_db, count):
 
 
 @pytest.mark.parametrize(("apart", "snr_db"), PAIRS)
-def test_two_sources_are_told_apart_without_bias_and_near_the_cramer_rao_bound(apart, snr_db):
+def test_two_sources_are_resolved_unbiased_and_near_the_cramer_rao_bound(apart, snr_db):
     check_pairs(apart, snr_db, FEW)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("apart", "snr_db"), [*PAIRS, (0.3, 30.0), (2.0, 10.0), (0.6, 40.0)])
-def test_many_pairs_are_told_apart_without_bias_and_near_the_cramer_rao_bound(apart, snr_db):
+def test_many_pairs_are_resolved_unbiased_and_near_the_cramer_rao_bound(apart, snr_db):
     check_pairs(apart, snr_db, MANY)
 
 
@@ -118,7 +118,7 @@ def split_share(snr_db, count, threshold=None):
 
 
 @pytest.mark.parametrize("snr_db", [6.0, 20.0, 60.0])
-def test_one_source_is_parted_no_oftener_than_is_stated(snr_db):
+def test_a_single_source_is_split_at_most_at_the_stated_rate(snr_db):
     few = 3000
     assert split_share(snr_db, few) * few <= binom.isf(1e-6, few, SPLIT)
     assert split_share(snr_db, few, 0.6 * most_left(N)) * few > binom.isf(1e-6, few, SPLIT)
@@ -126,7 +126,7 @@ def test_one_source_is_parted_no_oftener_than_is_stated(snr_db):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("snr_db", [3.0, 6.0, 13.0, 20.0, 40.0, 60.0])
-def test_of_many_single_sources_a_thousandth_at_most_is_parted(snr_db):
+def test_many_single_sources_are_split_at_most_at_the_stated_rate(snr_db):
     many = 10 * MANY
     assert split_share(snr_db, many) * many <= binom.isf(1e-6, many, SPLIT)
 
@@ -151,7 +151,7 @@ def test_no_other_pair_of_directions_leaves_less_of_a_snapshot(seed):
 
 
 @pytest.mark.parametrize("place", [None, np.array([0, 1, 2, 4, 5, 7, 8, 9, 11, 13.0])])
-def test_without_noise_three_directions_are_exact_wherever_the_elements_stand(place):
+def test_three_directions_without_noise_are_exact_for_any_element_positions(place):
     rng, u = np.random.default_rng(2), np.array([-1.0, 0.1, 0.9])
     x, _ = snapshot(rng, u, 60.0, noise=0.0, place=place)
     found, _, left = told(x, EVEN if place is None else place)
@@ -172,20 +172,20 @@ def test_a_mirrored_array_gives_mirrored_directions(seed):
 
 
 @pytest.mark.parametrize("power", [12.0, 100.0, 1e5])
-def test_a_single_source_is_as_sure_as_one_beam(power):
+def test_a_single_source_has_the_deviation_of_one_beam(power):
     x = (np.sqrt(power / N) * waves(np.array([0.4])))[:, 0]
     _, (std,), _ = told(x)
     assert std == pytest.approx(bearing_std(power - 1.0, 1.0, N * N - 1.0), rel=1e-6)
 
 
-def test_two_sources_that_noise_does_not_tell_apart_stay_one():
+def test_two_sources_inseparable_in_noise_stay_one():
     rng = np.random.default_rng(3)
     counts = [told(snapshot(rng, np.array([0.3, 0.35]), 10.0)[0])[0].size for _ in range(200)]
     assert np.mean(np.array(counts) == 1) > 0.95
 
 
 @pytest.mark.parametrize(("elements", "most"), [(2, 1), (4, 2), (5, 3), (10, 3), (40, 3)])
-def test_a_few_elements_tell_few_sources_apart(elements, most):
+def test_few_elements_resolve_few_sources(elements, most):
     limits = most_left(elements)
     assert limits.size == most
     assert np.isfinite(limits).all()
@@ -231,13 +231,13 @@ def test_two_echoes_that_overlap_are_two_rows_each_with_its_bearing_and_its_dela
     assert len(merged) < 2 or off.max() > 0.6, "one scan does not"
 
 
-def test_the_order_in_which_echoes_are_added_does_not_matter():
+def test_the_order_of_adding_echoes_does_not_matter():
     some, other = heard(PAIR), heard(PAIR[::-1])
     for name in ROWS:
         np.testing.assert_allclose(getattr(some, name), getattr(other, name), rtol=1e-6)
 
 
-def test_faces_whose_elements_are_mirrored_hear_mirrored_angles():
+def test_mirrored_elements_give_mirrored_angles():
     rows, mirrored = front(heard(PAIR)), front(heard(PAIR, mirror=True))
     np.testing.assert_allclose(mirrored * [-1, 1], rows[::-1], atol=1e-3)
 
@@ -254,7 +254,7 @@ def test_echoes_at_the_ends_of_the_record_are_heard(delay):
     np.testing.assert_allclose(rows[:, 0], [-8.0, 8.0], atol=1.0)
 
 
-def test_unless_asked_for_nothing_is_resolved():
+def test_overlaps_are_not_resolved_by_default():
     assert MERGING.most_left.size == 0
     assert FINDER.most_left.size == MOST
 
@@ -278,7 +278,7 @@ def world_rows(overlaps):
     return causes.size, np.count_nonzero(causes != UNLABELLED), np.concatenate(stds)
 
 
-def test_in_a_world_most_false_rows_go_and_more_are_right():
+def test_resolving_overlaps_removes_most_false_rows_of_a_world():
     (rows, right, _), (merged, merged_right, _) = world_rows("resolve"), world_rows("merge")
     assert rows - right < 0.4 * (merged - merged_right)
     assert right > merged_right

@@ -19,7 +19,7 @@ def test_bearings_and_delays_of_a_far_source_meet_their_bounds(tmp_path):
     assert rms(delay) < 1.1 * most
 
 
-def test_of_channels_in_another_order_nothing_is_where_it_is(tmp_path):
+def test_swapped_channels_give_wrong_positions(tmp_path):
     order = [1, 0, 2, 3, 4, 5, 6, 7]
     swapped, *_ = errors(tmp_path / "tape", "circle", 20.0, 12, 1, order=order)
     assert rms(swapped) > 3.0

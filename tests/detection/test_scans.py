@@ -33,7 +33,7 @@ def test_a_column_that_no_scan_has_and_columns_of_several_lengths_are_refused():
     assert make_scan(0.5, [3, 4], [0, 1]).bearing.dtype == np.float64
 
 
-def test_what_is_not_said_of_a_scan_says_nothing():
+def test_unset_columns_of_a_scan_are_nan():
     scan = make_scan(0.5, np.array([3, 4]), np.array([0.1, 0.2]), range=2.0)
     assert scan.range.tolist() == [2.0, 2.0]
     assert scan.caller.tolist() == [OWN, OWN]
@@ -41,7 +41,7 @@ def test_what_is_not_said_of_a_scan_says_nothing():
         assert np.isnan(getattr(scan, name)).all(), name
 
 
-def test_columns_are_replaced_in_a_copy_and_checked_as_those_of_a_new_scan():
+def test_columns_are_replaced_and_checked_in_a_copy():
     scan = make_scan(0.5, np.array([3, 4]), np.array([0.1, 0.2]), range=2.0)
     other = with_columns(scan, bearing=-scan.bearing, caller=1)
     assert (other.bearing.tolist(), other.caller.tolist()) == ([-0.1, -0.2], [1, 1])
@@ -57,7 +57,7 @@ def test_columns_are_replaced_in_a_copy_and_checked_as_those_of_a_new_scan():
         with_columns(scan, ranges=1.0)
 
 
-def test_how_the_numbers_lie_in_memory_makes_no_difference():
+def test_the_memory_order_of_the_numbers_makes_no_difference():
     scan = make_scan(0.5, np.array([3, 4, 3]), np.array([0.1, 0.2, 0.3]), bearing_std=0.1)
     other = replace(scan, numbers=np.asfortranarray(scan.numbers))
     noise = ConstantNoise(range_std=0.2, bearing_std=0.15, excess_path_std=0.3)

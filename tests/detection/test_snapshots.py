@@ -174,7 +174,7 @@ def assert_same(found, rows, interval):
         {"snapshots": "runs", "peak_db": 0.0, "false_alarm": 1e-2},
     ],
 )
-def test_detections_are_those_of_a_slow_second_version(frame, changes):
+def test_detections_match_a_slow_second_version(frame, changes):
     config = Config(detection=DetectionConfig(**changes))
     heard, blocks, key = mission_frame(frame=frame)
     matched = matched_of(heard, blocks, key)
@@ -185,7 +185,7 @@ def test_detections_are_those_of_a_slow_second_version(frame, changes):
 
 
 @pytest.mark.parametrize("pulse", [1, 2, 3])
-def test_detections_of_very_short_calls_are_those_of_a_slow_second_version(pulse):
+def test_detections_of_very_short_calls_match_a_slow_second_version(pulse):
     noise = complex_noise((400, 4, 2, 10), 1.0, stream_key(7, pulse, "short calls"))
     config = Config(detection=DetectionConfig(false_alarm=0.02, leakage_db=-60.0))
     timing = {"start": START, "interval": BLOCK, "pulse": pulse}
@@ -194,7 +194,7 @@ def test_detections_of_very_short_calls_are_those_of_a_slow_second_version(pulse
     assert_same(found, slow_detect(noise, config, **timing), BLOCK)
 
 
-def test_detections_at_the_full_rate_are_those_of_a_slow_second_version():
+def test_detections_at_the_full_rate_match_a_slow_second_version():
     heard = echoes((5.01e-3, 20, OWN, 9, 1.0), (6.8e-3, -30, BEACON, 6, 1.0))
     samples = record_samples(44, heard, LAYOUT, SETTLED, np.random.default_rng(7))
     matched = filter_samples(samples, calls=SETTLED.calls, rate=200e3, noise_std=1)
@@ -221,7 +221,7 @@ def test_the_threshold_is_the_quantile_of_ten_outputs_energy_in_noise():
         assert gamma(10).sf(finder_of(false_alarm=alarm).threshold) == pytest.approx(alarm)
 
 
-def test_noise_alone_passes_one_test_as_often_as_asked():
+def test_pure_noise_passes_each_test_as_often_as_asked():
     # Many faces and a single lag: every face and tone is one independent test.
     faces, batches, alarm = 2000, 50, 1e-3
     wide = Layout(normal=np.zeros(faces), position=LAYOUT.position)
@@ -238,7 +238,7 @@ def test_noise_alone_passes_one_test_as_often_as_asked():
     assert 0.97 * passed <= shown <= passed  # few snapshots of noise have all peaks past the cut
 
 
-def test_noise_alone_is_detected_in_hardly_any_frame():
+def test_pure_noise_is_detected_in_hardly_any_frame():
     # Each lag, face and tone is a test; a passed one shows a handful of peaks.
     frames, blocks = 200, 700
     tests = frames * (blocks - SETTLED.pulse + 1) * 8
@@ -295,7 +295,7 @@ def test_a_turn_by_a_quarter_moves_an_echo_to_the_next_face():
         assert set(found.face) == {face, (face + 1) % 4}  # the next one hears it at -67 degrees
 
 
-def test_two_echoes_of_one_direction_half_a_call_apart_are_two_snapshots_and_nearer_ones_one():
+def test_echoes_separated_by_half_a_call_are_two_snapshots():
     for gap, count in ((8, 2), (6, 1)):  # blocks; half a call is 7
         second = 4e-3 + gap * BLOCK + 0.25 / 35e3  # in quadrature: the energies add
         heard = echoes((4e-3, 0, OWN, 20, 1.0), (second, 0, OWN, 20, 1.0))
@@ -350,24 +350,24 @@ def calls_alone(tone, snr_db, leakage_db, count=60):
 
 @pytest.mark.parametrize("tone", [OWN, BEACON])
 @pytest.mark.parametrize("snr_db", LOUD)
-def test_a_strong_call_alone_makes_no_detection_in_the_other_tone(tone, snr_db):
+def test_a_single_strong_call_makes_no_detection_in_the_other_tone(tone, snr_db):
     assert calls_alone(tone, snr_db, -28.0) == 0
 
 
 @pytest.mark.parametrize("tone", [OWN, BEACON])
-def test_without_the_guard_it_would_make_one_at_each_edge(tone):
+def test_a_strong_call_without_the_guard_leaks_at_each_edge(tone):
     assert calls_alone(tone, 60.0, -60.0) > 60 * 2  # two faces hear it
 
 
 @pytest.mark.slow
-def test_a_call_whose_guard_stands_at_the_threshold_leaks_enough_to_lift_noise_over_it():
+def test_leakage_lifts_noise_over_the_threshold_only_where_the_guard_begins():
     # 43 dB of energy less 28 is the threshold, and less 33, its leak, the noise's own 10 dB.
     seen = {snr: calls_alone(BEACON, snr, -28.0, 3000) / 3000 for snr in (25.0, 33.0, 37.0, 45.0)}
     assert 0.05 < seen[33.0] < 0.2
     assert max(seen[25.0], seen[37.0], seen[45.0]) < 0.005
 
 
-def test_a_weak_echo_beside_a_loud_call_of_the_other_tone_is_given_up():
+def test_a_weak_echo_near_a_loud_call_of_another_tone_is_discarded():
     for snr_db, heard in ((25.0, True), (15.0, False)):  # 45 dB under the call less 28: 17
         both = echoes((6e-3, 10, BEACON, 45, 1.0), (7e-3, -20, OWN, snr_db, 1.0))
         found = found_in(matched_of(both))
@@ -423,13 +423,13 @@ def found_of_trio(leakage_db, *rows):
 
 
 @pytest.mark.parametrize("caller", [0, 1, 2])
-def test_of_three_tones_a_strong_call_makes_detections_in_its_own_alone(caller):
+def test_a_strong_call_of_three_tones_is_detected_only_in_its_tone(caller):
     call = (6.03e-3, 20, caller, 50.0)
     assert set(found_of_trio(-28.0, call).caller.tolist()) == {caller}
     assert set(found_of_trio(-60.0, call).caller.tolist()) == {0, 1, 2}
 
 
-def test_of_three_tones_the_strongest_of_the_others_is_the_one_guarded_against():
+def test_the_guard_is_against_the_strongest_of_three_tones():
     for loud in (1, 2):
         for snr_db, heard in ((25.0, True), (15.0, False)):  # 45 dB under the call less 28: 17
             rows = [(7e-3, -20, 0, snr_db), (6e-3, 10, loud, 45.0), (6e-3, 10, 3 - loud, 20.0)]
@@ -437,7 +437,7 @@ def test_of_three_tones_the_strongest_of_the_others_is_the_one_guarded_against()
             assert np.any((found.caller == 0) & (found.face == 0)) == heard
 
 
-def test_a_call_is_found_in_its_own_tone_alone_whichever_of_three_it_is():
+def test_each_of_three_calls_is_found_only_in_its_tone():
     rows = [(6e-3, 20, 0, 20.0), (6.1e-3, -30, 1, 20.0), (6.2e-3, 0, 2, 20.0)]
     found = found_of_trio(-28.0, *rows)
     front = found.face == 0
@@ -471,7 +471,7 @@ def test_two_echoes_of_one_run_from_two_directions_each_keep_their_time_of_arriv
     assert np.degrees(strongest.bearing[strongest.face == 0]) == pytest.approx([-10.0], abs=0.5)
 
 
-def test_what_leaks_into_a_run_is_left_out_and_the_echo_that_it_touches_is_kept():
+def test_leakage_into_a_run_is_excluded_and_the_adjacent_echo_kept():
     rows = [(0.02, 20.0, BEACON, 52.0, 1.0), (0.0245, -30.0, OWN, 30.0, 1.0)]
     matched = matched_of(echoes(*rows), blocks=160)
     energy = np.sum(np.abs(matched) ** 2, axis=3)[:, 0, OWN]

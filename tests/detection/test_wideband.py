@@ -121,7 +121,7 @@ def test_of_lobes_that_are_nearly_as_loud_the_same_is_taken_whenever_the_call_co
 
 
 @pytest.mark.parametrize("rate", [150e3, 192e3, 384e3, 1e6])
-def test_any_rate_that_holds_the_band_finds_it(rate):
+def test_a_sweep_is_found_at_any_sufficient_sample_rate(rate):
     _, settled, _ = setting(rate=rate)
     found = found_in(sound(5.12345e-3, 0.4, 30.0, settled), "face", rate=rate)
     assert found.delay.size == 1
@@ -206,7 +206,7 @@ def test_bearings_and_delays_meet_their_bounds_whatever_the_sweep(layout, name, 
         assert 0.85 < share < 1.25
 
 
-def test_a_row_states_what_the_doppler_shift_of_its_own_motion_may_do():
+def test_the_delay_deviation_covers_the_doppler_shift_of_own_motion():
     _, settled, _ = setting()
     arrival = sound(5e-3, 0.0, 50.0, settled, shift=1.0 + 2.0 * 0.75 / 343.0)
     still, moving = (found_in(arrival, "face", speed=speed) for speed in (0.0, 0.75))
@@ -232,7 +232,7 @@ def exceeded(layout, chance, name="linear", tests=12_000, threshold=None):
 
 @pytest.mark.parametrize("layout", SMALL)
 @pytest.mark.parametrize("name", ["linear", "wide", "tapered"])
-def test_noise_alone_passes_no_more_often_than_is_asked(layout, name):
+def test_pure_noise_passes_at_most_as_often_as_asked(layout, name):
     tests, chance = 12_000, 1e-2
     count = exceeded(layout, chance, name)
     assert count <= binom.ppf(1.0 - CHANCE, tests, chance)
@@ -243,7 +243,7 @@ def test_noise_alone_passes_no_more_often_than_is_asked(layout, name):
     )
 
 
-def test_noise_of_two_lags_is_as_alike_as_the_calls_autocorrelation():
+def test_noise_correlates_between_lags_as_the_calls_autocorrelation():
     _, settled, filters = setting()
     rng, count = np.random.default_rng(5), 400_000
     nothing = sound([], [], [], settled)
@@ -257,7 +257,7 @@ def test_noise_of_two_lags_is_as_alike_as_the_calls_autocorrelation():
 
 
 @pytest.mark.parametrize("name", ["linear", "tapered"])
-def test_two_echoes_a_few_lags_apart_are_two_and_lobes_are_none(name):
+def test_two_echoes_separated_by_a_few_lags_are_two_detections(name):
     _, settled, _ = setting(name)
     apart = 1.5e-4
     pair = sound([4.0e-3, 4.0e-3 + apart], [0.3, 0.3], [30.0, 29.0], settled)
@@ -291,7 +291,7 @@ def test_a_tone_and_a_sweep_are_heard_side_by_side_and_leave_little_in_each_othe
     assert own.sum() <= 1, "what leaks is none"
 
 
-def test_cross_talk_is_what_one_filter_answers_of_anothers_call():
+def test_cross_talk_is_the_output_of_a_filter_for_another_call():
     up, down, tone = Sweep(30e3, 60e3, 2.8e-3), Sweep(60e3, 30e3, 2.8e-3), ToneBurst(45e3, 2.8e-3)
     share = cross_talk([up, down, tone], 200e3)
     np.testing.assert_allclose(np.diag(share), 1.0)

@@ -18,7 +18,7 @@ from reference.missions import scan_of, scan_with
 NAN, RNG = np.nan, np.random.default_rng
 
 
-def test_labels_that_came_with_a_scan_are_taken_as_they_are_and_cost_no_copy():
+def test_labels_of_a_scan_are_taken_without_a_copy():
     scan = scan_of((3, 5.0, 0.3), (8, NAN, 1.0))
     assert labelled(scan, scan.landmark) is scan
 
@@ -39,7 +39,7 @@ def test_rows_of_one_label_become_one_whatever_their_order():
         assert one.range[at] == 4.0
 
 
-def test_rows_without_a_bearing_stand_at_the_end_whatever_their_order():
+def test_rows_without_a_bearing_come_last_in_any_order():
     rows = [(4, 0.3, 3.0, 1), (4, NAN, 3.0, 2), (5, 0.9, 2.0, 1)]
     for order in permutations(rows):
         label, bearing, excess_path, caller = map(np.array, zip(*order, strict=True))
@@ -56,7 +56,7 @@ def test_the_mean_of_directions_is_taken_across_the_cut_behind():
     assert bearing == pytest.approx(-np.pi + 0.1, abs=1e-12)
 
 
-def test_rows_that_say_how_sure_they_are_merge_as_independent_estimates_do():
+def test_rows_with_deviations_merge_by_inverse_variance():
     rng, stds = np.random.default_rng(5), np.array([0.01, 0.03, 0.02])
     drawn = rng.normal(0.0, stds, (4000, 3))
     scans = [make_scan(0.0, np.full(3, 4), row, bearing_std=stds) for row in drawn]
@@ -67,7 +67,7 @@ def test_rows_that_say_how_sure_they_are_merge_as_independent_estimates_do():
     assert np.std(error) == pytest.approx(claimed, rel=4.9 / np.sqrt(2 * error.size))
 
 
-def test_one_row_that_says_nothing_of_its_noise_makes_the_mean_plain_and_unsaid():
+def test_a_row_without_deviation_makes_the_merged_mean_plain():
     scan = make_scan(0.0, np.full(2, 4), np.array([0.1, 0.3]), bearing_std=np.array([0.01, NAN]))
     merged = labelled(scan, scan.landmark)
     assert merged.bearing[0] == pytest.approx(0.2, abs=1e-12)
@@ -77,7 +77,7 @@ def test_one_row_that_says_nothing_of_its_noise_makes_the_mean_plain_and_unsaid(
 @pytest.mark.parametrize(
     "label", [[1], [1, 2, 3, 4], [1.0, 2.0, 3.0], [1, NAN, 2], [1, 2, -2], [[1], [2], [3]], "abc"]
 )
-def test_what_cannot_be_labels_is_refused_before_a_kernel_sees_it(label):
+def test_invalid_labels_are_refused(label):
     scan = scan_of((UNLABELLED, 5.0, 0.3), (UNLABELLED, NAN, 1.0), (UNLABELLED, NAN, 2.0))
     with pytest.raises(
         InputError, match=r"association at 0\.0 s: found labels .* expected 3 whole"
@@ -86,7 +86,7 @@ def test_what_cannot_be_labels_is_refused_before_a_kernel_sees_it(label):
     assert labelled(scan, [4, UNLABELLED, 4]).landmark.tolist() == [4]
 
 
-def test_ranges_come_with_their_own_noise_from_the_first_row_that_has_them_and_excess_paths_stay():
+def test_the_first_range_is_kept_and_excess_paths_are_not_merged():
     scan = make_scan(
         0.0, np.full(4, 4), np.full(4, 0.1), bearing_std=0.01, caller=np.array([3, 0, 1, 2]),
         range=np.array([NAN, 5.0, 9.0, NAN]), range_std=np.array([0.9, 0.2, 0.3, 0.4]),
@@ -116,7 +116,7 @@ def test_the_level_of_merged_rows_is_the_highest_that_is_known():
         assert labelled(scan, scan.landmark).level_db.tolist() == [20.0]
 
 
-def test_a_scan_of_nothing_stays_one():
+def test_an_empty_or_unlabelled_scan_gives_an_empty_scan():
     empty = scan_of()
     assert labelled(empty, empty.landmark).landmark.size == 0
     nobody = scan_of((UNLABELLED, 2.0, 0.1))
@@ -149,7 +149,7 @@ def measured(pose, point):
 
 
 @pytest.mark.parametrize("error", [LINEAR, INVARIANT])
-def test_what_is_expected_has_the_slopes_of_the_measurements_themselves(error):
+def test_expected_measurements_have_the_covariance_of_finite_differences(error):
     """Each number is linear in the joint mean, and S its covariance, by finite differences."""
     _, belief = mapped(error)
     joint = belief.joint()
@@ -181,7 +181,7 @@ def test_what_is_expected_has_the_slopes_of_the_measurements_themselves(error):
 
 
 @pytest.mark.parametrize("error", [LINEAR, INVARIANT])
-def test_the_joint_gaussian_has_the_pose_and_the_map_of_the_belief(error):
+def test_the_joint_gaussian_contains_the_pose_and_map_of_the_belief(error):
     _, belief = mapped(error)
     joint, pose, points = belief.joint(), belief.pose(), belief.landmarks()
     assert joint.landmark.tolist() == points.landmark.tolist()
@@ -214,7 +214,7 @@ def test_landmarks_that_are_one_meet_as_the_kalman_filter_has_it_and_others_are_
     assert np.linalg.eigvalsh(after.covariance)[0] > 0.0
 
 
-def test_a_merge_says_nothing_of_the_heading_to_the_invariant_error():
+def test_a_merge_does_not_inform_the_invariant_filters_heading():
     _, belief = mapped(INVARIANT)
     far = replace(belief, covariance=belief.covariance + np.diag([0, 0, 1.0] + [0.0] * 8))
     after = far.edited((), ((2, 4),))
@@ -222,7 +222,7 @@ def test_a_merge_says_nothing_of_the_heading_to_the_invariant_error():
 
 
 @pytest.mark.parametrize("error", [LINEAR, INVARIANT])
-def test_landmarks_that_cannot_both_be_right_tell_nothing_of_the_rest_when_they_are_one(error):
+def test_merging_incompatible_landmarks_changes_no_other_estimate(error):
     _, belief = mapped(error)
     merged, removed = belief.edited((), ((2, 7),)).joint(), belief.edited((7,), ()).joint()
     assert merged.landmark.tolist() == removed.landmark.tolist() == [2, 4, 9]
@@ -278,7 +278,7 @@ def assignment(**changes):
     return Assignment(label=np.empty(0, np.int64), **changes)
 
 
-def test_a_landmark_that_nobody_holds_is_not_expected():
+def test_an_unmapped_landmark_is_refused_by_expected():
     _, belief = mapped(LINEAR)
     with pytest.raises(InputError, match=r"expected: found the landmarks \[5\]"):
         expected(belief.joint(), scan_of((3, 5.0, 0.3)), np.array([0]), np.array([5]))

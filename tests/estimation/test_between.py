@@ -45,7 +45,7 @@ def test_an_excess_path_that_may_be_none_places_nothing(slam, excess_path):
 
 
 @pytest.mark.parametrize("slam", ESTIMATORS, ids=lambda slam: type(slam).__name__)
-def test_what_is_placed_about_the_line_is_where_it_is_thought_to_be(slam):
+def test_landmarks_placed_near_the_callers_line_are_consistent(slam):
     rng, most = np.random.default_rng(3), 120
     places = np.column_stack([rng.uniform(2, 8, most), rng.uniform(0.5, 3.0, most)])
     places[::3, 1] *= 0.1

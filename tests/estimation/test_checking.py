@@ -154,7 +154,7 @@ def test_a_first_pose_that_is_none_is_refused(build, mean, covariance, said):
         build(BICYCLE).init(Gaussian(mean=mean, covariance=covariance))
 
 
-def test_objects_of_another_kind_are_refused_in_words(build):
+def test_objects_of_a_wrong_type_are_refused(build):
     slam = build(BICYCLE)
     belief, rng = slam.init(START), np.random.default_rng(7)
     with pytest.raises(InputError, match=r"init: found .* expected a Gaussian of a pose"):
@@ -174,7 +174,7 @@ def test_a_gate_that_is_no_share_is_refused_when_a_filter_is_made(build, gate):
         replace(build(BICYCLE), gate=gate)
 
 
-def test_lists_and_other_arrays_are_taken_as_they_are_meant(build):
+def test_lists_and_other_array_types_are_accepted(build):
     slam = build(BICYCLE)
     started = slam.init(START)
     controls, dt = np.array([[0.75, 0.25], [0.5, 0.0]]), np.array([0.25, 0.5])
@@ -194,7 +194,7 @@ def test_lists_and_other_arrays_are_taken_as_they_are_meant(build):
             np.testing.assert_array_equal(one, two)
 
 
-def test_clutter_is_left_out_and_what_several_calls_say_of_a_landmark_is_merged(build):
+def test_clutter_is_ignored_and_rows_of_a_landmark_are_merged(build):
     slam = build(BICYCLE)
     started = slam.init(START)
     both = make_scan(
@@ -210,7 +210,7 @@ def test_clutter_is_left_out_and_what_several_calls_say_of_a_landmark_is_merged(
         np.testing.assert_allclose(one, two, rtol=1e-9, atol=1e-12)
 
 
-def test_what_a_filter_was_handed_may_change_afterwards(build):
+def test_a_filter_copies_its_inputs(build):
     slam, start = build(BICYCLE), Gaussian(mean=np.zeros(3), covariance=np.eye(3) * 1e-4)
     belief = slam.init(start)
     before = answers(belief)
@@ -219,7 +219,7 @@ def test_what_a_filter_was_handed_may_change_afterwards(build):
         np.testing.assert_array_equal(now, then)
 
 
-def test_fastslam_asks_for_the_generator_by_which_it_draws():
+def test_fastslam_requires_a_generator():
     slam = entry("fastslam").build(Config(), BICYCLE)
     with pytest.raises(InputError, match="found no generator"):
         slam.update(slam.init(START), replace(SCAN), None)

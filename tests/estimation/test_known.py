@@ -29,7 +29,7 @@ def informed(kind, posts=POSTS):
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_what_is_known_is_in_the_map_as_surely_and_the_pose_is_as_it_was(kind):
+def test_a_known_map_enters_the_map_and_leaves_the_pose(kind):
     _, belief = informed(kind)
     rows, pose = belief.landmarks(), belief.pose()
     assert rows.landmark.tolist() == [7, 9]
@@ -40,7 +40,7 @@ def test_what_is_known_is_in_the_map_as_surely_and_the_pose_is_as_it_was(kind):
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_what_is_heard_of_it_tells_the_pose_even_which_way_is_north(kind):
+def test_measurements_of_a_known_map_correct_pose_and_heading(kind):
     slam, belief = informed(kind)
     distance, bearing = range_and_bearing(START.mean, POSTS.mean)
     heard = scan_with([7, 9], bearing, distance, range_std=0.1, bearing_std=0.05)
@@ -61,7 +61,7 @@ def test_what_is_heard_of_it_tells_the_pose_even_which_way_is_north(kind):
 FASTSLAM = FastSlam(motion=BICYCLE, rays=ray_config(), settings=FastSlamConfig(particles=500))
 
 
-def test_fastslam_has_what_is_known_in_every_particle_as_surely():
+def test_fastslam_holds_a_known_map_in_every_particle():
     belief = FASTSLAM.knowing(FASTSLAM.init(START), POSTS)
     rows = belief.landmarks()
     assert isinstance(FASTSLAM, AcceptsMap)
@@ -73,7 +73,7 @@ def test_fastslam_has_what_is_known_in_every_particle_as_surely():
     np.testing.assert_allclose(belief.pose().covariance, START.covariance, rtol=0, atol=1e-9)
 
 
-def test_fastslam_learns_from_it_what_the_linear_update_does():
+def test_fastslam_updates_from_a_known_map_like_the_ekf():
     rng, belief = np.random.default_rng(7), FASTSLAM.knowing(FASTSLAM.init(START), POSTS)
     distance, bearing = range_and_bearing(START.mean, POSTS.mean)
     heard = scan_with([7, 9], bearing, distance, range_std=0.1, bearing_std=0.05)
@@ -86,7 +86,7 @@ def test_fastslam_learns_from_it_what_the_linear_update_does():
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_who_moves_is_not_known_beforehand(kind):
+def test_a_moving_caller_in_the_known_map_is_refused(kind):
     slam = kind(motion=BICYCLE, rays=ray_config())
     scan = make_scan(1.0, np.array([9]), np.array([0.2]), bearing_std=0.1)
     drive = Drive(

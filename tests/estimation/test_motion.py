@@ -86,7 +86,7 @@ def test_a_speed_is_measured_within_the_car(offset, fits):
 
 
 @given(steps, poses, durations)
-def test_step_and_jacobians_equal_those_of_the_slow_reference(step, pose, dt):
+def test_step_and_jacobians_match_the_slow_reference(step, pose, dt):
     motion, control = step
     after, F, U = moved(motion, pose, control, dt)
     change = motion_step(motion, pose, control, dt) - after
@@ -97,7 +97,7 @@ def test_step_and_jacobians_equal_those_of_the_slow_reference(step, pose, dt):
     np.testing.assert_allclose(fast_U, U, atol=1e-12)
 
 
-def test_bicycle_step_is_that_of_equation_5():
+def test_bicycle_step_follows_equation_5():
     pose, (V, gamma), dt = np.array([1.0, 2.0, 0.5]), (0.75, 0.027), 0.125
     x = 1.0 + V * dt * np.cos(0.527)
     y = 2.0 + V * dt * np.sin(0.527)
@@ -154,7 +154,7 @@ def test_the_motion_since_a_pose_is_forward_then_to_the_left_and_its_length_of_t
 
 
 @given(poses, controls, durations, st.sampled_from([BICYCLE, UNICYCLE, CAR]))
-def test_controls_told_as_motions_lead_to_the_same_pose(pose, control, dt, motion):
+def test_controls_as_relative_motions_lead_to_the_same_pose(pose, control, dt, motion):
     (way,) = as_motions(motion, [control], [dt])
     change = motion_step(by_poses(motion), pose, way, dt) - motion_step(motion, pose, control, dt)
     np.testing.assert_allclose([*change[:2], wrap(change[2])], 0, atol=1e-14 * 20)
@@ -162,7 +162,7 @@ def test_controls_told_as_motions_lead_to_the_same_pose(pose, control, dt, motio
 
 @pytest.mark.parametrize("motion", [BICYCLE, UNICYCLE, POSES])
 @pytest.mark.parametrize("noise_at_rest", [True, False])
-def test_noise_is_that_of_the_model_and_none_at_rest_where_that_is_exact(motion, noise_at_rest):
+def test_noise_is_the_models_and_zero_at_rest_if_exact(motion, noise_at_rest):
     motion = replace(motion, noise_at_rest=noise_at_rest)
     still = np.zeros(len(motion.control_std))
     moving = [still + unit for unit in np.eye(still.size)]
@@ -173,7 +173,7 @@ def test_noise_is_that_of_the_model_and_none_at_rest_where_that_is_exact(motion,
         np.testing.assert_array_equal(noise_of(motion, control), expected)
 
 
-def test_a_motion_that_says_its_covariance_has_it_and_one_that_does_not_the_models():
+def test_a_stated_covariance_replaces_the_models():
     told = np.array([0.1, 0.0, 0.2, 4.0, 0.5, -0.3, 2.0, 0.1, 1.0])
     expected = [[4.0, 0.5, -0.3], [0.5, 2.0, 0.1], [-0.3, 0.1, 1.0]]
     np.testing.assert_array_equal(motion_noise(POSES, told), expected)
@@ -189,7 +189,7 @@ def test_a_stated_covariance_counts_at_rest_unless_rest_is_exact():
 
 @pytest.mark.parametrize("stated", [True, False])
 @pytest.mark.parametrize("motion", [BICYCLE, UNICYCLE, POSES])
-def test_a_pose_is_carried_with_its_covariance_as_the_jacobians_say(motion, stated):
+def test_a_pose_and_covariance_are_propagated_by_the_jacobians(motion, stated):
     rng = np.random.default_rng(2)
     drive = wandering(rng, 50, stated=stated)
     drive = drive if motion is POSES else drive[:, :2]
@@ -222,7 +222,7 @@ def test_measurement_jacobians_are_the_finite_differences_of_the_measurement(
     np.testing.assert_allclose(H_m, by_point, atol=TOLERANCE)
 
 
-def test_measurement_jacobians_are_finite_at_a_landmark_that_the_vehicle_stands_on():
+def test_measurement_jacobians_are_finite_at_zero_distance():
     for offset in (0.0, NEAREST / 10):
         H_x, H_m = measurement_jacobians(np.zeros(3), np.array([offset, 0.0]))
         assert np.isfinite(H_x).all()

@@ -51,12 +51,12 @@ def test_ray_reaches_from_the_nearest_to_the_farthest_range_with_no_member_to_sp
 
 
 @given(configs)
-def test_ray_is_that_of_the_slow_reference(rays):
+def test_ray_members_match_the_slow_reference(rays):
     np.testing.assert_allclose(ray_members(rays)[0], ray_ranges(rays), rtol=1e-12)
 
 
 @given(st.floats(1e-6, 0.2), st.floats(1, 1e9))
-def test_however_sharp_the_shares_of_what_is_known_so_far_are_shares(least, power):
+def test_shares_sum_to_1_at_any_sharpness(least, power):
     weights, share = shared(
         [0.0, 0.0, 0.0], [least, (1 - least) / 3, 2 * (1 - least) / 3], power, True
     )
@@ -120,7 +120,7 @@ def test_aggregated_shares_under_a_twentieth_are_skipped_and_not_handed_on():
     np.testing.assert_allclose(share, [0, 0.36, 0.6], rtol=1e-14)
 
 
-def test_power_sharpens_shares_and_leaves_weights_alone():
+def test_power_sharpens_shares_and_keeps_weights():
     log_likelihood = np.log([0.4, 0.6])
     weights, share = shared(log_likelihood, [0.5, 0.5], power=3.0)
     np.testing.assert_allclose(weights, [0.4, 0.6], rtol=1e-14)

@@ -88,7 +88,7 @@ def test_posts_that_were_moved_do_not_move_the_vehicle(kind):
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_a_drive_as_it_is_assumed_is_never_doubted_for_long(kind):
+def test_a_drive_that_matches_the_model_is_never_doubted_for_long(kind):
     bound = odometry_bound(0.999)
     for seed in range(3):
         _, scans = driven(100, seed)
@@ -96,7 +96,7 @@ def test_a_drive_as_it_is_assumed_is_never_doubted_for_long(kind):
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_what_any_pose_would_fit_is_no_evidence(kind):
+def test_a_single_wrong_row_does_not_raise_doubt(kind):
     slam = slam_of(kind)
     (_, belief) = followed(slam, driven(30)[1])[-1]
     before, _ = slam.predict(belief, np.tile(CONTROL, (STEPS, 1)), np.full(STEPS, STEP))
@@ -112,7 +112,7 @@ def test_what_any_pose_would_fit_is_no_evidence(kind):
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_a_wrong_row_after_a_push_is_rejected_beside_the_odometry(kind):
+def test_a_wrong_row_after_a_push_is_gated_with_the_odometry(kind):
     poses, scans = driven(40, push={30: np.array([0.0, 0.0, 0.5])})
     wrong = np.arange(scans[30].landmark.size) < 1
     scans[30] = with_columns(scans[30], range=scans[30].range + 2.0 * wrong)
@@ -161,7 +161,7 @@ def test_the_fitted_pose_is_the_true_one_though_half_of_the_rows_are_wrong(kind)
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_a_part_of_the_joint_gaussian_is_that_of_some_landmarks(kind):
+def test_the_joint_gaussian_of_some_landmarks_is_a_marginal(kind):
     (_, belief) = followed(slam_of(kind), driven(30)[1])[-1]
     whole, labels = belief.joint(), belief.joint().landmark[::2]
     part = belief.joint(labels)

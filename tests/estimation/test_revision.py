@@ -66,7 +66,7 @@ def driven(name, script, scans=10, ghosts=()):
 
 @pytest.mark.parametrize("name", ["ekf", "iekf", "smoother"])
 @pytest.mark.parametrize("ghosts", [(2,), (2, 3, 4)])
-def test_a_landmark_that_was_none_leaves_no_trace(name, ghosts):
+def test_a_removed_ghost_landmark_leaves_no_trace(name, ghosts):
     labels = {k: [1, 2, 3, GHOST] for k in ghosts}
     haunted = driven(name, Script(labels, remove={GONE_AT: (GHOST,)}), ghosts=ghosts)
     plain = driven(name, Script({}))
@@ -103,7 +103,7 @@ def test_two_labels_of_one_landmark_become_one(name):
 
 
 @pytest.mark.parametrize("name", CATALOGUE)
-def test_the_joint_gaussian_has_the_pose_and_the_map_of_the_belief(name):
+def test_the_joint_gaussian_contains_the_pose_and_map_of_the_belief(name):
     session = driven(name, Script({}))
     joint, pose = session.belief.joint(), session.belief.pose()
     assert sorted(joint.landmark.tolist()) == [1, 2, 3]
@@ -116,7 +116,7 @@ def test_the_joint_gaussian_has_the_pose_and_the_map_of_the_belief(name):
 
 
 @pytest.mark.parametrize("name", ["ekf", "iekf", "smoother"])
-def test_a_scan_that_is_stated_otherwise_later_is_heard_as_if_it_had_been_so_at_once(name):
+def test_a_scan_revised_later_equals_a_scan_revised_at_once(name):
     heard = driven(name, Script({})).state().past[1].came
     stated = replace(
         heard, landmark=np.array([7, 2, UNLABELLED]), numbers=heard.numbers + np.zeros((8, 1))
@@ -152,7 +152,7 @@ class Informed(Script):
 
 
 @pytest.mark.parametrize("name", ["ekf", "iekf", "smoother"])
-def test_all_that_is_remembered_is_associated_again_by_what_has_become_known(name):
+def test_remembered_scans_are_associated_again_with_new_information(name):
     session = driven(name, Informed({}))
     assert all(label.tolist() == [1, 5, 3] for label in session.labels)
     assert len(session.labels) == 10
@@ -178,7 +178,7 @@ class Renamed(Informed):
         return (number + 1, name), Assignment(label=np.array(ghost), remove=remove, again=again)
 
 
-def test_a_label_that_was_taken_back_may_be_given_again():
+def test_a_removed_label_may_be_assigned_again():
     session = driven("iekf", Renamed({}), ghosts=())
     assert sorted(session.belief.labels()) == [1, 3, GHOST]
     haunted = driven("iekf", Renamed({}), scans=6, ghosts=(2,))

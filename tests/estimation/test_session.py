@@ -43,7 +43,7 @@ def test_a_session_begins_with_the_map_that_is_known():
     assert session.belief.landmarks().mean.tolist() == [[3.0, 4.0]]
 
 
-def test_what_no_filter_can_use_leaves_the_session_as_it_was():
+def test_unusable_inputs_leave_the_session_unchanged():
     session = Session(entry("iekf").build(Config(), MOTION), START, np.random.default_rng(7))
     before = session.belief
     bad = make_scan(0.5, np.array([4]), np.array([np.inf]), bearing_std=0.1)

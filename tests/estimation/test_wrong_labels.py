@@ -37,7 +37,7 @@ def farthest(name, robust, share, seed):
 
 
 @pytest.mark.parametrize("name", ["iekf", "smoother"])
-def test_one_wrong_label_in_twenty_costs_a_tenth_by_hubers_loss_of_what_it_costs_without(name):
+def test_hubers_loss_limits_the_error_from_wrong_labels(name):
     """Of four drives the median is 0.7 m by the invariant EKF, 1.2 m by the smoother; 12 m."""
     robust, trusting = (
         np.median([farthest(name, loss, 0.05, seed) for seed in range(3, 7)])

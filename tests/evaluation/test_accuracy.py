@@ -100,7 +100,7 @@ def test_heading_errors_forget_whole_turns(difference, turns):
     assert error[0, 2] == pytest.approx(difference, abs=1e-13)
 
 
-def test_pose_error_leaves_its_arguments_alone():
+def test_pose_error_does_not_change_its_arguments():
     path, true = np.full((2, 3), 3.0), np.full((2, 3), -3.0)
     pose_error(path, true)
     assert (path == 3.0).all()
@@ -118,7 +118,7 @@ def test_a_partial_landmark_is_its_heaviest_hypothesis_and_the_first_of_equals()
     assert estimate.covariance[:, 0, 0].tolist() == [1.0, 4.0]
 
 
-def test_landmarks_keep_the_order_in_which_they_entered_the_map():
+def test_landmarks_keep_their_order_in_the_map():
     estimate = heaviest(hypotheses([30, 7, 30, 12, 7], [0.1, 0.2, 0.9, 1.0, 0.8]))
     assert estimate.landmark.tolist() == [30, 7, 12]
     assert estimate.mean[:, 0].tolist() == [2.0, 4.0, 3.0]

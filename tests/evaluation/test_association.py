@@ -71,7 +71,7 @@ LABELS = [np.array([1, 2, 3]), np.array([1, 2, UNLABELLED]), np.array([1, 4, 5])
 CAUSES = [np.array([7, 9, UNLABELLED]), np.array([7, 7, 8]), np.array([7, 9, 8])]
 
 
-def test_a_label_stands_for_what_caused_most_of_its_rows():
+def test_a_label_is_the_landmark_that_caused_most_of_its_rows():
     found = associated(LABELS, CAUSES)
     assert found.names == {1: 7, 2: 9, 3: UNLABELLED, 4: 9, 5: 8}
     assert found.rows == {1: 3, 2: 2, 3: 1, 4: 1, 5: 1}
@@ -85,7 +85,7 @@ def test_missed_false_and_doubled_landmarks_are_counted():
     assert (counts.missed, counts.false, counts.twice) == (2, 1, 1)
 
 
-def test_of_labels_that_stand_for_one_landmark_that_with_most_rows_has_its_name():
+def test_the_label_with_most_rows_gets_the_landmarks_name():
     named = renamed(map_of([4, 2, 3, 1]), associated(LABELS, CAUSES))
     assert named.landmark[1] == 9
     assert named.landmark[3] == 7
@@ -93,13 +93,13 @@ def test_of_labels_that_stand_for_one_landmark_that_with_most_rows_has_its_name(
     assert len({*named.landmark.tolist()}) == 4
 
 
-def test_what_caused_a_row_is_found_again_after_rows_were_left_out():
+def test_causes_are_found_again_after_rows_were_removed():
     frame = make_scan(0.0, np.full(3, -1), np.array([0.1, 0.1, 0.4]), caller=np.array([0, 1, 1]))
     taken = rows_of(frame, np.array([2, 1]))
     assert causes_of(taken, frame, np.array([7, 8, 9])).tolist() == [9, 8]
 
 
-def test_nothing_associated_is_no_score():
+def test_an_empty_association_has_no_score():
     found = associated([np.empty(0, np.int64)], [np.empty(0, np.int64)])
     assert found.right is None
     assert found.names == {}
@@ -108,7 +108,7 @@ def test_nothing_associated_is_no_score():
 TRUE = np.array([7, 8, 9]), np.array([[0.0, 0.0], [10.0, 0.0], [0.0, 10.0]])
 
 
-def test_landmark_near_no_true_one_is_false_whatever_caused_its_rows():
+def test_a_landmark_far_from_all_true_landmarks_is_false():
     places = np.array([[0.1, 0.0], [6.0, 0.0], [50.0, 50.0]])
     landmarks = map_with([1, 2, 3], places, np.tile(np.eye(2), (3, 1, 1)))
     rows = [np.array([1, 2, 3])] * 3

@@ -102,7 +102,7 @@ def test_a_heading_once_lost_is_never_known_again(strategy):
     assert np.all(heading[first:] >= heading[first] * (1.0 - 1e-3))
 
 
-def test_a_drive_told_by_poses_has_the_same_bound():
+def test_odometry_as_poses_has_the_same_bound():
     truly = np.array([true_control(k) for k in range(1, STEPS + 1)])
     scans, told = heard("fused"), as_poses(replace(DRIVE, controls=truly))
     same = pose_bound(told.motion, told.controls, told.time, WORLD.path, PLACES, scans)
@@ -110,7 +110,7 @@ def test_a_drive_told_by_poses_has_the_same_bound():
     assert same[-1].any()
 
 
-def test_the_bound_hangs_on_no_measurement_but_on_who_was_heard_how_surely():
+def test_the_bound_depends_on_labels_and_noise_and_not_on_values():
     scans = heard("fused")
     wrong = [
         scan_with(
@@ -132,7 +132,7 @@ def test_twice_the_noise_raises_the_bound_and_more_to_hear_lowers_it():
     assert area(heard("fused")) < area(heard("passive")) < area([])
 
 
-def test_of_a_path_it_is_the_root_of_the_mean_over_the_steps_and_the_start_is_none():
+def test_the_bound_of_a_path_is_the_rms_over_its_steps():
     bound = bound_of(heard("fused"))
     position, heading = path_bound(bound)
     squared = bound[1:, 0, 0] + bound[1:, 1, 1]
@@ -141,7 +141,7 @@ def test_of_a_path_it_is_the_root_of_the_mean_over_the_steps_and_the_start_is_no
     assert path_bound(bound[:1]) == (0.0, 0.0)
 
 
-def test_rows_of_unknown_labels_and_frames_without_rows_tell_nothing():
+def test_rows_of_unknown_labels_and_empty_frames_do_not_count():
     scans = heard("active")
     stranger = scan_with([999], [0.1], [3.0], time=0.25)
     with_more = sorted([*scans, stranger, scan_with(time=0.375)], key=lambda scan: scan.time)
@@ -174,7 +174,7 @@ def test_an_exact_start_leaves_a_consistent_filter_under_three():
     assert nees.mean() == pytest.approx(3.0, abs=0.1)  # the control: a start drawn from P_0
 
 
-def test_the_wronged_start_turns_and_shifts_the_whole_path():
+def test_a_wrong_start_turns_and_shifts_the_whole_path():
     """G is the derivative of every later pose by the first: the filter can never tell it."""
     path = WORLD.path
     for axis in range(3):
@@ -289,13 +289,13 @@ def bound_with_boat(route, wander, excess_path_std=0.05):
     )  # fmt: skip
 
 
-def test_one_that_never_strays_and_has_no_speed_is_bounded_as_one_that_stands():
+def test_a_caller_without_speed_has_the_bound_of_a_fixed_caller():
     stands = np.tile(PLACES[1][PLACES[0] == 12], (STEPS + 1, 1))
     still = bound_of(with_boat(heard("fused"), stands))
     np.testing.assert_allclose(bound_with_boat(stands, (1e-9, 0.0)), still, rtol=0, atol=1e-9)
 
 
-def test_the_more_a_caller_strays_the_less_its_calls_tell():
+def test_the_bound_grows_with_the_walk_of_a_caller():
     route = np.column_stack([np.linspace(3.0, 9.0, STEPS + 1), np.full(STEPS + 1, 4.0)])
     bounds = [path_bound(bound_with_boat(route, (1.0, walk)))[0] for walk in (0.0, 0.3, 3.0, 1e4)]
     assert bounds == sorted(bounds)
@@ -322,7 +322,7 @@ def test_a_heading_that_is_lost_is_not_known_again_by_how_a_caller_strays(odd_st
         assert heading.min() / heading[0] == pytest.approx(1.0, abs=1e-6)
 
 
-def test_a_caller_that_is_first_heard_late_is_bounded_by_what_was_heard():
+def test_a_caller_measured_late_is_bounded_by_its_measurements():
     """Until then its place and velocity hang together, and turn with the heading."""
     rng = np.random.default_rng(6)
     walk = np.cumsum(rng.normal(0.0, 1.0, (STEPS + 1, 2)), axis=0) * STEP + [3.0, 4.0]

@@ -58,7 +58,7 @@ def test_a_difference_of_two_samples_has_the_interval_of_welch(seed, n, m):
     assert finding.n == min(n, m)
 
 
-def test_two_samples_without_spread_or_numbers_decide_nothing():
+def test_two_samples_without_spread_or_numbers_are_undecided():
     some, none, one = np.array([1.0, 2.0, 4.0]), np.empty(0), np.array([3.0])
     for sample, against in ((some, none), (none, some), (some, one), (one, one), (some * 0, some)):
         (finding,) = judge([Statement(label="", sample=sample, against=against)])
@@ -67,7 +67,7 @@ def test_two_samples_without_spread_or_numbers_decide_nothing():
         assert finding.n == min(len(sample), len(against))
 
 
-def test_pairs_and_two_samples_form_a_family():
+def test_pairs_and_two_samples_share_a_family():
     rng = np.random.default_rng(4)
     a, b, c = (rng.normal(level, 1.0, 30) for level in (0.0, 0.7, 0.6))
     family = [Statement(label="p", sample=b - a), Statement(label="u", sample=c, against=a)]
@@ -76,12 +76,12 @@ def test_pairs_and_two_samples_form_a_family():
     assert together == pytest.approx(holm(np.array(alone)), rel=1e-9)
 
 
-def test_holms_adjustment_agrees_with_a_hand_worked_family():
+def test_holms_adjustment_matches_a_calculation_by_hand():
     assert holm(np.array([0.01, 0.04, 0.03, 0.005])) == pytest.approx([0.03, 0.06, 0.06, 0.02])
 
 
 @given(P_VALUES)
-def test_holm_keeps_the_order_between_no_correction_and_bonferronis(p):
+def test_holm_keeps_the_order_and_is_at_most_bonferronis(p):
     adjusted = holm(p)
     assert (adjusted >= p).all()
     assert (adjusted <= np.minimum(len(p) * p, 1.0)).all()
@@ -89,7 +89,7 @@ def test_holm_keeps_the_order_between_no_correction_and_bonferronis(p):
 
 
 @given(P_VALUES, st.floats(0.001, 0.2))
-def test_holm_rejects_the_same_as_the_closed_test_of_bonferroni(p, alpha):
+def test_holm_rejects_the_same_as_the_closed_bonferroni_test(p, alpha):
     """Each hypothesis falls when every intersection that holds it does: Holm's shortcut."""
     p = p[:6]
     closed = np.ones(len(p), dtype=bool)
@@ -140,7 +140,7 @@ def test_the_unit_of_the_sample_does_not_matter(seed, unit):
     [np.zeros(8), np.full(8, 5.0), [0.0, 0.0, 0.0, 0.0, 3.0, 3.0, 0.6, -0.6]],
     ids=["nothing", "all large", "some"],
 )
-def test_only_simultaneous_intervals_of_a_family_hold_at_once(means):
+def test_family_intervals_cover_jointly_and_single_intervals_do_not(means):
     rng = np.random.default_rng(11)
     runs, together, alone = 2000, 0, 0
     for _ in range(runs):
@@ -153,7 +153,7 @@ def test_only_simultaneous_intervals_of_a_family_hold_at_once(means):
     assert alone / runs < 0.95 - 6.0 * error, "the control: without correction they fail"
 
 
-def test_holm_finds_more_than_bonferroni():
+def test_holm_resolves_a_weak_effect_that_bonferroni_misses():
     rng = np.random.default_rng(5)
     strong = list(drawn(rng, np.full(7, 4.0), 20))
     weak = rng.normal(size=20)
@@ -183,7 +183,7 @@ def test_a_single_statement_of_nearness_is_two_one_sided_tests(seed):
     assert finding.holds is (False if far else (True if near else None))
 
 
-def test_nearness_and_its_opposite_are_seen():
+def test_statements_of_nearness_are_confirmed_or_refuted():
     shape = np.linspace(-1.0, 1.0, 60)
     near, far, between = judge(
         [
@@ -235,7 +235,7 @@ def test_the_confidence_asked_for_decides(confidence):
 
 
 @pytest.mark.parametrize("standing", [1, 2, 3])
-def test_intervals_of_hypotheses_not_rejected_share_alpha(standing):
+def test_undecided_statements_share_alpha_in_their_intervals(standing):
     shape, n = np.linspace(-1.0, 1.0, 20), 20
     weak = [shape + 0.01 * i for i in range(standing)]
     findings = judge(statements([*weak, *(shape + 9.0 for _ in range(8 - standing))]))
@@ -256,7 +256,7 @@ def test_slightly_above_is_above_in_the_sample_and_not_significant(shift, holds)
 
 @pytest.mark.parametrize("sample", [[], [1.0], [2.0, 2.0], [0.1 + 0.2] * 30])
 @pytest.mark.parametrize("relation", ["above", "not above", "slightly above", "within"])
-def test_a_sample_without_spread_decides_nothing(sample, relation):
+def test_a_sample_without_spread_is_undecided(sample, relation):
     (finding,) = judge(statements([np.array(sample)], relation, 0.5))
     assert finding.holds is None
     assert finding.interval == (-math.inf, math.inf)
@@ -265,7 +265,7 @@ def test_a_sample_without_spread_decides_nothing(sample, relation):
     assert finding.n == len(sample)
 
 
-def test_no_statements_no_findings():
+def test_no_statements_give_no_findings():
     assert judge([]) == ()
 
 
@@ -291,7 +291,7 @@ def test_pseudovalues_of_a_linear_statistic_are_its_values(seed):
     assert values == pytest.approx(curves @ weights, abs=1e-12)
 
 
-def test_pseudovalues_free_a_square_of_its_bias_and_know_its_error():
+def test_pseudovalues_remove_the_bias_of_a_square():
     """The square of a mean of n draws is too large by s^2/n: the jackknife takes off just that."""
     sample = np.random.default_rng(4).normal(3.0, 1.0, (500, 1))
     values = pseudovalues(sample, lambda mean: mean[:, 0] ** 2)

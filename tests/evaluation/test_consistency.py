@@ -54,7 +54,7 @@ def test_nees_does_not_depend_on_the_units(seed):
     assert (nees(error * unit, P * unit[:, None] * unit) == nees(error, P)).all()
 
 
-def test_nees_leaves_its_arguments_alone():
+def test_nees_does_not_change_its_arguments():
     error, P = np.ones((4, 3)), covariances(np.random.default_rng(1), 4)
     before = P.tobytes()
     nees(error, P)
@@ -260,7 +260,7 @@ def test_a_landmark_that_was_moved_has_strayed_and_no_other(moved):
     assert strayed_landmarks(track, scans, 0.999, 1e-3) == {moved: (20.0, 32.0, 13)}
 
 
-def test_what_is_far_by_chance_has_not_strayed():
+def test_a_landmark_far_off_by_chance_has_not_strayed():
     track, rng = track_past(POSTS), np.random.default_rng(5)
     assert strayed_landmarks(track, heard_on(track, lambda _: POSTS, rng), 0.9, 0.1) == {}
     once = heard_on(track, lambda time: POSTS + (time == 20.0))

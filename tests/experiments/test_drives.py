@@ -40,7 +40,7 @@ def driven(motion, steps=12, seed=7):
 
 @pytest.mark.parametrize("motion", MOTIONS, ids=lambda motion: motion.model)
 @given(times=st.lists(st.floats(0.001, 1.5), min_size=1, max_size=6))
-def test_the_parts_of_steps_lead_where_the_steps_do_along_the_true_path(motion, times):
+def test_split_steps_follow_the_true_path(motion, times):
     drive = driven(motion)
     fine, steps = split_at(drive, times)
     assert np.array_equal(fine.time[steps], drive.time)
@@ -74,7 +74,7 @@ def test_the_parts_of_a_step_are_together_about_as_uncertain_as_the_step(motion)
     np.testing.assert_allclose(deviation[0], deviation[1], rtol=0.02)
 
 
-def test_a_drive_is_as_it_was_where_all_is_heard_at_the_end_of_a_step():
+def test_a_drive_with_scans_at_step_ends_is_unchanged():
     drive = driven(MOTIONS[0])
     same, steps = split_at(drive, drive.time[[2, 5]])
     assert same is drive

@@ -28,11 +28,9 @@ FORMER = {
 
 
 @pytest.fixture(autouse=True)
-def undrawn_in_a_folder_of_its_own(tmp_path, monkeypatch):
+def undrawn_in_a_folder_of_its_own(tmp_path, monkeypatch, undrawn):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr("sys.argv", ["pipistrelle"])
-    monkeypatch.setattr("pipistrelle.figures.mission.draw_mission", lambda *_, **__: None)
-    monkeypatch.setattr("pipistrelle.figures.style.save_figure", lambda *_: None)
 
 
 def by_name(name):
@@ -70,7 +68,7 @@ def test_the_settings_of_the_paper_are_the_defaults(name):
     assert {*each.values()} == {config}
 
 
-def test_the_best_settings_are_those_that_the_study_timing_measured():
+def test_the_best_settings_equal_the_timing_studys():
     plan = read_plan(find_plan("timing"))
     radius = plan.grid["emitter.radius"][0]
     measured = {case.filter: case.config for case in cases_of(plan)
@@ -91,7 +89,7 @@ def test_run_without_a_word_takes_the_best_settings_and_their_estimator():
     assert "own" not in settings_kept("one"), "one estimator has all settings as its own"
 
 
-def test_the_papers_mission_is_what_run_did_before_to_the_bit():
+def test_the_paper_settings_keep_the_former_default_mission_to_the_bit():
     main(["run", *WORLD, "--settings", "paper", "--quiet", "-o", "one"])
     default = Config(scenario=ScenarioConfig(steps=32, landmarks=10))
     for trial in run_mission(default, STRATEGIES, ["ekf"]).trials:
@@ -101,7 +99,7 @@ def test_the_papers_mission_is_what_run_did_before_to_the_bit():
         np.testing.assert_allclose(end[[1, 2, 6, 7]], FORMER[trial.strategy], rtol=0, atol=1e-9)
 
 
-def test_a_name_lies_beneath_a_file_beneath_the_environment_beneath_flags(monkeypatch):
+def test_flags_override_the_environment_over_files_over_named_settings(monkeypatch):
     Path("mine.toml").write_text("rays.power = 3.0\nrays.prune = 1e-4\nfilter.robust = 'none'\n")
     words = ("--settings", "mine.toml", "--settings", "best", "--filter", "iekf")
     monkeypatch.setenv("PIPISTRELLE_RAYS__PRUNE", "1e-3")
@@ -115,7 +113,7 @@ def test_a_name_lies_beneath_a_file_beneath_the_environment_beneath_flags(monkey
     assert kept["filter"]["noise"] == "constant", "the flag, over the estimator's own"
 
 
-def test_a_name_may_stand_in_a_file_in_the_environment_and_as_a_flag(monkeypatch):
+def test_a_name_may_come_from_file_environment_or_flag(monkeypatch):
     Path("mine.toml").write_text("settings = 'paper'\n")
     for folder, words, name in (
         ("one", (), "best"),
@@ -130,7 +128,7 @@ def test_a_name_may_stand_in_a_file_in_the_environment_and_as_a_flag(monkeypatch
     assert [settings_kept(one)["settings"] for one in ("four", "five")] == ["physics", "paper"]
 
 
-def test_estimators_side_by_side_each_have_their_own_and_the_folder_gives_it_back(capsys):
+def test_estimators_in_one_run_keep_their_separate_settings(capsys):
     both = ran("both", "--filter", "ekf,iekf")
     for name in ("ekf", "iekf"):
         alone = ran(name, "--filter", name)
@@ -153,7 +151,7 @@ def test_the_names_of_two_runs_are_compared(capsys):
     ]
 
 
-def test_a_file_may_hold_what_is_one_estimators_alone():
+def test_a_file_may_contain_settings_of_one_estimator():
     Path("mine.toml").write_text("rays.power = 4.0\n[own.ekf]\nrays.power = 5.0\n")
     for name, power in (("ekf", 5.0), ("iekf", 4.0)):
         ran(name, "--settings", "mine.toml", "--filter", name)
@@ -220,7 +218,7 @@ def settings_kept_in(file):
     return tomllib.loads(Path(file).read_text())
 
 
-def test_slam_takes_the_name_over_its_own_defaults_and_without_one_keeps_them():
+def test_named_settings_override_the_defaults_of_slam():
     assert main(["run", *FUSED, "--filter.gate", "auto", "--save-log", "log", "-o", "one"]) == 0
     for folder, words in (("two", ()), ("best", ("--settings", "best")),
                           ("paper", ("--settings", "paper"))):  # fmt: skip
@@ -236,7 +234,7 @@ def test_slam_takes_the_name_over_its_own_defaults_and_without_one_keeps_them():
     assert solved.summary["filter"].to_list() == ["ekf"]
 
 
-def test_python_does_as_the_command_line():
+def test_python_gives_the_results_of_the_command_line():
     asked = {"duration": 4.0, "landmarks": 10, "strategies": "fused"}
     ran("one")
     ran("paper", "--settings", "paper")
@@ -257,7 +255,7 @@ def test_python_does_as_the_command_line():
 PLAN = {"format": 1, "name": "mine", "iterations": 1, "settings": "best"}
 
 
-def test_a_plan_stands_over_the_settings_that_it_names():
+def test_a_plan_overrides_the_settings_that_it_names():
     grid = {"filter.robust": ["none", "huber"]}
     own = {"iekf": {"rays.spacing": "paper"}}
     plan = plan_of(PLAN | {"filters": ["ekf", "iekf"], "config": {"rays.power": 4.0}, "grid": grid,
@@ -327,6 +325,6 @@ def test_the_plans_that_ship_are_listed_in_the_help(capsys):
     assert ", ".join(PLANS) in " ".join(capsys.readouterr().out.replace("│", " ").split())
 
 
-def test_what_is_one_estimators_alone_is_known_as_a_setting():
+def test_settings_of_one_estimator_are_known_settings():
     assert {("settings",), ("own",)} <= {*known_settings()}
     assert json.loads(Config(settings="best").model_dump_json(exclude_none=True))["settings"]

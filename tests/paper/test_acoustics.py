@@ -16,14 +16,14 @@ def listed_beamwidths(radii, frequency):
     return 2 * np.floor(10 * half + 1e-9) / 10
 
 
-def test_beamwidths_of_the_papers_radii_are_those_of_appendix_b():
+def test_beamwidths_of_the_papers_radii_match_appendix_b():
     listed = listed_beamwidths(np.round(RADII, 4), 35e3)
     np.testing.assert_allclose(listed, APPENDIX_B, rtol=0, atol=0.2 + 1e-9)
     assert np.sum(np.isclose(listed, APPENDIX_B)) >= 10
     assert listed[-1] == 180.0
 
 
-def test_beamwidths_at_the_beacons_frequency_are_not_those_of_appendix_b():
+def test_beamwidths_at_the_beacons_frequency_do_not_match_appendix_b():
     off = np.abs(listed_beamwidths(np.round(RADII, 4), 30e3) - APPENDIX_B)
     assert np.sum(off > 1.0) == 11
     assert off.max() > 30.0

@@ -34,17 +34,17 @@ def value(config: Config, name: str) -> float:
     return getattr(getattr(config, section), field)
 
 
-def test_the_fitted_values_are_those_of_the_study(found, plan):
+def test_the_fitted_values_equal_the_plans(found, plan):
     assert len(found["fitted"]) == 4
     for name, fitted in found["fitted"].items():
         assert value(read_plan(find_plan(plan)).config, name) == fitted
 
 
-def test_the_defaults_are_those_of_the_study_of_physics():
+def test_the_defaults_equal_the_physics_plans():
     assert read_plan(find_plan("physics")).config == Config(seed=2022)
 
 
-def test_the_worlds_of_the_fit_are_not_those_of_the_study(found, plan):
+def test_the_fit_and_the_study_use_different_worlds(found, plan):
     assert found["worlds"]["seed"] != read_plan(find_plan(plan)).config.seed
 
 
@@ -65,7 +65,7 @@ def test_active_sensing_sees_no_more_than_the_papers_claims_allow(found):
     assert round(found["landmarks_seen_predicted"]["active 180"]["ours"]) <= 36
 
 
-def test_the_power_is_the_least_above_one_that_reaches_the_papers_count(found):
+def test_the_fitted_power_is_the_least_that_reaches_the_papers_count(found):
     grid = found["prunes_tried"]
     assert grid == sorted(grid)
     for row in found["rays_tried"]:

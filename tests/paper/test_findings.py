@@ -35,7 +35,7 @@ def test_the_study_was_whole(study):
 
 
 @pytest.mark.parametrize("page", PAGES)
-def test_every_claim_stands_with_its_verdict_in_both_studies(page):
+def test_every_claim_is_listed_with_its_verdict_of_both_studies(page):
     told = rows(page)
     for column, study in enumerate(STUDIES, start=1):
         for claim in FOUND[study]["claims"]:
@@ -44,7 +44,7 @@ def test_every_claim_stands_with_its_verdict_in_both_studies(page):
 
 
 @pytest.mark.parametrize("study", STUDIES)
-def test_table_ii_stands_as_the_study_has_it(study):
+def test_table_ii_matches_the_study(study):
     page, column = findings(), STUDIES.index(study)
     for row in FOUND[study]["table_ii"]:
         title = {"ekf": "| EKF-SLAM |", "fastslam": "| FastSLAM 2.0 |"}[row["filter"]]
@@ -58,13 +58,13 @@ def test_table_ii_stands_as_the_study_has_it(study):
 
 
 @pytest.mark.parametrize("study", STUDIES)
-def test_what_was_left_out_is_told(study):
+def test_the_page_states_the_excluded_worlds(study):
     ekf, fastslam = FOUND[study]["exclusions"]
     words = f"{ekf['excluded']} worlds for EKF-SLAM and {fastslam['excluded']} "
     assert re.search(rf"{words}for FastSLAM 2\.0 of `{study}`", findings())
 
 
-def test_the_numbers_that_decide_stand_with_those_of_everything_counted():
+def test_the_page_states_the_deciding_numbers_with_and_without_exclusions():
     told = rows("docs/findings.md")
     for study in STUDIES:
         for claim in FOUND[study]["claims"]:
@@ -74,7 +74,7 @@ def test_the_numbers_that_decide_stand_with_those_of_everything_counted():
                     assert f"{number:.2f}" in text, (study, claim["claim"], number)
 
 
-def test_the_misfits_stand_as_the_experiment_found_them():
+def test_the_misfits_of_readings_match_the_experiment():
     with (PAPER / "readings.csv").open(encoding="utf-8") as file:
         table = list(csv.DictReader(file))
     page = findings().split("| reading |")[1].split("\n\n")[0]
@@ -88,7 +88,7 @@ def test_the_misfits_stand_as_the_experiment_found_them():
     )
 
 
-def test_the_misfits_of_the_studies_stand_as_they_were_measured():
+def test_the_misfits_of_the_studies_match_their_table():
     with (PAPER / "held_out.csv").open(encoding="utf-8") as file:
         table = {row["study"]: row for row in csv.DictReader(file)}
     assert list(table) == ["paper", "restart", "anew", "physics"]
@@ -99,7 +99,7 @@ def test_the_misfits_of_the_studies_stand_as_they_were_measured():
     assert words in findings()
 
 
-def test_the_noise_table_stands_as_the_experiment_found_it():
+def test_the_noise_table_matches_the_experiment():
     with (PAPER / "noise.csv").open(encoding="utf-8") as file:
         table = list(csv.DictReader(file))
     lines = findings().split("| noise of bearings |")[1].split("\n\n")[0].splitlines()[3:]
@@ -111,7 +111,7 @@ def test_the_noise_table_stands_as_the_experiment_found_it():
         assert f"{float(row['full_180_ekf']):.1f} / {float(row['full_passive_ekf']):.1f}" in line
 
 
-def test_every_variant_of_the_study_stands_with_its_numbers():
+def test_every_variant_of_the_study_is_listed_with_its_numbers():
     table = findings().split("| verdicts 1 to 8 |")[1].split("\n\n")[0].splitlines()[2:]
     with (PAPER / "variants.csv").open(encoding="utf-8") as file:
         variants = list(csv.DictReader(file))

@@ -58,10 +58,7 @@ def _field(store, description, value):
 def header(time, frame=""):
     """Return the header of a message."""
     whole = int(np.floor(time))
-    return {
-        "stamp": {"sec": whole, "nanosec": round((time - whole) * 1e9)},
-        "frame_id": frame,
-    }
+    return {"stamp": {"sec": whole, "nanosec": round((time - whole) * 1e9)}, "frame_id": frame}
 
 
 def quaternion(heading):

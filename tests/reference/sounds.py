@@ -8,6 +8,7 @@ from tempfile import TemporaryDirectory
 import numpy as np
 
 from pipistrelle.verbs.command_line import obey
+from reference.pictures import without_picture
 
 FEW = ("--receiver.elements", "4", "--landmarks", "20", "--duration", "4", "--seed", "7")
 """A drive of eight frames among few landmarks, for sixteen microphones."""
@@ -16,7 +17,7 @@ UNLABELLED = ("--association.method", "marginal", "--listening.timing", "true")
 
 def record(folder, *words, drive=FEW):
     """Write a recording with `pipistrelle run`; return its folder."""
-    with TemporaryDirectory() as place, redirect_stdout(StringIO()):
+    with TemporaryDirectory() as place, redirect_stdout(StringIO()), without_picture():
         line = ["run", *drive, "--strategy", "fused", "--quiet", "-o", f"{place}/run"]
         assert obey([*line, "--save-sound", str(folder), *words]) == 0
     return Path(folder)

@@ -141,10 +141,7 @@ def test_detections_are_travel_times_by_angles_to_starboard(tmp_path, definition
     path = tmp_path / "walk.mcap"
     messages = [*drive(), ("/sonar", DETECTIONS, 0.2, told)]
     messages.sort(key=lambda one: one[2])
-    log = load(
-        write_bag(path, messages, definitions=definitions),
-        bag=BagConfig(step=0.0),
-    )[0]
+    log = load(write_bag(path, messages, definitions=definitions), bag=BagConfig(step=0.0))[0]
     row = only(log)
     assert row.bearing[0] == pytest.approx(-0.3, abs=1e-6)
     assert row.range[0] == pytest.approx(7.5, rel=1e-6)
@@ -162,7 +159,7 @@ def test_a_travel_time_needs_a_speed_of_sound(tmp_path):
     refused(tmp_path / "one.mcap", "topic /sonar, message 1", "--bag.speed-of-sound")
 
 
-def test_ranges_lie_along_their_unit_vectors(tmp_path):
+def test_ranges_are_measured_along_their_unit_vectors(tmp_path):
     vectors = [{"x": 0.6, "y": 0.8}, {"x": 0.48, "y": 0.64, "z": 0.6}, {"z": 1.0}]
     told = pinged(beam_unit_vec=vectors, ranges=[5.0, 5.0, 3.0])
     log = read(tmp_path / "one.db3", ("/beams", RANGES, 0.2, told))
@@ -199,7 +196,7 @@ def cones(*ranges, far=6.0, **more):
 
 
 @pytest.mark.parametrize("far", [6.0, 4.1, 0.3, 25.599999, math.inf])
-def test_a_range_at_its_farthest_is_nothing_heard(tmp_path, far):
+def test_a_range_at_the_sensors_maximum_counts_as_no_echo(tmp_path, far):
     single = np.float32(far)
     below = float(np.nextafter(single, np.float32(0.0)))
     nothing = [far, float(single), below, math.inf, -math.inf, math.nan, 0.0, -1.0]
@@ -209,7 +206,7 @@ def test_a_range_at_its_farthest_is_nothing_heard(tmp_path, far):
     np.testing.assert_allclose([scan.range[0] for scan in log.scans], heard, rtol=1e-6)
 
 
-def test_one_range_in_more_than_a_fifth_of_the_messages_is_asked_about(tmp_path):
+def test_a_range_repeated_in_over_a_fifth_of_messages_is_doubted(tmp_path):
     def doubts(name, ranges):
         return read(tmp_path / name, *cones(*ranges), count=31).doubts
 
@@ -221,7 +218,7 @@ def test_one_range_in_more_than_a_fifth_of_the_messages_is_asked_about(tmp_path)
     assert doubts("short.mcap", [5.9] * 20) == ()
 
 
-def test_a_range_in_each_scan_is_asked_about_whatever_its_beam(tmp_path):
+def test_a_range_repeated_in_each_scan_is_doubted_for_any_beam(tmp_path):
     def ping(i):
         ways = [{"x": math.cos(0.1 * i), "y": math.sin(0.1 * i)}, {"x": 0.6, "y": -0.8}]
         told = pinged(0.1 * i, beam_unit_vec=ways, ranges=[7.3, 2.0 + 0.01 * i])
@@ -295,7 +292,7 @@ def seen(time, far=3.0):
     return ("/seen", LABELLED, time, labelled(time, [(7, 0.0, far)]))
 
 
-def test_a_twist_covariance_is_that_of_the_way_since_the_row_before(tmp_path):
+def test_a_twist_covariance_is_scaled_to_the_motion_since_the_last_row(tmp_path):
     covariance = np.zeros(36)
     covariance[[0, 7, 35]] = 0.04, 0.01, 0.09
     rows = [
@@ -307,7 +304,7 @@ def test_a_twist_covariance_is_that_of_the_way_since_the_row_before(tmp_path):
     assert load(path, bag=BagConfig(step=0.0, covariances=False))[0].controls.shape == (1, 3)
 
 
-def test_steps_merge_what_comes_more_often(tmp_path):
+def test_steps_merge_more_frequent_odometry(tmp_path):
     assert len(read(tmp_path / "one.mcap", seen(0.2), count=21).dt) == 20
     assert len(load(tmp_path / "one.mcap", bag=BagConfig(step=0.5))[0].dt) == 4
 
@@ -322,8 +319,7 @@ def test_messages_are_timed_by_their_headers_unless_reception_is_asked_for(tmp_p
 
 
 @pytest.mark.parametrize(
-    "name",
-    ["Odometry", "PoseStamped", "PoseWithCovarianceStamped", "TransformStamped"],
+    "name", ["Odometry", "PoseStamped", "PoseWithCovarianceStamped", "TransformStamped"]
 )
 def test_the_truth_is_a_topic_that_is_named_and_the_log_begins_there(tmp_path, name):
     def truth(time):
@@ -349,7 +345,7 @@ def test_the_truth_is_a_topic_that_is_named_and_the_log_begins_there(tmp_path, n
     assert load(path, bag=BagConfig(odometry="/odom", step=0.0))[1].path is None
 
 
-def test_two_odometries_are_told_apart_by_a_name(tmp_path):
+def test_one_of_two_odometry_topics_is_chosen_by_name(tmp_path):
     other = [("/visual", *row[1:]) for row in drive()]
     path = write_bag(
         tmp_path / "one.mcap", sorted([*drive(), *other, seen(0.2)], key=lambda one: one[2])
@@ -391,7 +387,7 @@ ODD = ("no w", "empty", "no number", "scaled", "a little long", "w first", "upsi
 
 @pytest.mark.parametrize("topic", ["/odom", "/true"])
 @pytest.mark.parametrize("kind", ODD)
-def test_orientations_that_are_none_are_refused_or_left_out(tmp_path, kind, topic):
+def test_invalid_orientations_are_refused_or_left_out(tmp_path, kind, topic):
     def bag(name, odd):
         rows = []
         for i in range(12):
@@ -432,7 +428,7 @@ def test_quaternions_of_fixed_point_are_turns(tmp_path, steps):
     np.testing.assert_allclose(log.controls[:, 2], 0.3, atol=4.0 / steps)
 
 
-def test_transforms_that_are_no_turns_are_left_out_or_refused(tmp_path):
+def test_invalid_transforms_are_left_out_or_refused(tmp_path):
     good = ("/tf_static", TRANSFORMS, 0.0, static("base_link", "front", 0.3, 0.2))
     camera = static("base_link", "camera", 0.1, 0.0, q={"z": 0.2})
     bad = ("/tf_static", TRANSFORMS, 0.01, camera)
@@ -481,7 +477,7 @@ def test_a_clock_that_begins_with_the_drive_has_a_time_zero(tmp_path):
     assert len(log.scans) == 2
 
 
-def test_stamps_that_are_all_zero_are_refused_with_what_helps(tmp_path):
+def test_zero_stamps_are_refused_with_the_option_that_helps(tmp_path):
     path = stamped(tmp_path / "one.mcap", early=20)
     refused(path, "topic /odom: found the stamp 0 in all 20 messages", "--bag.stamps received")
     assert len(load(path, bag=BagConfig(stamps="received", step=0.0))[0].dt) == 19
@@ -502,7 +498,7 @@ def test_a_stamp_of_zero_in_between_is_left_out(tmp_path):
 
 
 @pytest.mark.parametrize(("pause", "asked"), [(90.0, False), (110.0, True)])
-def test_a_silence_of_the_odometry_is_asked_about_before_the_work(tmp_path, pause, asked):
+def test_a_long_silence_of_the_odometry_is_doubted(tmp_path, pause, asked):
     times = [round(0.1 * i + pause * (i >= 20), 1) for i in range(40)]
     told = [("/odom", ODOMETRY, t, odometry(t, 0.1 * i, 0.0, 0.0)) for i, t in enumerate(times)]
     log, _ = load(write_bag(tmp_path / "one.mcap", [*told, seen(times[-1])]))
@@ -522,7 +518,7 @@ def test_too_many_steps_are_refused_by_the_gap_that_makes_them(tmp_path):
 # What is wrong in a bag
 
 
-def test_what_is_no_sound_bag_is_refused_by_its_name(tmp_path):
+def test_a_damaged_or_missing_bag_is_refused_by_name(tmp_path):
     told = sorted([*drive(), seen(0.2)], key=lambda one: one[2])
     for name in KINDS[:3]:
         whole = write_bag(tmp_path / name, told).read_bytes()
@@ -572,12 +568,12 @@ def test_what_is_no_sound_bag_is_refused_by_its_name(tmp_path):
         ([*drive(), seen(9.0)], ("topic /seen", "1 outside odometry")),
     ],
 )
-def test_what_cannot_be_used_is_refused_by_topic_and_message(tmp_path, told, parts):
+def test_unusable_messages_are_refused_by_topic_and_number(tmp_path, told, parts):
     path = write_bag(tmp_path / "one.mcap", sorted(told, key=lambda one: one[2]))
     refused(path, *parts)
 
 
-def test_messages_that_a_folder_counts_and_its_file_lacks_are_missed(tmp_path):
+def test_messages_missing_from_a_bags_file_are_reported(tmp_path):
     path = write_bag(tmp_path / "walk", sorted([*drive(), seen(0.2)], key=lambda one: one[2]))
     told = (path / "metadata.yaml").read_text()
     assert told.count("message_count: 5") == 1
@@ -653,7 +649,7 @@ def test_an_mcap_is_read_whatever_its_index_lacks(tmp_path, how, index, statisti
         assert [topic.count for topic in bag.seen()] == [4, 5, 2]
 
 
-def test_an_mcap_that_counts_more_than_it_holds_is_refused_without_talk_of_folders(tmp_path):
+def test_an_mcap_with_missing_messages_is_refused_with_its_remedy(tmp_path):
     path = write_bag(tmp_path / "one.mcap", sorted([*drive(), seen(0.2)], key=lambda one: one[2]))
     data = path.read_bytes()
     count = (1).to_bytes(2, "little") + (5).to_bytes(8, "little")
@@ -679,7 +675,7 @@ def test_a_bag_without_labels_is_refused_by_its_file(tmp_path):
         replay(log, Truth(time=log.time), ["fused"], ["ekf"], None, Config())
 
 
-def test_a_message_whose_bytes_end_early_is_refused_by_its_topic(tmp_path):
+def test_a_truncated_message_is_refused_by_its_topic(tmp_path):
     from rosbags.rosbag2 import StoragePlugin, Writer
 
     from reference.bags import made, store_of
@@ -772,7 +768,7 @@ def test_bytes_that_are_changed_at_random_end_in_a_log_or_a_refusal(tmp_path, na
     assert ends == {"read", "refused"}
 
 
-def test_without_rosbags_a_bag_is_refused_with_what_installs_it(tmp_path, monkeypatch):
+def test_a_bag_without_rosbags_is_refused_with_the_install_command(tmp_path, monkeypatch):
     path = write_bag(tmp_path / "one.mcap", sorted([*drive(), seen(0.2)], key=lambda one: one[2]))
     for name in [name for name in sys.modules if name.split(".")[0] == "rosbags"]:
         monkeypatch.delitem(sys.modules, name)

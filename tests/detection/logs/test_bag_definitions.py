@@ -110,7 +110,7 @@ def test_a_bag_that_is_defined_in_idl_is_read(tmp_path):
     assert log.scans[0].range == pytest.approx([2.0])
 
 
-def test_arrays_and_lists_of_idl_are_those_of_ros():
+def test_arrays_and_sequences_of_idl_match_ros_definitions():
     text = """module a_msgs { module msg { typedef double double__3[3];
       struct In { string<5> s; sequence<float, 4> f; unsigned long long u; };
       struct Out { double__3 d; a_msgs::msg::In one; sequence<In> many; long n; octet b; }; }; };"""
@@ -121,7 +121,7 @@ def test_arrays_and_lists_of_idl_are_those_of_ros():
 
 
 @pytest.mark.parametrize("more", ["string[2] notes\n", "Extra[3] extra\n", "int8[1000000] far\n"])
-def test_further_fields_are_decoded_as_the_text_says(more):
+def test_extra_fields_are_decoded_by_the_recorded_definition(more):
     text = more + sound(ODOMETRY) + PART.replace("a_msgs", "nav_msgs").format("Extra") + "int8 x\n"
     types = get_types_from_msg(text, ODOMETRY)
     theirs = get_typestore(Stores.EMPTY)
@@ -198,10 +198,7 @@ HOSTILE = {
     "no definition": (f"a_msgs/Y x\n{sound(ODOMETRY)}", "no definition of a_msgs/msg/Y"),
     "a long text": ("#" * (LONGEST + 1), "characters"),
     "many lines": ("\n" * (LONGEST - 40) + "int8 x\n", "header as nothing"),
-    "many fields": (
-        sound(ODOMETRY) + PART.format("Y") + "int8 x\n" * 20000,
-        "a field twice",
-    ),
+    "many fields": (sound(ODOMETRY) + PART.format("Y") + "int8 x\n" * 20000, "a field twice"),
     "a field twice": (f"int8 x\nint8 x\n{sound(ODOMETRY)}", "a field twice"),
     "a type twice": (
         f"{sound(ODOMETRY)}{LINE}MSG: std_msgs/Header\nint8 x\n",
@@ -261,6 +258,6 @@ def test_a_topic_of_transforms_of_another_type_is_refused(tmp_path):
         load(path)
 
 
-def test_our_definitions_are_read_as_rosbags_reads_them():
+def test_definitions_are_parsed_like_rosbags():
     for name in (DETECTIONS, LABELLED):
         assert read_definition(name, DEFINITIONS[name])[name] == store_of().fielddefs[name][1]

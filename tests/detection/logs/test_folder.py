@@ -89,7 +89,7 @@ def test_a_row_holds_until_the_next_and_the_last_only_ends_the_log(folder):
     assert log.dt.tolist() == [0.1, 0.3 - 0.1, 0.4 - 0.3]
 
 
-def test_the_settings_are_those_of_the_file_and_the_name_is_the_folders(folder):
+def test_settings_come_from_the_file_and_the_name_from_the_folder(folder):
     log = read_log(folder)
     assert (log.name, log.motion, log.control_std) == ("drive", "unicycle", (0.1, 0.15))
     assert (log.initial_pose, log.initial_pose_std) == ((1.0, -2.0, 0.5), (0.05, 0.06, 0.04))
@@ -97,7 +97,7 @@ def test_the_settings_are_those_of_the_file_and_the_name_is_the_folders(folder):
     assert (log.gate, log.noise_at_rest, log.ignored_rows) == (None, True, {})
 
 
-def test_a_bicycle_has_a_wheelbase_and_its_own_columns(tmp_path):
+def test_a_bicycle_log_has_a_wheelbase_speed_and_steering(tmp_path):
     header = ODOMETRY.replace("velocity,angular_rate", "speed,steering")
     log = read_log(recorded(tmp_path, BICYCLE, header))
     assert (log.motion, log.wheelbase, log.control_std) == ("bicycle", 0.3, (0.1, 0.15))
@@ -109,7 +109,7 @@ def test_optional_settings_are_read(tmp_path):
     assert (log.gate, log.noise_at_rest) == (0.99, False)
 
 
-def test_whole_numbers_are_numbers(tmp_path):
+def test_settings_accept_whole_numbers(tmp_path):
     log = read_log(recorded(tmp_path, UNICYCLE.replace("range_std = 0.2", "range_std = 2")))
     assert log.range_std == 2.0
 
@@ -168,21 +168,21 @@ def test_blank_lines_comments_spaces_and_foreign_line_ends_do_no_harm(folder):
         (STATED, ["0.1,7,0.5,4,1,2", "0.1,3,0.2,5,3,4"], [1, 3], [2, 4]),
     ],
 )
-def test_rows_may_state_how_sure_they_are(tmp_path, stated, rows, bearing_std, range_std):
+def test_rows_may_state_their_standard_deviations(tmp_path, stated, rows, bearing_std, range_std):
     (scan,) = read_log(recorded(tmp_path, measurements=measured(*rows, stated=stated))).scans
     np.testing.assert_array_equal(scan.bearing_std, bearing_std)
     np.testing.assert_array_equal(scan.range_std, range_std)
     assert scan.landmark.tolist() == [7, 3]
 
 
-def test_a_range_std_beside_an_empty_range_does_no_harm(tmp_path):
+def test_a_range_std_without_a_range_is_accepted(tmp_path):
     rows = measured("0.1,7,0.5,,0.01,0.3", stated=STATED)
     (scan,) = read_log(recorded(tmp_path, measurements=rows)).scans
     assert np.isnan(scan.range).all()
     assert scan.bearing_std.tolist() == [0.01]
 
 
-def test_what_rows_state_stays_with_them_when_others_are_dropped(tmp_path):
+def test_stated_deviations_stay_with_their_rows_when_others_are_dropped(tmp_path):
     rows = [
         "0.1,-1,0,1,0.1,",
         "0.1,7,0,1,0.2,",
@@ -210,13 +210,13 @@ def test_merged_controls_are_time_weighted_means_and_the_last_step_may_be_short(
     np.testing.assert_allclose(log.controls[:, 1], np.array(by_hand) / 10, rtol=1e-14)
 
 
-def test_merging_keeps_what_was_driven(tmp_path):
+def test_merging_steps_keeps_the_distance_driven(tmp_path):
     log = merged(tmp_path, 0.07)
     driven = log.dt @ log.controls
     np.testing.assert_allclose(driven, [0.1 * 1 + 0.2 * 2 + 0.1 * 3, 0.08], rtol=1e-14)
 
 
-def test_merged_steps_start_at_the_first_row_and_are_whole_where_the_log_is(tmp_path):
+def test_merged_steps_start_at_the_first_row_and_fill_the_log(tmp_path):
     rows = "".join(f"{100 + i / 50!r},1,0\n" for i in range(151))
     log = merged(tmp_path, 0.3, "time,velocity,angular_rate\n" + rows, measured("101,1,0,1"))
     assert len(log.dt) == 10
@@ -224,7 +224,7 @@ def test_merged_steps_start_at_the_first_row_and_are_whole_where_the_log_is(tmp_
     assert log.time[-1] == 103.0
 
 
-def test_a_merged_step_of_standing_rows_stands_exactly(tmp_path):
+def test_a_merged_step_of_rows_at_rest_is_exactly_zero(tmp_path):
     rows = "".join(f"{1e9 + 0.017 * i:.3f},{0.0 if i < 40 else 0.3},0\n" for i in range(80))
     measurements = measured("1000000000.5,1,0,1")
     log = merged(tmp_path, 0.1, "time,velocity,angular_rate\n" + rows, measurements)
@@ -269,7 +269,7 @@ def test_measurements_outside_the_odometry_are_dropped_and_counted(tmp_path):
 
 
 @pytest.mark.parametrize(("late", "used"), [(0.05, [0.1, 0.1, 0.3]), (-0.05, [0.1, 0.3, 0.3])])
-def test_a_sensor_whose_clock_is_late_or_early_is_heard_by_the_odometrys(tmp_path, late, used):
+def test_a_sensors_clock_offset_is_corrected_to_the_odometrys_clock(tmp_path, late, used):
     settings = UNICYCLE.replace("range_std", f"time_offset = {late}\nrange_std", 1)
     times = (0.04 + max(late, 0.0), 0.1, 0.2)
     rows = measured(*(f"{time},{label},0,1" for label, time in enumerate(times)))
@@ -327,21 +327,21 @@ def test_a_pipe_or_a_device_in_a_files_place_is_refused_unread(folder, name):
     refused(folder, name, "a pipe or a device")
 
 
-def test_a_link_to_no_file_is_told_from_a_file_that_is_not_there(folder):
+def test_a_broken_link_is_distinguished_from_a_missing_file(folder):
     (folder / "odometry.csv").unlink()
     refused(folder, "odometry.csv", "found no such file")
     (folder / "odometry.csv").symlink_to("nowhere.csv")
     refused(folder, "odometry.csv", "found a link to no file")
 
 
-def test_measurements_of_which_no_row_is_left_are_refused(tmp_path):
+def test_measurements_without_a_usable_row_are_refused(tmp_path):
     rows = measured("0.1,-1,0.5,4.0", "9.0,7,0.5,4.0", "9.5,3,0.5,")
     folder = recorded(tmp_path, measurements=rows)
     left_out = "left out: 1 clutter, 2 outside odometry), expected some of landmarks"
     refused(folder, "measurements.csv", left_out, "0.0 s and 0.4 s", "use the odometry's clock")
 
 
-def test_rows_of_clutter_may_be_of_one_time(tmp_path):
+def test_clutter_rows_may_have_the_same_time(tmp_path):
     rows = ["0.1,-1,0.5,4.0", "0.1,7,0.5,4.0", "0.1,-1,0.2,"]
     log = read_log(recorded(tmp_path, measurements=measured(*rows)))
     assert [scan.landmark.tolist() for scan in log.scans] == [[7]]
@@ -384,7 +384,7 @@ ROWS = {
 }
 
 
-def test_measurements_without_a_column_of_labels_are_told_that_labels_must_be_known(tmp_path):
+def test_measurements_without_labels_are_refused_with_both_remedies(tmp_path):
     rows = "time,bearing,range\n0.1,0.5,1\n"
     folder = recorded(tmp_path, measurements=rows)
     refused(folder, "line 1", "the same whenever it is seen", "for --association.method to decide")
@@ -437,7 +437,7 @@ def test_a_landmark_twice_at_one_time_is_found_among_others(tmp_path):
 
 
 @pytest.mark.parametrize("row", ["0.1,7,0.5", "0.1,7,0.5,1,0"])
-def test_a_file_of_wrong_rows_alone_is_refused_too(tmp_path, row):
+def test_a_file_of_only_malformed_rows_is_refused(tmp_path, row):
     folder = recorded(tmp_path, measurements=measured(row, row.replace("7", "8")))
     refused(folder, "line 2", f"{row.count(',') + 1} fields")
 
@@ -495,23 +495,21 @@ def test_a_wrong_header_is_refused(folder, name, header):
         ",",
     ],
 )
-def test_a_header_with_columns_that_are_unknown_or_misplaced_names_those_that_may_follow(
-    tmp_path, more
-):
+def test_an_unknown_or_misplaced_column_is_refused_with_the_allowed_ones(tmp_path, more):
     header = f"time,landmark,bearing,range{more}"
     folder = recorded(tmp_path, measurements=f"{header}\n0.1,7,0.5,4,0.1,0.1\n")
     may = "'time,landmark,bearing,range', perhaps followed by bearing_std, range_std, excess_path,"
     refused(folder, "measurements.csv, line 1", repr(header), may)
 
 
-def test_no_columns_may_follow_those_of_odometry(tmp_path):
+def test_extra_odometry_columns_are_refused(tmp_path):
     odometry = ODOMETRY.replace("rate\n", "rate,range_std\n")
     message = refused(recorded(tmp_path, odometry=odometry), "odometry.csv, line 1")
     assert "perhaps" not in message
 
 
 @pytest.mark.parametrize("stated", ["bearing_std,landmark,bearing,range", "landmark,bearing,range"])
-def test_no_column_goes_before_the_four(tmp_path, stated):
+def test_a_column_before_the_first_four_is_refused(tmp_path, stated):
     folder = recorded(tmp_path, measurements=f"{stated}\n0.1,7,0.5,4.0\n")
     refused(folder, "measurements.csv, line 1", repr(stated))
 
@@ -587,7 +585,7 @@ CAR = BICYCLE.replace("bicycle", "ackermann") + "speed_offset = -0.1\n"
 STEERED = "time,speed,steering\n0.0,1.0,0.1\n0.1,2.0,{}\n0.3,3.0,0.3\n0.4,9.0,0.9\n"
 
 
-def test_a_car_says_where_its_speed_is_measured(tmp_path):
+def test_a_car_log_has_wheelbase_and_speed_offset(tmp_path):
     log = read_log(recorded(tmp_path, CAR, STEERED.format(-1.0)))
     assert (log.motion, log.wheelbase, log.speed_offset) == ("ackermann", 0.3, -0.1)
     assert log.controls[1].tolist() == [2.0, -1.0]
@@ -604,7 +602,7 @@ def test_a_car_that_steers_across_is_asked_for_radians(tmp_path, steering):
     refused(folder, "odometry.csv, line 3", f"steering {steering}", "radians")
 
 
-def test_a_log_may_say_where_its_sensor_is_and_what_it_sees(tmp_path):
+def test_a_log_may_state_sensor_pose_and_association_settings(tmp_path):
     more = "sensor_pose = [3.8, 0.5, 0.1]\n[association]\nmax_range = 50\nclutter = 0.01\n"
     log = read_log(recorded(tmp_path, UNICYCLE + more))
     assert log.sensor_pose == (3.8, 0.5, 0.1)
@@ -716,7 +714,7 @@ def test_scans_that_share_a_step_survive_being_written(tmp_path):
     assert same(read_log(tmp_path / "again" / "drive"), log)
 
 
-def test_a_written_folder_says_what_it_holds(tmp_path):
+def test_a_written_readme_lists_the_columns(tmp_path):
     write_log(tmp_path, read_log(DATA / "bicycle_log"))
     readme = (tmp_path / "README.md").read_text()
     assert "time,speed,steering" in readme
@@ -734,7 +732,7 @@ def test_a_written_folder_says_what_it_holds(tmp_path):
         ({"bearing_std": [0.1, 0.2], "range_std": [NAN, 0.3]}, ",bearing_std,range_std"),
     ],
 )
-def test_columns_are_written_only_of_what_some_row_states(tmp_path, stated, header):
+def test_only_columns_with_a_value_are_written(tmp_path, stated, header):
     log = read_log(DATA / "unicycle_log")
     first, *others = log.scans
     said = {name: np.resize(values, first.landmark.size) for name, values in stated.items()}
@@ -764,7 +762,7 @@ def timed(folder, *rows, settings=UNICYCLE + CALLERS, stated=TIMED):
     return recorded(folder, settings, measurements=measured(*rows, stated=stated))
 
 
-def test_rows_may_say_how_much_later_than_whose_direct_call_they_came(tmp_path):
+def test_rows_may_state_an_excess_path_and_its_caller(tmp_path):
     rows = (
         "0.1,7,0.5,4.0,3.25,0.01,mate",
         "0.1,7,,,6.5,,boat",
@@ -788,7 +786,7 @@ def test_rows_may_say_how_much_later_than_whose_direct_call_they_came(tmp_path):
     assert [(c.place, c.place_std) for c in log.callers] == [(None, None), ((1, 2.5), (0.1, 0.2))]
 
 
-def test_a_log_that_calls_excess_paths_by_their_former_name_is_read_and_says_so(tmp_path):
+def test_former_names_of_excess_path_columns_are_read_and_listed(tmp_path):
     row, settings = "0.1,7,0.5,4.0,3.25,0.01,mate", UNICYCLE + "detour_std = 0.05\n" + CALLERS
     former = ",detour,detour_std,caller"
     log = read_log(timed(tmp_path / "former", row, settings=settings, stated=former))
@@ -801,7 +799,7 @@ def test_a_log_that_calls_excess_paths_by_their_former_name_is_read_and_says_so(
 
 
 @pytest.mark.parametrize("order", [(0, 1, 2, 3, 4), (4, 3, 2, 1, 0), (2, 4, 0, 3, 1)])
-def test_columns_after_the_four_may_stand_in_any_order(tmp_path, order):
+def test_columns_after_the_first_four_may_have_any_order(tmp_path, order):
     names, row = (
         ("bearing_std", "range_std", "excess_path", "excess_path_std", "caller"),
         "0.1,7,0.5,4.0",
@@ -814,7 +812,7 @@ def test_columns_after_the_four_may_stand_in_any_order(tmp_path, order):
     assert [part.item() for part in told] == [0.01, 0.2, 3.5, 0.03, 2]
 
 
-def test_a_log_without_callers_says_nothing_of_them(folder):
+def test_a_log_without_callers_has_no_caller_columns(folder):
     log = read_log(folder)
     assert log.callers == ()
     assert log.excess_path_std is None

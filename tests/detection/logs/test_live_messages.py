@@ -44,7 +44,7 @@ def winding(covariance=None):
 
 @pytest.mark.parametrize("motion", ["poses", "twist"])
 @pytest.mark.parametrize("sure", [False, True])
-def test_steps_between_messages_are_those_of_their_bag(tmp_path, motion, sure):
+def test_steps_of_live_messages_equal_the_bags(tmp_path, motion, sure):
     covariance = np.zeros(36)
     covariance[[0, 7, 35, 5, 30]] = 0.04, 0.01, 0.09, 0.01, 0.01
     told = [*winding(covariance if sure else None)]
@@ -65,7 +65,7 @@ def test_steps_between_messages_are_those_of_their_bag(tmp_path, motion, sure):
     assert stamp_and_pose(made[0])[1] == pytest.approx(log.initial_pose, abs=1e-12)
 
 
-def test_scans_of_messages_are_those_of_their_bag(tmp_path):
+def test_scans_of_live_messages_equal_the_bags(tmp_path):
     tie = static("base_link", "sonar", 0.4, -0.2, 0.3)
     ping = {
         "header": header(0.1, "sonar"),
@@ -104,7 +104,7 @@ def test_a_range_that_is_nothing_heard_in_a_bag_is_no_scan(far):
 
 
 @pytest.mark.parametrize("q", [{"z": 0.2}, {}, {"x": 1.0}, {"z": 512.0, "w": 512.0}])
-def test_an_orientation_that_is_none_is_refused_as_in_a_bag(q):
+def test_an_invalid_orientation_is_refused_as_in_a_bag(q):
     told = odometry(0.5, 1.0, 0.0, 0.0)
     told["pose"]["pose"]["orientation"] = q
     odd = message(ODOMETRY, told)

@@ -40,7 +40,7 @@ def refused(folder, *parts):
         assert part in str(error.value)
 
 
-def test_the_settings_are_those_chosen_for_the_robots():
+def test_an_mrclam_log_has_the_settings_of_its_robots():
     log = read_mrclam(MADE_UP, 1)
     assert (log.name, log.motion) == ("mrclam_made_up_robot1", "unicycle")
     assert (log.control_std, log.range_std, log.bearing_std) == ((0.10, 0.15), 0.2, 0.06)
@@ -152,7 +152,7 @@ def test_more_than_a_twentieth_of_unknown_barcodes_is_refused(folder):
 
 
 @pytest.mark.parametrize("robot", range(1, 6))
-def test_set_6_is_read_as_it_is(real, robot):
+def test_every_row_of_set_6_is_read_or_counted_as_ignored(real, robot):
     log = read_mrclam(real, robot)
     rows = np.loadtxt(real / f"Robot{robot}_Measurement.dat")
     subject = {barcode: s for s, barcode in np.loadtxt(real / "Barcodes.dat")}

@@ -89,7 +89,7 @@ def drives(draw, *, least=1):
 # Ways
 
 
-def test_a_way_is_forward_to_the_left_and_a_turn_seen_from_the_pose_before(tmp_path):
+def test_controls_are_motions_relative_to_the_previous_pose(tmp_path):
     log = read_log(recorded(tmp_path / "drive"))
     c, s = np.cos(0.1), np.sin(0.1)
     by_hand = [[0.5, 0.0, 0.1], [0.0, 0.0, 0.0], [0.2 * s, 0.2 * c, 2.9]]
@@ -99,7 +99,7 @@ def test_a_way_is_forward_to_the_left_and_a_turn_seen_from_the_pose_before(tmp_p
     assert motion_of(log) == Motion(model="poses", control_std=(0.02, 0.01, 0.03))
 
 
-def test_a_turn_goes_the_shorter_way_across_half_a_turn_and_whole_ones_are_nothing():
+def test_turns_are_wrapped_to_the_shorter_direction():
     headings = np.array([3.0, -3.0, -3.0 + 2.0 * np.pi, 3.1, -3.1])
     poses = np.column_stack([np.zeros((5, 2)), headings])
     turns = motions_between(table(range(5), poses), np.arange(5.0))[:, 2]
@@ -108,7 +108,7 @@ def test_a_turn_goes_the_shorter_way_across_half_a_turn_and_whole_ones_are_nothi
 
 
 @given(drives(), st.tuples(lengths, lengths, angles))
-def test_ways_do_not_know_where_the_recorders_frame_begins(drive, frame):
+def test_motions_do_not_depend_on_the_recorders_frame(drive, frame):
     time, poses = drive
     c, s = np.cos(frame[2]), np.sin(frame[2])
     shifted = np.column_stack(
@@ -139,7 +139,7 @@ def test_between_rows_it_goes_on_at_constant_velocity(speed, rate, parts):
     np.testing.assert_allclose(motions, relative_motions(np.array(arc)), rtol=0, atol=1e-13)
 
 
-def test_what_stands_stands_to_the_bit_in_merged_steps_and_cut_rows_too(tmp_path):
+def test_poses_at_rest_give_zero_steps_to_the_bit_after_merging(tmp_path):
     """Times of a recorder, in steps that its rows do not divide."""
     stamps = [f"{1e9 + 0.017 * i:.3f}" for i in range(80)]
     poses = [(3.7, -0.123456789, 2.5) if i < 42 else (3.7, 0.01 * i, 2.5) for i in range(80)]
@@ -158,7 +158,7 @@ def test_a_step_that_ends_with_a_row_but_for_rounding_ends_with_the_row(rounding
     np.testing.assert_allclose(motions, relative_motions(np.array(poses)), rtol=0, atol=0)
 
 
-def test_rows_may_lie_any_time_apart(tmp_path):
+def test_gaps_between_rows_may_be_of_any_length(tmp_path):
     """Ten seconds without a row are one way, however long a step is."""
     text = f"{HEADER}\n0,0,0,0\n0.05,0.1,0,0\n10.05,4.1,0,0\n10.06,4.2,0,0\n"
     log = read_log(recorded(tmp_path, text))
@@ -168,7 +168,7 @@ def test_rows_may_lie_any_time_apart(tmp_path):
     assert sum(log.controls[:, 0]) == pytest.approx(4.2)
 
 
-def test_of_rows_with_one_time_the_last_says_where_it_is_and_no_way_is_lost(tmp_path):
+def test_the_last_of_simultaneous_rows_counts_and_no_motion_is_lost(tmp_path):
     text = f"{HEADER}\n0,9,9,0\n0,0,0,0\n1,1,0,0\n1,1.5,0,0\n2,2,0,0\n"
     log = read_log(recorded(tmp_path, text))
     np.testing.assert_allclose(log.controls[:, 0], [1.5, 0.5])
@@ -217,7 +217,7 @@ def rows_of(motions):
     return np.vstack([np.full(6, np.nan), motions[:, 3:]])
 
 
-def test_a_row_says_how_surely_the_way_that_led_to_it_is_known(tmp_path):
+def test_a_rows_covariance_is_of_the_motion_that_ends_there(tmp_path):
     rows = ["0,0,0,0,,,,,,", "1,1,0,0,4,0.5,-0.3,2,0.1,1", "2,2,0,0,,,,,,"]
     log = read_log(recorded(tmp_path, STATED + "\n".join(rows)))
     assert log.controls[0].tolist() == [1, 0, 0, 4, 0.5, -0.3, 2, 0.1, 1]
@@ -230,11 +230,11 @@ def test_a_row_says_how_surely_the_way_that_led_to_it_is_known(tmp_path):
 @pytest.mark.parametrize(
     "rows", [["0,0,0,0,,,,,,", "1,1,0,0,,,,,,"], ["0,0,0,0,4,0,0,4,0,4", "1,1,0,0,,,,,,"]]
 )
-def test_columns_in_which_no_way_says_anything_are_none(tmp_path, rows):
+def test_covariance_columns_without_a_value_are_dropped(tmp_path, rows):
     assert read_log(recorded(tmp_path, STATED + "\n".join(rows))).controls.shape == (1, 3)
 
 
-def test_covariances_of_whole_rows_are_what_the_file_says_to_the_bit():
+def test_covariances_of_unmerged_rows_equal_the_file_to_the_bit():
     motions, poses = drive_of()
     time = np.arange(float(len(poses)))
     read = motions_between(table(time, poses, rows_of(motions)), time)
@@ -242,7 +242,7 @@ def test_covariances_of_whole_rows_are_what_the_file_says_to_the_bit():
 
 
 @pytest.mark.parametrize("many", [2, 3, 12])
-def test_covariances_of_merged_rows_are_what_their_ways_add_up_to(many):
+def test_covariances_of_merged_rows_are_composed_along_the_motions(many):
     motions, poses = drive_of()
     time = np.arange(float(len(poses)))
     merged = motions_between(table(time, poses, rows_of(motions)), time[::many])
@@ -276,7 +276,7 @@ def test_a_row_that_is_cut_gives_each_part_its_share():
     np.testing.assert_allclose(parts[:, 3:], [np.multiply(0.25, Q), np.multiply(0.75, Q)])
 
 
-def test_of_rows_with_one_time_none_of_the_noise_is_lost():
+def test_covariances_of_simultaneous_rows_add_up():
     Q = np.array([4.0, 0.5, -0.3, 2.0, 0.1, 1.0])
     poses, nothing = [[0.0, 0, 0], [1.0, 0, 0], [1.0, 0, 0], [1.0, 0, 0]], np.full(6, np.nan)
     file = table([0.0, 0.0, 1.0, 1.0], poses, [nothing, 5.0 * Q, Q, 2.0 * Q])
@@ -284,7 +284,7 @@ def test_of_rows_with_one_time_none_of_the_noise_is_lost():
     np.testing.assert_allclose(way[3:], 3.0 * Q)
 
 
-def test_a_step_of_which_a_part_says_nothing_has_the_noise_of_the_settings():
+def test_a_step_with_a_part_without_covariance_takes_the_settings_noise():
     Q = np.array([4.0, 0.5, -0.3, 2.0, 0.1, 1.0])
     file = table(range(5), np.zeros((5, 3)), [[np.nan] * 6, Q, [np.nan] * 6, Q, Q])
     merged = motions_between(file, np.array([0.0, 2.0, 4.0]))
@@ -324,7 +324,7 @@ COVARIANCES = {
 @pytest.mark.parametrize(
     ("row", "parts"), [(r, p) for r, *p in COVARIANCES.values()], ids=COVARIANCES
 )
-def test_what_is_no_covariance_is_refused_by_its_line(tmp_path, row, parts):
+def test_an_invalid_covariance_is_refused_by_its_line(tmp_path, row, parts):
     text = f"{STATED}0,0,0,0,,,,,,\n\n1,0,0,0,,,,,,\n2,{row}\n3,0,0,0,1,0,0,1,0,1\n"
     refused(lambda: read_log(recorded(tmp_path, text)), "odometry.csv, line 5", *parts)
 
@@ -347,7 +347,7 @@ def test_a_bad_row_of_poses_is_refused_by_its_line(tmp_path, row, parts):
     refused(lambda: read_log(recorded(tmp_path, ODOMETRY + row + "\n")), "odometry.csv", *parts)
 
 
-def test_headings_that_are_not_wrapped_and_those_from_0_to_a_turn_are_welcome(tmp_path):
+def test_unwrapped_headings_and_headings_in_0_to_2_pi_are_accepted(tmp_path):
     for headings in ([0.0, 3.0, 6.0, 9.0], [0.1, 6.27, 0.05, 6.28319]):
         rows = [f"{0.1 * k},0,0,{heading}" for k, heading in enumerate(headings)]
         log = read_log(recorded(tmp_path, "\n".join([HEADER, *rows])))
@@ -364,7 +364,7 @@ def test_headings_that_are_not_wrapped_and_those_from_0_to_a_turn_are_welcome(tm
         "time,x,y,heading,motion_xy,motion_xx",
     ],
 )
-def test_a_header_that_is_not_that_of_poses_names_what_it_may_be(tmp_path, header):
+def test_a_wrong_pose_header_is_refused_with_the_allowed_columns(tmp_path, header):
     folder = recorded(tmp_path, ODOMETRY.replace(HEADER, header))
     may = f"'{HEADER}', perhaps followed by {', '.join(COVARIANCE)};"
     refused(lambda: read_log(folder), "odometry.csv, line 1", repr(header), may)
@@ -380,14 +380,14 @@ def test_covariances_may_not_follow_the_columns_of_controls(tmp_path):
 
 
 @pytest.mark.parametrize("key", ["forward_std", "sideways_std", "turn_std"])
-def test_the_noise_of_a_way_is_asked_for_by_its_keys(tmp_path, key):
+def test_missing_or_negative_noise_of_poses_is_refused_by_key(tmp_path, key):
     settings = re.sub(rf"{key} = .*\n", "", SETTINGS)
     refused(lambda: read_log(recorded(tmp_path, settings=settings)), f"no key {key!r}", "turn_std")
     settings = re.sub(rf"{key} = .*\n", f"{key} = -1\n", SETTINGS)
     refused(lambda: read_log(recorded(tmp_path, settings=settings)), f"key {key!r}: found -1")
 
 
-def test_the_keys_of_a_vehicle_are_none_of_poses(tmp_path):
+def test_keys_of_vehicles_are_refused_for_poses(tmp_path):
     settings = SETTINGS + "velocity_std = 0.1\n"
     refused(lambda: read_log(recorded(tmp_path, settings=settings)), "unknown key 'velocity_std'")
     settings = SETTINGS.replace('"poses"', '["poses"]')
@@ -404,7 +404,7 @@ def test_one_pose_is_no_drive(tmp_path):
 # A frame that is begun anew
 
 
-def test_a_way_far_beyond_the_usual_is_found_and_no_drive_is():
+def test_only_motions_far_beyond_the_usual_are_jumps():
     motions, dt = wandering(np.random.default_rng(1), 200, stated=True), np.full(200, 0.1)
     assert jumps(motions, dt).size == 0
     assert jumps(np.zeros((5, 3)), np.ones(5)).size == 0
@@ -415,7 +415,7 @@ def test_a_way_far_beyond_the_usual_is_found_and_no_drive_is():
     assert 70 not in jumps(motions, dt), "a long way in a long time"
 
 
-def test_a_small_way_of_a_vehicle_that_hardly_moves_is_no_jump():
+def test_a_small_motion_of_a_nearly_resting_vehicle_is_no_jump():
     motions = np.zeros((100, 3))
     motions[:, 0] = 1e-5
     motions[50] = [0.4, 0.0, 0.4]
@@ -463,7 +463,7 @@ def test_the_log_of_poses_of_the_data_survives_being_written(tmp_path):
 
 
 @given(st.lists(st.tuples(lengths, lengths, angles), min_size=1, max_size=20))
-def test_poses_along_ways_give_the_ways_again(ways):
+def test_motions_between_composed_poses_are_recovered(ways):
     motions = np.array(ways)
     change = relative_motions(poses_along(motions)) - motions
     np.testing.assert_allclose(change[:, :2], 0.0, atol=1e-13)
@@ -474,12 +474,7 @@ def test_poses_along_ways_give_the_ways_again(ways):
 def test_the_poses_on_the_pages_of_the_documentation_are_sound(tmp_path):
     page = (Path(__file__).parents[3] / "docs" / "log_format.md").read_text()
     plain, told = re.findall(r"^```text\n(time,x,y,heading.*?)^```", page, re.M | re.S)
-    log = read_log(
-        recorded(
-            tmp_path,
-            plain,
-        )
-    )
+    log = read_log(recorded(tmp_path, plain))
     assert log.controls.shape == (3, 3)
     assert log.controls[2].tolist() == [0.0, 0.0, 0.0]
     assert read_log(recorded(tmp_path, told)).controls.shape == (3, 9)

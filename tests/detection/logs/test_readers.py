@@ -19,7 +19,7 @@ def made_up(tmp_path):
     return Path(shutil.copytree(DATA / "mrclam_made_up", tmp_path / "set"))
 
 
-def test_a_folder_is_known_by_its_files(made_up):
+def test_a_format_is_recognised_by_its_files(made_up):
     assert reader_of(DATA / "unicycle_log") is LOG_FOLDER
     assert reader_of(made_up) is MRCLAM
     (made_up / "Barcodes.dat").unlink()
@@ -28,7 +28,7 @@ def test_a_folder_is_known_by_its_files(made_up):
     assert reader_of(made_up) is LOG_FOLDER
 
 
-def test_a_folder_that_nobody_knows_is_taken_for_a_log_folder(tmp_path):
+def test_an_unrecognised_folder_is_read_as_a_log_folder(tmp_path):
     assert reader_of(tmp_path) is LOG_FOLDER
     assert reader_of(tmp_path, [TAPE]) is LOG_FOLDER
 
@@ -39,13 +39,13 @@ def test_a_given_reader_is_asked_first(made_up):
     assert reader_of(made_up) is MRCLAM
 
 
-def test_the_robots_of_a_set_are_those_whose_odometry_is_there(made_up):
+def test_robots_of_a_set_are_listed_by_their_odometry_files(made_up):
     assert MRCLAM.robots(made_up) == [1]
     (made_up / "Robot4_Odometry.dat").touch()
     assert MRCLAM.robots(made_up) == [1, 4]
 
 
-def test_an_entry_reads_what_its_formats_own_function_reads():
+def test_each_reader_equals_its_formats_function():
     assert LOG_FOLDER.read(DATA / "bicycle_log").time.tolist() == (
         read_log(DATA / "bicycle_log").time.tolist()
     )
@@ -54,7 +54,7 @@ def test_an_entry_reads_what_its_formats_own_function_reads():
     assert log.time.tolist() == read_mrclam(DATA / "mrclam_made_up", 1, span).time.tolist()
 
 
-def test_every_format_has_a_name_of_its_own_and_words_for_the_help():
+def test_every_format_has_a_unique_name_and_a_help_text():
     assert len({reader.name for reader in READERS}) == len(READERS)
     assert all(reader.help for reader in READERS)
     assert all(bool(reader.robots) == bool(reader.robot_help) for reader in READERS)

@@ -1,5 +1,6 @@
 """Sound of calls that are no tones: own recordings give the run's own rows."""
 
+import shutil
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -82,7 +83,7 @@ def scans_of_run(settings):
     ],
     indirect=True,
 )
-def test_what_is_heard_of_a_call_is_what_the_run_heard(case):
+def test_detections_of_a_recorded_call_equal_the_runs(case):
     tape = record(Path("tape").absolute(), *words(case))
     log, run = heard(tape), scans_of_run(case)
     assert [scan.time for scan in log] == [scan.time for scan in run]
@@ -100,7 +101,7 @@ def test_what_is_heard_of_a_call_is_what_the_run_heard(case):
     assert found >= rows - 2  # next to the threshold the measured noise may decide otherwise
 
 
-def test_slam_on_what_was_heard_of_a_sweep_is_the_run_again(tmp_path):
+def test_slam_on_a_recorded_sweep_repeats_the_run(tmp_path):
     sweep = words(SWEEP)
     record(tmp_path / "tape", *UNLABELLED, "--filter.noise", "measured", *sweep)
     pipistrelle.hear(tmp_path / "tape", output=tmp_path / "log")
@@ -115,7 +116,7 @@ def test_slam_on_what_was_heard_of_a_sweep_is_the_run_again(tmp_path):
         assert np.abs(again[name].to_numpy() - run[name].to_numpy()).max() < 0.03
 
 
-def test_a_recording_says_what_was_sent_and_keeps_its_file(tmp_path, monkeypatch):
+def test_a_recording_describes_and_keeps_the_sent_call(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     time = np.arange(500) / 250e3
     wave = Sweep(60e3, 35e3, 2e-3).waveform(time, 47.5e3).real
@@ -130,6 +131,13 @@ def test_a_recording_says_what_was_sent_and_keeps_its_file(tmp_path, monkeypatch
     np.testing.assert_allclose(kept, wave, atol=1e-6)
 
 
+@pytest.fixture(scope="module")
+def two_frames(tmp_path_factory):
+    """A recording of two frames of a vehicle that sends sweeps."""
+    folder = tmp_path_factory.mktemp("sweep") / "tape"
+    return record(folder, "--emitter.call", "sweep", "--frames", "0:2")
+
+
 @pytest.mark.parametrize(
     ("old", "new", "message"),
     [
@@ -139,8 +147,8 @@ def test_a_recording_says_what_was_sent_and_keeps_its_file(tmp_path, monkeypatch
         ("band = [", "bend = [", "bend"),
     ],
 )
-def test_a_call_that_is_told_wrongly_is_refused(tmp_path, old, new, message):
-    tape = record(tmp_path / "tape", "--emitter.call", "sweep", "--frames", "0:2")
+def test_a_wrongly_described_call_is_refused(two_frames, tmp_path, old, new, message):
+    tape = shutil.copytree(two_frames, tmp_path / "tape")
     text = (tape / "recording.toml").read_text()
     text = text.replace("taper = 0.0\n", "", 1).replace(old, new, 1)
     (tape / "recording.toml").write_text(text)
@@ -148,7 +156,7 @@ def test_a_call_that_is_told_wrongly_is_refused(tmp_path, old, new, message):
         heard(tape)
 
 
-def test_a_sweep_that_nobody_says_when_it_comes_is_found_by_its_leak(tmp_path):
+def test_a_sweep_without_call_times_is_found_by_its_leakage(tmp_path):
     tape = record(tmp_path / "tape", "--emitter.call", "sweep", "--frames", "1:5")
     told = heard(tape)
     (tape / "calls.csv").unlink()

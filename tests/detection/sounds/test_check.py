@@ -52,7 +52,7 @@ def exchanged(rows, pairs):
         rows[i][0], rows[j][0] = rows[j][0], rows[i][0]
 
 
-def test_nothing_is_odd_about_a_recording_of_our_own(sound):
+def test_a_simulated_recording_passes_all_checks(sound):
     assert checked(sound) == []
 
 
@@ -65,7 +65,7 @@ def test_channels_that_are_swapped_are_named(tape, i, j):
     assert any(one in fault for one in named)
 
 
-def test_what_is_swapped_is_named_of_microphones_all_around_that_hear_sweeps(tmp_path):
+def test_swapped_channels_of_a_circular_array_are_named_from_sweeps(tmp_path):
     circle = (
         "--receiver.array",
         str(Path(__file__).parents[3] / "examples" / "arrays" / "circle.csv"),
@@ -122,7 +122,7 @@ def test_silence_says_nothing_of_the_sample_rate(tape):
     assert not any("sample rate" in fault for fault in faults)
 
 
-def test_a_sample_rate_that_does_not_fit_the_call_is_told_with_the_one_that_would(tape):
+def test_a_wrong_sample_rate_is_reported_with_the_right_value(tape):
     samples, _ = soundfile.read(tape / "recording.wav", dtype="float32")
     soundfile.write(tape / "recording.wav", samples, 192_000, subtype="PCM_16")
     about = (tape / "recording.toml").read_text().replace("200000.0", "192000.0")
@@ -136,7 +136,7 @@ def test_a_sample_rate_that_does_not_fit_the_call_is_told_with_the_one_that_woul
         assert "as 200000 Hz nearly would" in fault
 
 
-def test_a_clock_that_jumps_is_told_where_it_does(tape):
+def test_a_clock_jump_is_reported_with_its_call(tape):
     def lose(rows):
         for row in rows[5:]:
             row[0] = str(int(row[0]) - 700)

@@ -67,7 +67,7 @@ def agreeing(scan, run, bearing, way):
     return count
 
 
-def test_what_is_heard_of_a_recording_is_what_the_run_heard(own):
+def test_detections_of_a_recording_equal_the_runs(own):
     log, _ = heard(own)
     run = frames_of_run()
     assert [scan.time for scan in log.scans] == [scan.time for scan in run]
@@ -89,7 +89,7 @@ HARBOUR_SWEEP = {"call": "sweep", "band": (165e3, 135e3), "taper": 0.2}
     [({}, 1e-6), pytest.param(HARBOUR_SWEEP, 1e-4, marks=pytest.mark.slow)],
     ids=["tone", "sweep"],
 )
-def test_what_is_heard_under_water_is_what_the_run_heard(tmp_path, emitter, limit):
+def test_detections_of_an_underwater_recording_equal_the_runs(tmp_path, emitter, limit):
     harbour = str(Path(__file__).parents[3] / "examples" / "harbour.toml")
     words = [f"--emitter.{key}={value}" for key, value in emitter.items() if key != "band"]
     words += ["--emitter.band", *map(str, emitter["band"])] if emitter else []
@@ -104,7 +104,7 @@ def test_what_is_heard_under_water_is_what_the_run_heard(tmp_path, emitter, limi
     assert found >= rows - 2
 
 
-def test_the_log_of_a_recording_is_read_as_it_was_heard(own, tmp_path):
+def test_the_log_of_a_recording_holds_its_detections(own, tmp_path):
     done = pipistrelle.hear(own, output=tmp_path / "log")
     log, scans = read_log(tmp_path / "log"), heard(own)[0].scans
     assert done.measurements.height == sum(scan.bearing.size for scan in scans)
@@ -116,7 +116,7 @@ def test_the_log_of_a_recording_is_read_as_it_was_heard(own, tmp_path):
     assert pipistrelle.hear(own).measurements.equals(done.measurements)
 
 
-def test_slam_on_what_was_heard_is_the_run_again(tmp_path):
+def test_slam_on_a_recording_repeats_the_run(tmp_path):
     record(tmp_path / "tape", *UNLABELLED, "--filter.noise", "measured", "--filter", "smoother")
     pipistrelle.hear(tmp_path / "tape", output=tmp_path / "log")
     asked = {"filters": "smoother", "association__method": "marginal"}
@@ -129,7 +129,7 @@ def test_slam_on_what_was_heard_is_the_run_again(tmp_path):
         assert np.abs(again[name].to_numpy() - run[name].to_numpy()).max() < 0.01
 
 
-def test_sixteen_bits_and_flac_hold_nearly_the_same(tmp_path):
+def test_sixteen_bits_and_flac_give_nearly_the_same_detections(tmp_path):
     record(tmp_path / "short", "--sound-bits", "16")
     samples, rate = soundfile.read(tmp_path / "short" / "recording.wav", dtype="int16")
     assert np.abs(samples.astype(int)).max() > 2000
@@ -148,7 +148,7 @@ def test_sixteen_bits_and_flac_hold_nearly_the_same(tmp_path):
 
 
 @pytest.mark.parametrize("faces", [True, False])
-def test_a_point_is_where_another_program_put_it(tmp_path, faces):
+def test_a_point_simulated_by_another_program_is_located(tmp_path, faces):
     log, found = heard(foreign(tmp_path / "tape", place=(1.5, 0.9), faces=faces))
     assert [scan.time for scan in log.scans] == [10.0 + s / 192e3 for s in (1000, 25e3, 47e3)] or (
         len(log.scans) == 3
@@ -177,7 +177,7 @@ def test_gains_and_offsets_of_channels_do_not_matter(tmp_path):
 
 
 @pytest.mark.parametrize("way", ["period", "trigger", "leak"])
-def test_calls_are_found_where_calls_csv_would_have_said(tmp_path, way):
+def test_calls_are_found_without_calls_csv_at_the_same_times(tmp_path, way):
     folder = foreign(tmp_path / "tape", calls=(1013, 25_013, 49_013))
     told, _ = heard(folder)
     (folder / "calls.csv").unlink()
@@ -270,7 +270,7 @@ def as_one_place(folder):
     (folder / "recording.toml").write_text(f"one_centre = true\n{about}")
 
 
-def test_noise_alone_passes_as_often_as_it_is_said_to(tmp_path):
+def test_pure_noise_passes_at_the_false_alarm_probability(tmp_path):
     folder = foreign(
         tmp_path / "tape", rate=200_000, frequency=40e3, duration=6e-4, amplitude=0.0,
         calls=tuple(range(1000, 400_000, 20_000)),
@@ -340,7 +340,7 @@ def refused(folder, *words):
     return str(error.value)
 
 
-def test_what_is_wrong_with_a_recording_is_named(tmp_path):
+def test_faults_of_a_recording_are_named(tmp_path):
     sound = foreign(tmp_path / "sound")
 
     def spoiled(name, change):
@@ -383,7 +383,7 @@ def test_what_is_wrong_with_a_recording_is_named(tmp_path):
         refused(folder, *words)
 
 
-def test_faces_that_share_a_centre_are_lines_that_are_alike(tmp_path):
+def test_faces_that_share_a_centre_must_be_equal_lines(tmp_path):
     folder = foreign(tmp_path / "sound")
     as_one_place(folder)
     heard(folder)

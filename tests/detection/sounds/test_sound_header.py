@@ -84,7 +84,7 @@ def test_a_cut_file_is_refused_with_the_bytes_that_are_missing(tmp_path, kind, m
 
 @pytest.mark.parametrize("size", [0, 0x7FFFF000, 0xFFFFFFFF])
 @pytest.mark.parametrize("order", ["<", ">"])
-def test_a_size_that_was_never_filled_in_is_named_with_what_fills_it_in(tmp_path, size, order):
+def test_an_unfilled_size_is_refused_with_the_command_that_mends_it(tmp_path, size, order):
     path = recording(tmp_path / "tape", order="FILE" if order == "<" else "BIG", width="PCM_16")
     data = path.read_bytes()
     place = data.find(b"data") + 4
@@ -132,7 +132,7 @@ def test_hours_of_digital_silence_in_a_few_bytes_are_refused_before_they_are_rea
     assert samples_of(path.parent) == (100_000, 3)
 
 
-def test_doors_that_are_odd_are_named(tmp_path):
+def test_invalid_sound_files_are_refused_by_name(tmp_path):
     import os
 
     path = recording(tmp_path / "tape")

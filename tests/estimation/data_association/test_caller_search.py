@@ -92,13 +92,13 @@ def test_where_a_second_search_disagrees_the_mean_of_both_is_taken():
     assert error[1] < 0.6 * error[0]
 
 
-def test_where_they_differ_widely_the_second_alone_is_taken():
+def test_the_second_search_replaces_a_widely_different_first():
     first = found_first(2.5)
     _, place = searched(first, moves=False)
     assert place[:2] == pytest.approx(find_caller(first.tracks).place[:2])
 
 
-def test_where_both_searches_agree_it_is_where_it_was_and_is_not_followed_on():
+def test_a_second_search_that_agrees_keeps_the_position_and_ends_tracking():
     first = found_first(1.02)
     caller, place = searched(first, moves=False)
     assert place is None
@@ -106,7 +106,7 @@ def test_where_both_searches_agree_it_is_where_it_was_and_is_not_followed_on():
     assert not len(caller.tracks.poses)
 
 
-def test_a_second_search_that_finds_nothing_is_given_up():
+def test_an_unsuccessful_second_search_ends_after_30_scans():
     for scans, given_up in ((20, False), (28, False), (30, True)):
         first = found_first(1.5, scans=scans, landmarks=3)
         caller, place = searched(first, moves=False)
@@ -114,7 +114,7 @@ def test_a_second_search_that_finds_nothing_is_given_up():
         assert caller.place.agreed == given_up, scans
 
 
-def test_who_is_found_late_or_moves_is_searched_for_once():
+def test_a_late_or_moving_caller_is_searched_for_once():
     for scans, moves, once in ((8, False, False), (18, False, False), (20, False, True)):
         unknown = Caller(label=1, tracks=heard(3, scans=scans)[0])
         assert searched(unknown, moves)[1].agreed == once, scans
@@ -149,7 +149,7 @@ def test_a_caller_that_moves_is_found_with_its_velocity(how):
     assert sure >= 4
 
 
-def test_one_that_moves_fits_no_place_and_one_that_stands_is_found_at_rest():
+def test_only_a_fixed_caller_fits_a_position_and_is_found_at_rest():
     tracks, _ = heard(3, caller=lambda t: way(t, (0.9, 0.7)))
     assert find_caller(tracks).misfit > 2.0 * find_moving_caller(tracks).misfit
     still = find_moving_caller(heard(3)[0])
@@ -157,7 +157,7 @@ def test_one_that_moves_fits_no_place_and_one_that_stands_is_found_at_rest():
     assert np.hypot(*still.place.motion[:2]) < 0.3
 
 
-def test_a_vehicle_that_stands_still_finds_no_caller():
+def test_a_vehicle_at_rest_finds_no_caller():
     rng, tracks = np.random.default_rng(0), Tracks()
     bearing, way = rng.uniform(-3.0, 3.0, 15), rng.uniform(2.0, 20.0, 15)
     for k in range(12):
@@ -170,13 +170,13 @@ def test_a_vehicle_that_stands_still_finds_no_caller():
         assert found is None or not found.sure
 
 
-def test_tracks_follow_landmarks_and_break_at_none():
+def test_tracks_follow_all_landmarks_without_breaks():
     tracks, _ = heard(5)
     table, _, _ = in_window(tracks, 14, 12)
     assert len(table) >= 15, "of 20 landmarks, two may be too near each other to tell"
 
 
-def test_too_few_tracks_or_no_direct_call_say_nothing():
+def test_too_few_tracks_or_no_direct_call_find_no_caller():
     assert find_caller(Tracks()) is None is find_moving_caller(Tracks())
     tracks, _ = heard(1, landmarks=5)
     assert find_caller(tracks) is None

@@ -72,7 +72,7 @@ def test_the_search_finds_the_best_of_all_sets(seed):
 
 
 @pytest.mark.parametrize("seed", range(4))
-def test_innovations_are_those_of_the_slow_version(seed):
+def test_innovations_match_the_slow_version(seed):
     joint, columns = drawn(seed)
     row, landmark = np.array([0, 1, 3]), np.array([2, 0, 4])
     _, innovate = costs_and_innovations(joint, columns)
@@ -89,7 +89,7 @@ def test_innovations_are_those_of_the_slow_version(seed):
             assert block == pytest.approx(slow.covariance[p, :count, q, : numbers[q]], abs=1e-12)
 
 
-def test_a_turned_vehicle_is_told_by_all_rows_together_where_each_by_itself_errs():
+def test_a_heading_error_is_resolved_by_joint_but_not_single_compatibility():
     ring = np.linspace(0.0, 2.0 * np.pi, 12, endpoint=False)
     places = 5.0 * np.stack([np.cos(ring), np.sin(ring)], axis=-1)
     covariance = 1e-6 * np.eye(27)
@@ -112,7 +112,7 @@ def test_a_scan_of_many_rows_ends_within_its_bound():
     assert np.count_nonzero(jointly_compatible(costs, innovate) >= 0) >= 10
 
 
-def test_no_rows_and_no_landmarks_are_no_harm():
+def test_no_rows_or_no_landmarks_give_no_pairs():
     assert jointly_compatible(np.empty((0, 3)), None).tolist() == []
     assert jointly_compatible(np.empty((2, 0)), None).tolist() == [-1, -1]
 

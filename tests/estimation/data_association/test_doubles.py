@@ -31,12 +31,12 @@ def asked_of(joint, apart=None, asked=None):
 
 
 @pytest.mark.parametrize("asked", [[4], [7], [0], [5, 6]])
-def test_a_closed_loop_is_seen_by_the_group_whoever_is_asked(asked):
+def test_a_closed_loop_is_found_as_a_group_from_any_member(asked):
     joint = closed_loop(np.array([2.5, -1.5]), drift_std=2.0)
     assert sorted(asked_of(joint, asked=np.array(asked))) == [(0, 4), (1, 5), (2, 6), (3, 7)]
 
 
-def test_one_pair_after_a_long_drift_tells_nothing():
+def test_a_single_pair_after_a_long_drift_is_no_evidence():
     assert asked_of(closed_loop(np.array([2.5, -1.5]), drift_std=2.0, twice=1)) == []
 
 
@@ -44,7 +44,7 @@ def test_one_pair_in_one_place_is_one_landmark():
     assert asked_of(closed_loop(np.array([0.1, 0.0]), drift_std=0.02, twice=1)) == [(0, 4)]
 
 
-def test_what_was_heard_together_stays_two():
+def test_landmarks_measured_in_one_scan_are_not_merged():
     joint = closed_loop(np.array([0.1, 0.0]), drift_std=0.02, twice=1)
     apart = np.eye(5, dtype=bool)
     apart[0, 4] = apart[4, 0] = True

@@ -62,9 +62,7 @@ def labelled(early, joint, at, method="marginal"):
 
 @pytest.mark.parametrize("method", ["nearest", "joint", "marginal"])
 @pytest.mark.parametrize("seed", range(4))
-def test_bearings_alone_are_labelled_though_the_map_is_turned_by_more_than_they_are_apart(
-    seed, method
-):
+def test_bearings_are_labelled_though_the_map_is_turned_beyond_their_spacing(seed, method):
     joint, places = world(seed, turn=[-0.15, 0.1, 0.12, 0.16][seed])
     early, truth = early_scan(places, False, np.random.default_rng(seed))
     scan = labelled(early, joint, UNPLACED, method)
@@ -102,7 +100,7 @@ def test_a_map_that_fits_at_two_turns_labels_nothing():
     assert (labelled(early, joint, UNPLACED).landmark == UNLABELLED).all()
 
 
-def test_what_was_given_is_not_changed_and_the_vehicles_own_rows_are_left_alone():
+def test_inputs_are_unchanged_and_the_vehicles_echoes_stay_unlabelled():
     joint, places = world(1, 0.1)
     early, _ = early_scan(places, False, np.random.default_rng(1))
     caller = early.scan.caller.copy()
@@ -116,7 +114,7 @@ def test_what_was_given_is_not_changed_and_the_vehicles_own_rows_are_left_alone(
     np.testing.assert_array_equal(early.scan.numbers, numbers)
 
 
-def test_a_turn_moves_the_mean_bearing_and_what_is_left_does_not():
+def test_removing_a_turn_removes_the_variance_of_the_mean_bearing():
     joint, _ = world(2, 0.1)
     rng = np.random.default_rng(2)
     root = 0.01 * rng.standard_normal((joint.mean.size, joint.mean.size))
@@ -138,7 +136,7 @@ def test_a_turn_moves_the_mean_bearing_and_what_is_left_does_not():
     assert turned - mean_bearing(joint.mean) == pytest.approx(0.001, rel=0.02)
 
 
-def test_who_only_listens_keeps_the_heading_of_the_start():
+def test_a_passive_vehicle_keeps_the_heading_of_the_start():
     """Without labels for the first scan both errors of this drive are 0.4 m."""
     settings = {
         "seed": 10,

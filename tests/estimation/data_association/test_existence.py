@@ -42,14 +42,14 @@ def test_odds_rise_with_each_scan_and_confirm_at_the_third():
     assert HEARD * 2 >= CONFIRMED
 
 
-def test_what_is_heard_less_surely_takes_more_scans():
+def test_less_certain_detections_take_more_scans_to_confirm():
     for times, confirmed in ((3, False), (4, False), (5, True)):
         known = heard_so_often(times, surety=0.5)
         assert known.odds[0] == pytest.approx(0.5 * HEARD * times - HEARD)
         assert bool(known.confirmed[0]) is confirmed
 
 
-def test_a_landmark_that_should_have_been_heard_and_was_not_is_given_up():
+def test_a_landmark_missed_repeatedly_is_deleted():
     known = heard_so_often(3)
     missed = judged(known, NONE, THERE, np.array([False]), 3)
     assert missed.odds[0] == pytest.approx(known.odds[0] - MISSED)
@@ -67,7 +67,7 @@ def test_a_landmark_that_should_have_been_heard_and_was_not_is_given_up():
         ("it is not on the map", NONE, (AHEAD, np.array([-1]), *THERE[2:])),
     ],
 )  # fmt: skip
-def test_nothing_is_expected_where(why, rows, there):
+def test_a_landmark_that_cannot_be_detected_keeps_its_odds(why, rows, there):
     known = heard_so_often(3)
     after = judged(known, rows, there, np.array([False]), 3)
     assert after.odds[0] == known.odds[0], why
@@ -93,7 +93,7 @@ def test_silence_counts_less_where_a_landmark_may_be_hidden_until_it_is_none(why
     assert after.odds[0] < GONE
 
 
-def test_a_caller_that_did_not_call_tells_nothing_though_a_row_is_near():
+def test_a_silent_caller_changes_no_odds_despite_a_near_row():
     mean = np.array([0.0, 0.0, 0.0, 4.0, 0.0, 0.0, 6.0])
     there = mean, np.array([3]), np.array([-2, 5]), np.zeros(2, bool)
     way = 4.0 + np.hypot(4.0, 6.0) - 6.0
@@ -132,7 +132,7 @@ def seen_so_often(times, sight=LIDAR):
     return known
 
 
-def test_a_sensor_without_levels_misses_what_is_within_its_sight():
+def test_a_sensor_without_levels_counts_misses_within_its_range():
     known = seen_so_often(3)
     for rows in (NONE, UNSEEN):
         missed = judged(known, rows, THERE, np.array([False]), 3, LIDAR)
@@ -151,14 +151,14 @@ def test_a_sensor_without_levels_misses_what_is_within_its_sight():
         ("others have levels", row(-1, 4.9, 30.0), (4.0, 0.0), LIDAR, False),
     ],
 )
-def test_a_sensor_without_levels_misses_nothing_where(why, rows, where, sight, near):
+def test_a_landmark_out_of_a_sensors_range_keeps_its_odds(why, rows, where, sight, near):
     known = seen_so_often(3)
     there = (np.array([0.0, 0.0, 0.0, *where]), *THERE[1:])
     after = judged(known, rows, there, np.array([near]), 3, sight)
     assert after.odds[0] == known.odds[0], why
 
 
-def test_what_is_not_yet_one_is_none_after_a_long_silence():
+def test_an_unconfirmed_landmark_is_deleted_after_a_long_silence():
     known = heard_so_often(1)
     nowhere = (AHEAD, np.array([-1]), *THERE[2:])
     for scan in range(1, PATIENCE + 2):
@@ -166,7 +166,7 @@ def test_what_is_not_yet_one_is_none_after_a_long_silence():
     assert known.odds[0] < GONE
 
 
-def test_what_is_given_is_not_changed():
+def test_judging_does_not_change_its_inputs():
     known = heard_so_often(2)
     before = [column.copy() for column in known]
     judged(known, row(), THERE, np.array([False]), 2)

@@ -66,7 +66,7 @@ def test_message_passing_is_exact_where_no_loop_is():
 
 
 @pytest.mark.parametrize("seed", range(20))
-def test_pairs_beyond_the_gate_are_as_pairs_without_weight(seed):
+def test_pairs_beyond_the_gate_have_zero_weight(seed):
     rng = np.random.default_rng(seed)
     costs = rng.normal(-3.0, 8.0, (6, 5))
     costs[rng.random((6, 5)) < 0.5] = np.inf
@@ -74,7 +74,7 @@ def test_pairs_beyond_the_gate_are_as_pairs_without_weight(seed):
     np.testing.assert_array_equal(probabilities(costs), probabilities(weightless))
 
 
-def test_what_two_landmarks_explain_alike_is_left_out_and_what_is_clutter_too():
+def test_ambiguous_rows_and_clutter_are_not_matched():
     assert marginal(np.array([[-9.0, -8.5]])).tolist() == [NOTHING]
     assert marginal(np.array([[-9.0, 2.0]])).tolist() == [0]
     assert marginal(np.array([[0.5, np.inf]])).tolist() == [NOTHING]

@@ -34,7 +34,7 @@ def rows_of(scan, way, std):
 
 @pytest.mark.parametrize("seed", range(5))
 @pytest.mark.parametrize("own", [True, False])
-def test_costs_are_those_of_the_joint_innovations(seed, own):
+def test_costs_match_the_joint_innovations(seed, own):
     joint, rng = joint_of(seed), np.random.default_rng(seed + 100)
     way = rng.uniform(1.0, 9.0, 6)
     columns = (
@@ -77,7 +77,7 @@ def test_a_row_that_is_clutter_more_rarely_costs_less_by_twice_the_logarithm():
 
 @pytest.mark.parametrize(("vague", "std", "told"),
                          [(0.02, 0.02, False), (0.06, 0.02, True), (0.02, 0.3, True)])  # fmt: skip
-def test_a_row_tells_of_a_landmark_that_is_known_or_as_well_as_the_row_says(vague, std, told):
+def test_a_row_matches_only_landmarks_known_as_well_as_the_row(vague, std, told):
     mean, covariance = np.array([0.0, 0.0, 0.0, 5.0, 0.0]), np.diag([0.0, 0.0, 0.0, 0.25, 0.25])
     row = np.zeros(1), np.full(1, 0.1), np.full(1, 5.0), np.full(1, std), np.ones(1)
     chances = *CHANCES[:4], vague

@@ -21,7 +21,7 @@ LIMITS = 0.05, 0.35, 0.25
 CHANCES = 25.0, 0.06, 1.3, 0.8, 0.06
 
 
-def test_rows_are_sure_as_the_formulae_written_out_say():
+def test_certainty_and_clutter_of_rows_match_the_formulae():
     rng = np.random.default_rng(5)
     caller, own = rng.integers(0, 2, 200), rng.choice([0.001, 0.01, 0.06, 0.15, np.nan], 200)
     way = np.where(rng.random(200) < 0.2, np.nan, 3.0)
@@ -43,7 +43,7 @@ def test_rows_are_sure_as_the_formulae_written_out_say():
 
 
 @pytest.mark.parametrize(("apart", "begun"), [(0.9, [1]), (1.1, [1, 0])])
-def test_a_row_beside_a_louder_one_begins_nothing_and_the_loudest_is_first(apart, begun):
+def test_a_row_next_to_a_louder_row_begins_no_landmark(apart, begun):
     way = np.array([3.0, 3.0 + apart * BESIDE / 2.0])
     stds = {"bearing_std": 0.01, "range_std": 0.02}
     level = np.array([30.0, 40.0])
@@ -61,7 +61,7 @@ def test_a_row_beside_a_louder_one_begins_nothing_and_the_loudest_is_first(apart
     assert count == (0, 2)
 
 
-def test_labels_are_among_others_as_numpy_says():
+def test_is_among_agrees_with_numpy():
     rng = np.random.default_rng(9)
     labels, others = rng.integers(-1, 9, 50), rng.integers(-1, 9, 4)
     assert np.array_equal(is_among(labels, others), np.isin(labels, others))

@@ -59,7 +59,7 @@ def scan_of(places, pose=(0.0, 0.0, 0.0), rng=None, time=0.0, level=40.0, **stds
 
 @pytest.mark.parametrize("method", ["nearest", "joint", "marginal"])
 @pytest.mark.parametrize("name", ["ekf", "iekf", "smoother", "fastslam"])
-def test_landmarks_that_are_apart_keep_their_labels_while_the_vehicle_drives(name, method):
+def test_separate_landmarks_keep_their_labels_while_the_vehicle_drives(name, method):
     session, rng = session_of(name, method), np.random.default_rng(3)
     for k in range(12):
         session.move(np.array([[0.5, 0.1]]), np.array([0.5]))
@@ -73,7 +73,7 @@ def test_landmarks_that_are_apart_keep_their_labels_while_the_vehicle_drives(nam
     assert {*session.belief.labels()} == {1, 2, 3, 4}
 
 
-def test_what_is_heard_once_is_on_no_map_and_is_forgotten():
+def test_a_landmark_measured_once_is_not_mapped_and_is_forgotten():
     session = session_of()
     session.hear(scan_of(np.vstack([PLACES, [[-5.0, -5.0]]])))
     assert session.landmarks().landmark.size == 0, "nothing is sure yet"
@@ -87,9 +87,7 @@ def test_what_is_heard_once_is_on_no_map_and_is_forgotten():
 @pytest.mark.parametrize(
     ("std", "scans"), [(0.01, 3), (0.032, 3), (0.045, 4), (0.051, None), (0.07, 4)]
 )
-def test_the_less_sure_bearings_are_the_more_scans_make_a_landmark_and_beyond_a_limit_none(
-    std, scans
-):
+def test_less_precise_bearings_need_more_scans_to_make_a_landmark(std, scans):
     session = session_of(bearing_std=0.07)  # what is only assumed is beyond no limit
     counts = []
     for _ in range(6):
@@ -98,7 +96,7 @@ def test_the_less_sure_bearings_are_the_more_scans_make_a_landmark_and_beyond_a_
     assert counts == [0 if scans is None or k < scans else 4 for k in range(1, 7)]
 
 
-def test_a_landmark_that_vanishes_is_removed_and_one_that_appears_is_born():
+def test_a_vanished_landmark_is_removed_and_a_new_landmark_added():
     session, there = session_of(), np.vstack([PLACES, [[1.5, -2.5]]])
     for _ in range(8):
         session.hear(scan_of(there))
@@ -111,7 +109,7 @@ def test_a_landmark_that_vanishes_is_removed_and_one_that_appears_is_born():
 
 
 @pytest.mark.parametrize("name", ["iekf", "smoother", "fastslam"])
-def test_what_was_heard_often_leaves_the_map_in_silence_and_is_the_same_when_heard_again(name):
+def test_an_often_measured_landmark_keeps_its_label_through_a_silence(name):
     session, there = session_of(name), np.vstack([PLACES, [[1.5, -2.5]]])
     for _ in range(LASTING):
         session.hear(scan_of(there))
@@ -125,7 +123,7 @@ def test_what_was_heard_often_leaves_the_map_in_silence_and_is_the_same_when_hea
     assert sorted(session.landmarks().landmark.tolist()) == [1, 2, 3, 4, 5]
 
 
-def test_two_landmarks_within_a_call_of_each_other_are_told_apart_once_both_are_heard():
+def test_two_landmarks_within_a_call_are_separated_once_both_are_measured():
     near = np.vstack([PLACES, PLACES[0] + [0.0, 1.2]])
     session, rng = session_of(), np.random.default_rng(0)
     for _ in range(10):
@@ -135,7 +133,7 @@ def test_two_landmarks_within_a_call_of_each_other_are_told_apart_once_both_are_
 
 
 @pytest.mark.parametrize("both", [True, False])
-def test_two_landmarks_closer_than_a_call_stay_two_though_now_and_then_one_alone_is_heard(both):
+def test_two_very_close_landmarks_stay_two_despite_missed_detections(both):
     near = np.vstack([PLACES, PLACES[0] + [0.0, 0.3]])
     session, rng = session_of(), np.random.default_rng(5)
     for k in range(24):
@@ -149,7 +147,7 @@ def test_two_landmarks_closer_than_a_call_stay_two_though_now_and_then_one_alone
 
 
 @pytest.mark.parametrize("name", ["iekf", "smoother"])
-def test_a_vehicle_that_starts_among_nothing_maps_what_it_comes_to(name):
+def test_a_vehicle_that_starts_without_landmarks_maps_later_landmarks(name):
     session, rng, nothing = session_of(name), np.random.default_rng(1), np.empty((0, 2))
     for k in range(60):
         session.move(np.array([[0.5, 0.1]]), np.array([0.5]))
@@ -161,14 +159,14 @@ def test_a_vehicle_that_starts_among_nothing_maps_what_it_comes_to(name):
     assert np.sqrt(np.trace(session.belief.pose().covariance[:2, :2])) > 0.1, "it was silent"
 
 
-def test_bearings_about_the_cut_behind_are_one_landmarks():
+def test_bearings_around_pi_belong_to_one_landmark():
     session = session_of()
     for y in (-0.05, 0.05, -0.05, 0.05):
         session.hear(scan_of(np.array([[-5.0, y]])))
     assert [label.tolist() for label in session.labels] == [[1]] * 4
 
 
-def test_what_is_taken_back_leaves_the_belief_as_if_it_had_never_been_heard():
+def test_a_retracted_landmark_leaves_no_trace_in_the_belief():
     ghost, beliefs = np.array([[-6.0, 2.0]]), []
     for haunted in (False, True):
         session = session_of()
@@ -181,7 +179,7 @@ def test_what_is_taken_back_leaves_the_belief_as_if_it_had_never_been_heard():
     np.testing.assert_allclose(beliefs[1].covariance, beliefs[0].covariance, atol=1e-14)
 
 
-def test_a_scan_without_rows_is_no_harm():
+def test_a_scan_without_rows_is_accepted():
     session = session_of()
     none = replace(
         scan_of(PLACES[:1]), landmark=np.empty(0, np.int64), caller=np.empty(0, np.int64)
@@ -192,7 +190,7 @@ def test_a_scan_without_rows_is_no_harm():
 
 
 @pytest.mark.parametrize("name", ["ekf", "fastslam"])
-def test_a_filter_that_is_told_the_papers_noise_finds_its_caller_by_what_the_signal_says(name):
+def test_a_filter_with_constant_noise_finds_its_caller_by_measured_noise(name):
     """Of 20 rows of a frame 0.15 rad and 0.4 m say little, and an association has no use for it."""
     settings = BEST | {"scenario": {"steps": 480}, "seed": 7, "association": {"method": "marginal"}}
     config = Config.model_validate(settings | {"filter": {"noise": "constant", "robust": "huber"}})
@@ -220,7 +218,7 @@ def test_associate_changes_nothing_that_it_is_given():
     assert (memory.scan, memory.labels, memory.known.label.size) == (0, 0, 0)
 
 
-def test_a_caller_that_was_found_is_told_by_its_range_and_its_own_bearing():
+def test_a_found_caller_is_measured_by_its_range_and_bearing():
     joint = JointGaussian(landmark=np.empty(0, int), mean=np.zeros(3), covariance=0.01 * np.eye(3))
     stage = association_of(Config(association=AssociationConfig(method="marginal")))
     memory = Memory(labels=1, callers={1: Caller(label=1, place=CallerPlace(6.0, 8.0))})

@@ -41,12 +41,12 @@ def tried(caller, heard=20):
 
 
 @pytest.mark.parametrize("caller", [(7.0, 4.5), (9.8, 3.2), (6.4, 4.2)])
-def test_one_that_has_turned_is_where_its_rows_fit(caller):
+def test_a_caller_that_turned_is_placed_where_its_rows_fit(caller):
     assert np.hypot(*(tried(np.array(caller)) - caller)) < 0.5
     assert np.hypot(*(EXPECTED - caller)) > 2.0
 
 
-def test_one_that_is_where_it_was_expected_or_is_heard_little_of_is_left_there():
+def test_a_caller_at_its_expected_position_or_with_few_rows_stays_there():
     assert tried(EXPECTED + 0.1).tolist() == EXPECTED.tolist()
     assert tried(np.array([7.0, 4.5]), heard=4).tolist() == EXPECTED.tolist()
 
@@ -60,9 +60,7 @@ def test_one_that_is_where_it_was_expected_or_is_heard_little_of_is_left_there()
         (True, True, False, 20),
     ],
 )
-def test_what_is_heard_of_a_caller_that_is_not_where_it_was_expected_begins_no_landmark(
-    moves, hears_itself, heard_before, begun
-):
+def test_rows_of_a_misplaced_caller_begin_no_landmark(moves, hears_itself, heard_before, begun):
     """Of one that stands they are new, and who only listens has nothing else to go by."""
     size, rng = len(PLACES), np.random.default_rng(5)
     mean = np.concatenate([np.zeros(3), PLACES.ravel(), EXPECTED])

@@ -42,7 +42,7 @@ PAIRS = [(EkfSlam, SlowRoamingEkfSlam), (InvariantEkfSlam, SlowRoamingInvariantE
 # Against what is slow
 
 
-def test_two_callers_and_a_ray_go_on_as_the_exact_solution_does():
+def test_propagation_of_two_callers_and_a_ray_matches_the_exact_solution():
     rng = np.random.default_rng(4)
     landmark = np.array([7, 3, 3, 3, 5, velocity_of(3), 8, velocity_of(7)])
     size = 3 + 2 * landmark.size
@@ -122,7 +122,7 @@ def test_bearings_of_a_caller_that_moves_are_never_crossed(kind):
     assert all((belief.weight >= 0.0).all() for belief in beliefs), "nothing waits to be crossed"
 
 
-def test_the_invariant_filter_follows_in_any_direction_alike():
+def test_the_invariant_filter_commutes_with_turning_and_shifting_the_mission():
     """Turned by a radian and shifted, the same mission is believed, turned and shifted."""
     mission = boat_mission("fused", frames=40)
     turn, shift = np.array([[np.cos(1), -np.sin(1)], [np.sin(1), np.cos(1)]]), np.array([7.0, -4.0])
@@ -170,7 +170,7 @@ def caller_nees(kind, told, runs=40):
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_how_sure_a_caller_is_followed_is_true_unless_its_walk_is_told_a_thirtieth(kind):
+def test_a_tracked_caller_is_consistent_unless_its_walk_is_understated(kind):
     assert 1.2 < caller_nees(kind, 1.0) < 3.0, "2, with the chance of 40 draws"
     assert caller_nees(kind, 1 / 30) > 5.0
 
@@ -200,7 +200,7 @@ def test_a_caller_that_circles_is_followed_by_its_sound():
         assert label not in trial.track.landmarks.landmark
 
 
-def test_without_timing_a_caller_that_moves_is_left_out_as_ever():
+def test_a_moving_caller_is_ignored_without_timing():
     deaf = SAILING.model_copy(update={"listening": ListeningConfig(timing=False)})
     strays = deaf.model_copy(update={"filter": FilterConfig(caller_walk_std=9.0)})
     one, other = (run_mission(config, ["fused"], ["iekf"]).trials[0] for config in (deaf, strays))

@@ -68,7 +68,7 @@ def fields(belief):
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_a_bearing_that_waits_is_told_as_a_partial_landmark_along_it(kind):
+def test_a_waiting_bearing_is_reported_as_a_partial_landmark(kind):
     rows = heard_from(kind, 0.3).landmarks()
     assert rows.landmark.tolist() == [4, 4]
     assert rows.weight.tolist() == [0.5, 0.5]
@@ -109,7 +109,7 @@ def test_a_bearing_that_does_not_cross_surely_ahead_places_nothing(kind, second)
 
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize(("degrees", "robust"), [(15.0, 2), (19.0, 2), (22.0, 1), (45.0, 1)])
-def test_where_bearings_may_be_far_off_only_those_that_cross_clearly_place(kind, degrees, robust):
+def test_robust_initialization_needs_bearings_that_cross_clearly(kind, degrees, robust):
     plain, careful = (
         heard_from(kind, 0.0, -np.radians(degrees), robust=how).landmarks() for how in (False, True)
     )
@@ -128,7 +128,7 @@ def test_coarse_bearings_and_the_papers_spacing_are_as_ever_to_the_bit(kind):
         np.testing.assert_array_equal(one.covariance, other.covariance)
 
 
-def test_a_range_places_a_landmark_whose_bearing_waits():
+def test_a_range_initialises_a_landmark_with_a_waiting_bearing():
     slam = EkfSlam(motion=BICYCLE, rays=FITTED)
     belief = slam.init(Gaussian(mean=np.zeros(3), covariance=1e-12 * np.eye(3)))
     belief = slam.update(belief, scan_with([4], [0.0], bearing_std=0.01))
@@ -137,7 +137,7 @@ def test_a_range_places_a_landmark_whose_bearing_waits():
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_a_precise_bearing_is_told_to_a_ray_as_no_more_precise_than_its_members_are_linear(kind):
+def test_a_precise_bearing_updates_a_ray_within_its_members_linearity(kind):
     """A coarse bearing casts the ray; of two that follow, one is as precise as members allow."""
 
     def after(std):

@@ -102,21 +102,21 @@ def same(one, other):
 
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize(("off", "farther"), [(1.999, NAN), (-1.999, NAN), (1.99, -1.99), (0, 0)])
-def test_what_is_no_more_than_two_sigma_off_is_taken_as_ever_to_the_bit(kind, off, farther):
+def test_innovations_within_two_sigma_update_unchanged_to_the_bit(kind, off, farther):
     plain, robust = (corrected(kind, robust, off, farther)[0] for robust in (False, True))
     assert same(plain, robust)
 
 
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize(("off", "farther"), [(2.001, NAN), (-2.001, 0.0), (0.0, 2.001)])
-def test_what_is_more_than_two_sigma_off_is_not(kind, off, farther):
+def test_innovations_beyond_two_sigma_update_differently(kind, off, farther):
     plain, robust = (corrected(kind, robust, off, farther)[0] for robust in (False, True))
     assert not same(plain, robust)
 
 
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("off", [2.5, -3.0, 5.0, -12.0, 30.0])
-def test_a_surprising_bearing_corrects_as_one_two_sigma_off_whatever_it_is(kind, off):
+def test_a_bearing_beyond_two_sigma_corrects_by_two_sigma(kind, off):
     """The pose is known and P half of S, so that K nu k / e is half of 2 sqrt(S)."""
     _, (along, across) = corrected(kind, True, off)
     assert across == pytest.approx(np.sign(off) * FAR * np.sqrt(2.0) * TURN, rel=1e-9)
@@ -129,14 +129,14 @@ def test_a_surprising_bearing_corrects_as_one_two_sigma_off_whatever_it_is(kind,
 
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("farther", [2.5, -3.0, 12.0, 30.0])
-def test_a_surprising_range_corrects_as_one_two_sigma_off_whatever_it_is(kind, farther):
+def test_a_range_beyond_two_sigma_corrects_by_two_sigma(kind, farther):
     _, (along, across) = corrected(kind, True, 0.0, farther)
     assert along == pytest.approx(np.sign(farther) * np.sqrt(2.0) * SPREAD, rel=1e-9)
     assert across == pytest.approx(0.0, abs=1e-12)
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_the_more_it_surprises_the_less_is_learnt_of_it(kind):
+def test_larger_innovations_reduce_the_covariance_less(kind):
     """Of P half of S, P H^T H P / S' takes k / 2e off: it is R' = S' - P that counts."""
     for off in (1.0, 4.0, 40.0):
         after, _ = corrected(kind, True, off, 0.0)
@@ -147,7 +147,7 @@ def test_the_more_it_surprises_the_less_is_learnt_of_it(kind):
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_range_and_bearing_are_tempered_apart(kind):
+def test_range_and_bearing_are_tempered_separately(kind):
     _, calm = corrected(kind, False, 1.0, -1.0)
     _, (along, across) = corrected(kind, True, 20.0, -1.0)
     assert along == pytest.approx(calm[0], rel=1e-9)
@@ -159,7 +159,7 @@ def test_range_and_bearing_are_tempered_apart(kind):
 
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("robust", [False, True])
-def test_the_gate_asks_what_is_left_of_a_surprise(kind, robust):
+def test_the_gate_applies_after_hubers_rule(kind, robust):
     slam, belief = post_ahead(kind, robust, gate=0.99)
     far_off = 10.0 * np.sqrt(2.0) * TURN  # of 10 sigma Huber's rule leaves sqrt(2 * 10)
     assert slam.update(belief, scan_with([7], [far_off])).gated == 1
@@ -178,7 +178,7 @@ def shifted(belief, x, y):
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_a_bearing_that_one_member_of_a_ray_expects_surprises_nobody(kind):
+def test_a_bearing_expected_by_a_ray_member_is_not_tempered(kind):
     slams = [paper_filter(kind, robust=robust, bearing_std=0.05) for robust in (False, True)]
     ray = slams[0].update(slams[0].init(SURE), scan_with([7], [0.0]))
     aside = shifted(ray, 0.0, -3.0)
@@ -193,7 +193,7 @@ def test_a_bearing_that_one_member_of_a_ray_expects_surprises_nobody(kind):
 
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("ranged", ["anew", "heaviest"])
-def test_a_range_that_places_a_ray_surprises_nobody(kind, ranged):
+def test_a_range_that_initialises_a_ray_is_not_tempered(kind, ranged):
     slams = [
         paper_filter(kind, robust=robust, rays=ray_config(ranged=ranged))
         for robust in (False, True)
@@ -205,7 +205,7 @@ def test_a_range_that_places_a_ray_surprises_nobody(kind, ranged):
 
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("second", [-np.pi / 4, 1.0])
-def test_a_bearing_that_waits_is_crossed_as_ever_to_the_bit(kind, second):
+def test_a_waiting_bearing_initialises_unchanged_to_the_bit(kind, second):
     slams = [
         paper_filter(kind, robust=robust, rays=FITTED, bearing_std=0.01) for robust in (False, True)
     ]
@@ -238,7 +238,7 @@ def aligned_error(kind, robust, seed, gross):
 
 @pytest.mark.parametrize("drives", [5, pytest.param(30, marks=pytest.mark.slow)])
 @pytest.mark.parametrize("kind", KINDS)
-def test_gross_errors_among_precise_bearings_are_borne(kind, drives):
+def test_robust_filters_withstand_gross_errors_in_precise_bearings(kind, drives):
     calm, calm_robust, plain, robust = (
         np.array([aligned_error(kind, robust, seed, gross) for seed in range(drives)])
         for gross in (0.0, 0.05)
@@ -275,7 +275,7 @@ def test_with_the_papers_constants_and_no_gross_errors_little_changes(kind, stra
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_a_filter_is_not_robust_unless_it_is_told_to_be(kind):
+def test_a_filter_is_not_robust_by_default(kind):
     mission = paper_mission("fused", frames=10, outliers=0.2)
     runs = [followed(paper_filter(kind, **asked), mission) for asked in ({}, {"robust": False})]
     for (one, _), (other, _) in zip(*runs, strict=True):

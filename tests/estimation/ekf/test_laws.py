@@ -147,7 +147,7 @@ def test_heading_passes_through_pi_without_a_jump(turn):
     np.testing.assert_allclose(after.mean, belief.mean, rtol=0, atol=1e-14)
 
 
-def test_second_look_from_the_same_place_says_nothing_about_the_pose():
+def test_second_look_from_the_same_pose_does_not_change_it():
     slam = paper_filter()
     belief = slam.update(slam.init(START), scan_of((1, 5.0, 0.3)))
     after = slam.update(belief, scan_of((1, 5.4, 0.1)))
@@ -166,7 +166,7 @@ def test_correction_that_carries_the_heading_past_pi_is_wrapped():
     assert -np.pi <= after.mean[2] < -np.pi + 0.1
 
 
-def test_empty_scan_leaves_the_belief_as_it_was():
+def test_empty_scan_leaves_the_belief_unchanged():
     slam = paper_filter()
     *_, (belief, _) = followed(slam, paper_mission("fused", frames=5))
     assert_same(slam.update(belief, scan_of()), belief)
@@ -187,7 +187,7 @@ def test_known_landmarks_of_a_scan_are_corrected_one_after_another():
         )
 
 
-def test_new_landmarks_are_placed_from_the_corrected_pose_wherever_they_stand_in_the_scan():
+def test_new_landmarks_are_placed_from_the_corrected_pose_in_any_order():
     slam = paper_filter()
     belief = slam.update(slam.init(START), scan_of((1, 5.0, 0.3)))
     known, new, ray = (1, 5.3, 0.2), (2, 4.0, -1.0), (3, np.nan, 2.0)
@@ -201,7 +201,7 @@ def test_new_landmarks_are_placed_from_the_corrected_pose_wherever_they_stand_in
 
 
 @pytest.mark.parametrize("row", [(1, 0.01, 0.5), (1, np.nan, 0.5)])
-def test_landmark_that_the_vehicle_stands_on_corrects_nothing(row):
+def test_landmark_at_the_vehicles_position_corrects_nothing(row):
     slam = paper_filter()
     belief = slam.update(slam.init(START), scan_of((1, NEAREST / 2, 0.0), (2, 4.0, 1.0)))
     assert_same(slam.update(belief, scan_of(row)), belief)
@@ -234,7 +234,7 @@ def test_stopped_vehicle_with_noise_at_rest_grows_uncertain_along_its_heading_an
     np.testing.assert_allclose(rested.covariance, expected, rtol=1e-12, atol=0)
 
 
-def test_one_control_alone_at_zero_is_not_rest():
+def test_a_vehicle_with_only_one_zero_control_is_not_at_rest():
     motion = Motion(model="unicycle", control_std=(0.1, 0.15), noise_at_rest=False)
     slam = paper_filter(motion=motion)
     turning, _ = slam.predict(slam.init(KNOWN_POSE), np.array([[0.0, 0.1]]), np.array([STEP]))

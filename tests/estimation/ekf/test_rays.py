@@ -66,7 +66,7 @@ def test_landmark_heard_once_is_a_ray_along_its_bearing_and_not_fully_initialise
     np.testing.assert_allclose(rows.mean, points, rtol=0, atol=1e-14)
 
 
-def test_members_of_a_ray_are_correlated_through_the_pose_alone():
+def test_members_of_a_ray_are_correlated_only_through_the_pose():
     slam = paper_filter()
     belief = slam.update(slam.init(START), scan_of((5, np.nan, 0.4)))
     c, s = np.cos(0.4), np.sin(0.4)
@@ -80,7 +80,7 @@ def test_members_of_a_ray_are_correlated_through_the_pose_alone():
             np.testing.assert_allclose(block, expected, rtol=0, atol=1e-13)
 
 
-def test_bearings_from_one_known_place_never_tell_the_members_apart():
+def test_bearings_from_one_known_position_never_change_the_weights():
     slam = paper_filter()
     belief = slam.init(KNOWN_POSE)
     for bearing in (0.4, 0.5, 0.2, 0.9, 0.3):
@@ -144,7 +144,7 @@ def test_pruning_removes_rows_and_changes_nothing_else():
     np.testing.assert_allclose(pruned.weight[own], rest[own] / rest[own].sum(), rtol=1e-15)
 
 
-def test_range_places_a_partial_landmark_anew():
+def test_a_range_replaces_a_partial_landmark():
     slam = paper_filter()
     before = slam.update(slam.init(START), scan_of((1, 3.0, 1.0), (5, np.nan, 0.4), (2, 2.0, 0.0)))
     after = slam.update(before, scan_of((5, 6.0, 0.3)))
@@ -155,7 +155,7 @@ def test_range_places_a_partial_landmark_anew():
     np.testing.assert_allclose(after.covariance, fresh.covariance, rtol=0, atol=1e-14)
 
 
-def test_range_moves_the_heaviest_member_where_settings_say_so():
+def test_a_range_moves_the_heaviest_member_if_so_configured():
     slam = paper_filter(rays=ray_config(ranged="heaviest"))
     *_, before = seen_along_a_line(slam, frames=2)
     heaviest = np.argmax(np.where(before.landmark == 7, before.weight, 0))
@@ -201,7 +201,7 @@ def test_gate_drops_a_bearing_that_no_member_expected():
 
 
 @pytest.mark.slow
-def test_keeping_the_common_bearing_noise_makes_the_filter_surer_and_not_more_right():
+def test_keeping_the_members_common_bearing_noise_raises_the_nees():
     """The cross-covariance that Sola drops is an honest one, but shared updates reuse it.
 
     Over eight passive missions it moves the pose by a fraction of its deviation, shrinks the

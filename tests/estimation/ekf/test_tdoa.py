@@ -162,7 +162,7 @@ def test_a_landmark_heard_once_is_placed_by_its_excess_path(kind):
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_where_bearings_may_be_far_off_an_excess_path_places_what_is_sure_all_the_same(kind):
+def test_robust_excess_path_initialization_needs_a_precise_bearing(kind):
     e, members = excess_path_of(np.zeros(2), LANDMARK, CALLER), {}
     for robust in (False, True):
         slam, belief = standing(kind, robust)
@@ -178,7 +178,7 @@ def test_where_bearings_may_be_far_off_an_excess_path_places_what_is_sure_all_th
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_a_placed_landmark_is_as_unsure_as_many_draws_of_what_places_it(kind):
+def test_a_placed_landmarks_covariance_matches_monte_carlo_draws(kind):
     slam, belief = standing(kind)
     e, rng = excess_path_of(np.zeros(2), LANDMARK, CALLER), np.random.default_rng(3)
     _, covariance = mapped(slam.update(belief, heard(LANDMARK, e)), 7)
@@ -215,7 +215,7 @@ def test_in_line_with_the_caller_an_excess_path_that_may_be_none_places_nothing(
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_an_excess_path_of_a_caller_that_nobody_knows_is_a_bearing_alone(kind):
+def test_an_excess_path_of_an_unknown_caller_counts_as_a_bearing(kind):
     slam, belief = standing(kind)
     e = excess_path_of(np.zeros(2), LANDMARK, CALLER)
     known = heard(LANDMARK, e)

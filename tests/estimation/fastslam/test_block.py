@@ -50,14 +50,14 @@ def expected(offset, count, j=0):
     return said - 0.5 * math.log(2.0 * math.pi)
 
 
-def test_a_member_at_the_pose_is_uniform_over_the_circle_in_a_ray_and_alone_says_nothing():
+def test_a_member_at_the_pose_has_a_uniform_bearing_likelihood():
     count = np.resize([1, 2, 4], LANES)
     said = expected(0.5 * NEAREST, count)
     assert said[count == 1] == pytest.approx(0.0, abs=1e-15)
     assert said[count > 1] == pytest.approx(-math.log(2.0 * math.pi), rel=1e-15)
 
 
-def test_a_member_some_way_off_is_as_likely_as_its_gaussian_says_however_many_there_are():
+def test_a_distant_member_has_its_gaussian_likelihood():
     said = expected(2.0, np.resize([1, 2, 4], LANES))
     S = (0.04 + 0.09) / 2.0**2 + 0.02 + 0.01
     assert said == pytest.approx(-0.5 * (0.3**2 / S + math.log(2.0 * math.pi * S)), rel=1e-12)
@@ -70,7 +70,7 @@ def test_a_lane_without_that_member_has_no_likelihood():
 
 
 @pytest.mark.parametrize(("offset", "says"), [(0.5, False), (2.0, True)])
-def test_what_stands_at_the_pose_refines_it_neither_by_its_bearing_nor_by_its_range(offset, says):
+def test_a_landmark_at_the_pose_refines_it_by_neither_measurement(offset, says):
     alone, whole = np.ones(LANES, dtype=np.int64), np.ones(LANES)
     for by_range in (False, True):
         pose, member = uncertain_pair(offset * NEAREST)
@@ -84,7 +84,7 @@ def test_what_stands_at_the_pose_refines_it_neither_by_its_bearing_nor_by_its_ra
 
 
 @pytest.mark.parametrize(("offset", "beyond"), [(0.5, False), (2.0, True)])
-def test_no_gate_drops_what_stands_at_the_pose_for_nothing_was_foreseen_of_it(offset, beyond):
+def test_a_landmark_at_the_pose_is_never_gated(offset, beyond):
     alone = np.ones(LANES, dtype=np.int64)
     pose, member = uncertain_pair(offset * NEAREST)
     assert bearing_beyond(pose, member, heard(3.0), alone, 0, 1e-9) == beyond
@@ -117,7 +117,7 @@ def weighed(unit, distance=5.0):
 
 
 @pytest.mark.parametrize("distance", [2.5, 5.0, 9.0])
-def test_the_weights_of_a_ray_and_of_a_full_landmark_do_not_hang_on_the_unit_of_length(distance):
+def test_relative_weights_do_not_depend_on_the_unit_of_length(distance):
     ray, full = weighed(1.0, distance)
     for unit in (1e3, 1e-2):
         assert np.subtract(*weighed(unit, distance)) == pytest.approx(ray - full, rel=1e-9)

@@ -89,12 +89,12 @@ def test_the_map_of_the_mixture_is_that_before_a_resampling_as_the_pose_is():
 
 
 @pytest.mark.parametrize("estimate", ["heaviest", "mixture"])
-def test_the_setting_changes_no_particle(estimate):
+def test_the_estimate_setting_changes_no_particle(estimate):
     one, other = last(by(estimate)), last(by("separate"))
     assert_same(replace(one, estimate=other.estimate, mixed=False), other)
 
 
-def test_the_map_of_the_mixture_is_as_sure_as_it_is_right_and_one_particles_is_not():
+def test_the_mixtures_map_is_consistent_and_one_particles_is_not():
     mission, squared = small_mission("active", 60), {"mixture": [], "separate": []}
     for estimate, found in squared.items():
         for seed in range(3):

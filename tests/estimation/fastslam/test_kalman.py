@@ -152,11 +152,11 @@ def assert_converges_at_the_rate(toys):
         assert rms[-1] < 0.15 * rms[0]
 
 
-def test_swarm_on_an_axis_tends_to_the_kalman_filter_as_one_over_the_root_of_its_size():
+def test_swarm_on_an_axis_converges_to_the_kalman_filter_by_root_n():
     assert_converges_at_the_rate([axis_toy(seed, start_std=0.3, moves=5) for seed in range(100)])
 
 
-def test_swarm_in_the_plane_tends_to_the_kalman_filter_as_one_over_the_root_of_its_size():
+def test_swarm_in_the_plane_converges_to_the_kalman_filter_by_root_n():
     assert_converges_at_the_rate([plane_toy(seed) for seed in range(100)])
 
 

@@ -96,7 +96,7 @@ def test_steps_of_a_frame_are_the_steps_one_by_one():
     assert_same(belief, together)
 
 
-def test_new_landmarks_are_placed_last_wherever_they_stand_in_the_scan():
+def test_new_landmarks_are_placed_last_in_any_order():
     slam = swarm_filter()
     belief = began(slam, (1, 5.0, 0.3))
     known, new, ray = (1, 5.3, 0.2), (2, 4.0, -1.0), (3, np.nan, 2.0)
@@ -148,7 +148,7 @@ def test_mean_number_of_full_landmarks_is_weighted():
     assert fractional > 3
 
 
-def test_resampling_happens_below_the_threshold_and_keeps_what_the_swarm_said():
+def test_resampling_below_the_threshold_keeps_the_estimates():
     slam, mission = swarm_filter(50, resample_below=1.0), small_mission("active", frames=5)
     belief, rng = slam.init(START), drawing()
     for controls, dt, scan in zip(mission.controls, mission.dt, mission.scans, strict=True):
@@ -176,7 +176,7 @@ def looking_apart(slam):
 
 @pytest.mark.parametrize(("bearing", "gated"), [(0.0, 0), (-0.5, 0), (-0.25, 1), (1.0, 1)])
 @pytest.mark.parametrize("distance", [4.0, np.nan])
-def test_gate_drops_what_no_particle_expected_and_keeps_what_one_did(bearing, gated, distance):
+def test_the_gate_drops_rows_that_no_particle_expects(bearing, gated, distance):
     slam = never_resampling(swarm_filter(2, gate=0.99, bearing_std=0.03))
     belief = looking_apart(slam)
     after = slam.update(belief, scan_of((1, distance, bearing)), drawing())

@@ -19,15 +19,13 @@ from reference.swarms import (
 # What weighs
 
 
-def test_frames_with_only_new_landmarks_sample_place_and_weigh_nothing():
+def test_frames_with_only_new_landmarks_leave_the_weights_equal():
     slam = swarm_filter(30)
     normal = drawing().standard_normal((30, 3))
     scan = scan_of((1, 5.0, 0.3), (2, np.nan, 1.0))
     belief = slam.update(slam.init(START), scan, Drawn(normal, np.full(30, 0.5)))
     np.testing.assert_allclose(
-        belief.cloud(),
-        START.mean + normal * np.sqrt(np.diag(START.covariance)),
-        rtol=1e-15,
+        belief.cloud(), START.mean + normal * np.sqrt(np.diag(START.covariance)), rtol=1e-15
     )
     assert np.ptp(belief.log_weight) == 0
     assert not particles_of(belief).covariance.any()
@@ -37,9 +35,7 @@ def test_frames_with_only_new_landmarks_sample_place_and_weigh_nothing():
 
 
 @pytest.mark.parametrize("ranged", ["anew", "heaviest"])
-def test_a_range_weighs_alike_who_holds_a_partial_landmark_alike_and_makes_it_full(
-    ranged,
-):
+def test_a_range_initialises_a_partial_landmark_without_changing_weights(ranged):
     slam = swarm_filter(30, rays=ray_config(ranged=ranged))
     belief = began(slam, (1, 5.0, 0.3), (2, np.nan, 1.0))
     belief, _ = slam.predict(belief, np.tile([0.75, 0.2], (4, 1)), np.full(4, STEP))

@@ -57,13 +57,13 @@ def test_impossible_particles_weigh_nothing_and_when_all_are_they_weigh_the_same
 
 
 @given(unnormalised)
-def test_effective_particles_lie_between_one_and_all(values):
+def test_effective_particles_are_between_1_and_all(values):
     weight = weights_of(values)
     assert 1 - 1e-12 <= effective_particles(weight) <= weight.size * (1 + 1e-12)
 
 
 @pytest.mark.parametrize("equal", [1, 3, 100])
-def test_equal_weights_are_worth_their_number_whatever_has_none(equal):
+def test_the_effective_number_of_equal_weights_is_their_count(equal):
     weight = np.concatenate([np.full(equal, 1 / equal), np.zeros(7)])
     assert effective_particles(weight) == pytest.approx(equal, rel=1e-12)
 

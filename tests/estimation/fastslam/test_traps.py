@@ -94,7 +94,7 @@ def test_likelihoods_that_underflow_leave_weights_that_sum_to_one(row, mixture):
         assert_sound(belief)
 
 
-def test_swarm_whose_headings_lie_on_both_sides_of_pi_points_between_them():
+def test_a_swarm_with_headings_around_pi_has_the_wrapped_mean():
     slam = swarm_filter(500, motion=TURNING)
     start = Gaussian(mean=np.array([0, 0, np.pi - 1e-3]), covariance=START.covariance)
     belief = began(slam, (1, 5.0, 0.3), start=start)
@@ -111,7 +111,7 @@ def test_swarm_whose_headings_lie_on_both_sides_of_pi_points_between_them():
 
 
 @pytest.mark.parametrize("row", [(1, 0.01, 0.5), (1, np.nan, 0.5)])
-def test_landmark_that_the_vehicle_stands_on_weighs_and_corrects_nothing(row):
+def test_a_landmark_at_the_vehicles_position_weighs_and_corrects_nothing(row):
     slam = swarm_filter(motion=AT_REST)
     belief = began(slam, (1, NEAREST / 2, 0.0), (2, 4.0, 1.0))
     assert_same(slam.update(belief, scan_of(row), drawing()), belief)
@@ -128,7 +128,7 @@ def test_landmark_a_little_farther_corrects_and_all_stays_sound(row):
 
 @pytest.mark.parametrize("row", [(1, 0.01, 0.5), (1, np.nan, 0.5)])
 @pytest.mark.parametrize("mixture", ["federated", "exact"])
-def test_ray_that_the_vehicle_stands_on_stays_sound(row, mixture):
+def test_a_ray_through_the_vehicles_position_stays_sound(row, mixture):
     rays = ray_config(range_bounds=(1e-4, 20.0))
     slam = swarm_filter(mixture=mixture, motion=AT_REST, rays=rays)
     belief = began(slam, (1, np.nan, 0.0), (2, 4.0, 1.0))

@@ -83,7 +83,7 @@ def mission_of(strategy, seed=4, frames=30, callers=(13, 45), std=1.0, controls=
     ],
     ids=str,
 )
-def test_the_optimum_is_that_of_dense_normal_equations(strategy, names):
+def test_the_optimum_matches_dense_normal_equations(strategy, names):
     slam = smoother(*names)
     *_, (belief, _) = followed(slam, mission_of(strategy, frames=10))
     history = in_hindsight(belief.history)
@@ -107,7 +107,7 @@ def test_the_optimum_is_that_of_dense_normal_equations(strategy, names):
 
 
 @pytest.mark.parametrize("motion", MOTIONS, ids=lambda motion: motion.model)
-def test_slopes_of_a_leg_are_its_derivatives(motion):
+def test_slopes_of_a_leg_match_finite_differences(motion):
     """By differences of steps that are led otherwise."""
     names = [name for name in PARAMETERS[:3] if name != "wheelbase" or motion is BICYCLE]
     codes = asking(*names, motion=motion).odometry
@@ -133,7 +133,7 @@ def test_slopes_of_a_leg_are_its_derivatives(motion):
 
 
 @pytest.mark.parametrize("strategy", ["active", "fused"])
-def test_a_sensor_that_is_turned_and_stands_aside_is_found(strategy):
+def test_the_pose_of_a_turned_sensor_is_calibrated(strategy):
     """Odometry tells where the vehicle heads; an arc tells how far the sensor is from its point."""
     mission = mission_of(strategy, frames=120, std=0.2)
     turned = [with_columns(scan, bearing=wrap(scan.bearing - 0.05)) for scan in mission.scans]
@@ -183,7 +183,7 @@ def test_a_clock_that_is_late_or_early_is_found(late, seed):
     assert std < 0.02
 
 
-def test_of_a_vehicle_that_stands_nothing_tells_how_late_its_clock_is():
+def test_a_vehicle_at_rest_leaves_the_time_offset_at_its_prior():
     mission = mission_of("active", frames=10, callers=())
     still = replace(mission, controls=0.0 * mission.controls)
     *_, (belief, _) = followed(smoother("time_offset", motion=STILL), still)
@@ -212,7 +212,7 @@ def test_a_speed_of_sound_is_found_by_odometry_and_by_bearings():
     assert std < 1.5
 
 
-def test_what_says_nothing_of_a_parameter_leaves_its_prior():
+def test_uninformative_measurements_leave_a_parameter_at_its_prior():
     *_, (belief, _) = followed(smoother("speed_of_sound"), paper_mission("passive", frames=20))
     value, std = belief.calibration()["speed_of_sound"]
     assert (value, std) == (pytest.approx(343.0, abs=0.2), pytest.approx(10.0, rel=1e-3))
@@ -231,7 +231,7 @@ def test_predicted_poses_know_that_the_odometry_is_calibrated():
     assert more == pytest.approx(turn**2, rel=1e-6)
 
 
-def test_steps_after_the_last_scan_are_led_by_what_was_calibrated_too():
+def test_steps_after_the_last_scan_use_the_calibrated_parameters():
     """The path goes on from its last node as the belief predicts it, but for other points."""
     long = replace(BICYCLE, wheelbase=0.22)
     slam, mission = smoother("wheelbase", motion=long), mission_of("active", frames=60, std=0.2)
@@ -253,6 +253,6 @@ def test_without_parameters_nothing_is_calibrated():
     assert NOTHING.stds.size == 0
 
 
-def test_a_wheelbase_of_what_has_none_is_refused():
+def test_a_wheelbase_of_a_unicycle_is_refused():
     with pytest.raises(InputError, match=r"filter.calibrate: found \"wheelbase\" for a unicycle"):
         asking("wheelbase", motion=MOTIONS[1])

@@ -37,7 +37,7 @@ def roaming():
 # When they enter
 
 
-def test_one_that_moves_is_no_landmark_and_is_where_it_is(roaming):
+def test_a_moving_caller_is_tracked_and_is_no_landmark(roaming):
     _, places, beliefs = roaming
     last = beliefs[-1]
     assert CALLER not in last.landmarks().landmark
@@ -47,7 +47,7 @@ def test_one_that_moves_is_no_landmark_and_is_where_it_is(roaming):
     assert np.sqrt(np.trace(now.covariance[0])) < 2.0
 
 
-def test_pose_and_map_together_have_it_where_it_is_after_the_steps_since(roaming):
+def test_the_joint_gaussian_holds_the_callers_predicted_position(roaming):
     mission, _, beliefs = roaming
     belief = smoother().predict(beliefs[-1], mission.controls[0], mission.dt[0])[0]
     joint, now = belief.joint(), belief.moving()
@@ -58,7 +58,7 @@ def test_pose_and_map_together_have_it_where_it_is_after_the_steps_since(roaming
     assert np.hypot(*(joint.mean[here] - beliefs[-1].moving().mean[0])) > 0.05, "it has moved"
 
 
-def test_until_it_is_placed_it_is_a_ray_and_only_when_just_heard():
+def test_an_uninitialised_moving_caller_is_a_ray_when_just_measured():
     mission, _ = roaming_mission(np.random.default_rng(4), frames=3)
     first = mission.scans[0]
     alone = rows_of(first, first.landmark == CALLER)
@@ -73,7 +73,7 @@ def test_until_it_is_placed_it_is_a_ray_and_only_when_just_heard():
     assert not slam.update(belief, others).moving().landmark.size
 
 
-def test_bearings_that_cross_place_what_stands_and_never_what_moves():
+def test_crossing_bearings_initialise_fixed_but_not_moving_callers():
     mission, _ = roaming_mission(np.random.default_rng(4), 40, speed_std=1e-9, walk_std=0.0)
     callers = [rows_of(scan, scan.landmark == CALLER) for scan in mission.scans]
     standing = [replace(scan, moving=NO_CALLERS) for scan in callers]
@@ -91,7 +91,7 @@ def test_a_caller_joins_the_chain_at_the_node_that_places_it(roaming):
     assert np.isfinite(mission.scans[0].excess_path).any()
 
 
-def test_a_range_places_it_at_once():
+def test_a_range_initialises_a_moving_caller_immediately():
     mission, places = roaming_mission(np.random.default_rng(2), frames=1, ranges=1)
     *_, (belief, _) = followed(smoother(), mission, START)
     assert (belief.history.callers, belief.history.first.tolist()) == ((CALLER,), [1])
@@ -99,12 +99,12 @@ def test_a_range_places_it_at_once():
     assert surprise(now.mean[0] - places[1], now.covariance[0]) < 16.0
 
 
-def test_a_landmark_is_placed_by_the_call_of_one_that_moves(roaming):
+def test_landmarks_are_initialised_by_a_moving_callers_call(roaming):
     _, _, beliefs = roaming
     assert len(beliefs[-1].history.placed) > 15
 
 
-def test_where_it_will_be_is_where_it_is_believed_once_the_vehicle_has_gone_on(roaming):
+def test_a_callers_prediction_equals_its_estimate_after_an_empty_update(roaming):
     mission, _, beliefs = roaming
     (first,) = beliefs[-1].history.first
     leg = smoother().predict(beliefs[first + 1], mission.controls[0], mission.dt[0])[0]
@@ -118,7 +118,7 @@ def test_where_it_will_be_is_where_it_is_believed_once_the_vehicle_has_gone_on(r
     np.testing.assert_allclose(before.covariance, after.covariance, rtol=0, atol=1e-6)
 
 
-def test_it_goes_on_while_the_vehicle_surely_stands():
+def test_a_moving_caller_is_tracked_while_the_vehicle_is_at_rest():
     motion = replace(MOTION, noise_at_rest=False)
     mission, _ = roaming_mission(np.random.default_rng(2), frames=4, ranges=1)
     slam = replace(smoother(), motion=motion)
@@ -130,7 +130,7 @@ def test_it_goes_on_while_the_vehicle_surely_stands():
 # How well they are followed
 
 
-def test_one_that_stands_is_a_landmark():
+def test_a_moving_caller_without_motion_equals_a_landmark():
     mission, _ = roaming_mission(
         np.random.default_rng(8), 16, ranges=2, speed_std=1e-9, walk_std=0.0
     )
@@ -162,7 +162,7 @@ def nees(seed, walk_std):
     ]
 
 
-def test_places_are_off_by_what_they_say_where_it_moves_as_told_and_not_where_it_is_told_to_stay():
+def test_tracked_positions_are_consistent_only_with_the_true_walk():
     runs = 36
     low, high = stats.chi2(2 * runs).ppf([5e-4, 1.0 - 5e-4]) / runs
     means = np.mean([nees(seed, WALK) for seed in range(runs)], axis=0)
@@ -171,7 +171,7 @@ def test_places_are_off_by_what_they_say_where_it_moves_as_told_and_not_where_it
     assert np.all(deceived > 3.0 * high), deceived
 
 
-def test_what_comes_later_tells_where_it_was(roaming):
+def test_later_scans_improve_a_callers_earlier_positions(roaming):
     _, places, beliefs = roaming
     revised = beliefs[-1].tracks()[CALLER]
     heard = np.arange(beliefs[-1].history.first[0], 17)
@@ -182,7 +182,7 @@ def test_what_comes_later_tells_where_it_was(roaming):
     assert late < np.sqrt(np.mean((online - places[heard]) ** 2))
 
 
-def test_a_track_is_what_is_believed_at_the_end(roaming):
+def test_a_track_contains_the_final_belief(roaming):
     mission, _, beliefs = roaming
     drive = Drive(
         motion=MOTION,
@@ -196,7 +196,7 @@ def test_a_track_is_what_is_believed_at_the_end(roaming):
     assert len(track.pose.mean) == len(track.callers[CALLER].mean)
 
 
-def test_where_nothing_is_heard_a_track_is_what_was_believed_then(roaming):
+def test_a_track_without_detections_is_the_prediction(roaming):
     mission, _, _ = roaming
     time = np.append(0.0, np.cumsum(mission.dt))
     controls = mission.controls.reshape(-1, mission.controls.shape[-1])
@@ -213,7 +213,7 @@ def test_where_nothing_is_heard_a_track_is_what_was_believed_then(roaming):
 # Bits, and the gate
 
 
-def test_a_belief_left_behind_goes_on_to_the_same_bits(roaming):
+def test_an_earlier_belief_continues_to_the_same_bits(roaming):
     mission, _, beliefs = roaming
     slam, other = smoother(), beliefs[9]
     for frame in range(10, 16):
@@ -229,7 +229,7 @@ def test_a_belief_left_behind_goes_on_to_the_same_bits(roaming):
         np.testing.assert_array_equal(now.covariance, then.covariance)
 
 
-def test_the_gate_drops_a_bearing_of_it_that_cannot_be(roaming):
+def test_the_gate_drops_an_impossible_bearing_of_a_moving_caller(roaming):
     mission, _, beliefs = roaming
     slam, scan = smoother(gate=1.0 - 1e-9), mission.scans[12]
     numbers = scan.numbers.copy()

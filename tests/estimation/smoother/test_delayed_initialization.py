@@ -70,7 +70,7 @@ def test_bearings_cross_where_the_landmark_is(place):
     np.testing.assert_allclose(crossing(poses(5), heard), place, rtol=0, atol=1e-12)
 
 
-def test_of_the_earlier_bearings_the_one_counts_that_crosses_most_squarely():
+def test_the_earlier_bearing_that_crosses_most_squarely_counts():
     """The one from the first pose crosses most squarely; the others are wrong."""
     place = (4.0, 4.0)
     heard = [seen_from(x, place) for x in range(5)]
@@ -109,7 +109,7 @@ def test_bearings_cross_where_the_place_is_known_to_half_the_range(earlier, last
         pytest.param((Bearing(0, 0.7, 0.3), Bearing(1, 1.4, 0.3)), id="anywhere"),
     ],
 )
-def test_what_does_not_cross_clearly_ahead_crosses_nowhere(heard):
+def test_bearings_that_do_not_cross_clearly_ahead_give_no_position(heard):
     assert crossing(poses(2), heard) is None
 
 
@@ -155,7 +155,7 @@ def test_a_landmark_that_is_never_placed_waits(controls, bearings, start):
     assert_waits(rows, 4)
 
 
-def test_what_waits_says_nothing_of_the_path():
+def test_waiting_bearings_do_not_change_the_path():
     scans = [scan_with([4, 9], [0.0, 1.0 + 0.01 * k], bearing_std=0.01) for k in range(4)]
     track, rows = lived([AHEAD] * 4, scans)
     reckoned, _ = lived([AHEAD] * 4, [])
@@ -188,7 +188,7 @@ def test_a_range_places_a_landmark_that_waited():
 
 
 @pytest.mark.parametrize("robust", [False, True])
-def test_a_vehicle_that_stands_on_an_exact_start_maps_from_where_it_is(robust):
+def test_a_vehicle_at_rest_with_an_exact_start_maps_from_there(robust):
     scans = [scan_with([4, 5], [0.3, -0.5], [2.0, np.nan])] * 5
     track, rows = lived([STILL] * 5, scans, start=EXACT, robust=robust)
     np.testing.assert_allclose(track.pose.mean, np.zeros((6, 3)), rtol=0, atol=1e-6)
@@ -200,7 +200,7 @@ def test_a_vehicle_that_stands_on_an_exact_start_maps_from_where_it_is(robust):
     ("bearing_std", "range_std"), [(1e-6, 10.0), (1e-6, 1e-6), (1.0, 1e-6), (1e-9, 100.0)]
 )
 @pytest.mark.parametrize("gate", [1.0, 0.999])
-def test_noise_however_unequal_ends_no_mission(bearing_std, range_std, gate):
+def test_very_unequal_noise_ends_no_mission(bearing_std, range_std, gate):
     rng, places = np.random.default_rng(2), np.array([[4.0, 3.0], [2.0, -5.0], [9.0, 1.0]])
     scans = []
     for x in range(1, 9):
@@ -214,7 +214,7 @@ def test_noise_however_unequal_ends_no_mission(bearing_std, range_std, gate):
     assert set(rows.landmark.tolist()) == {1, 2, 3}
 
 
-def test_labels_as_large_as_tables_hold_them_are_told_apart():
+def test_the_largest_labels_are_distinguished():
     labels = [2**53 - 1, 2**53 - 2, 2**32, 0]
     scans = [scan_with(labels, [0.3, -0.3, 1.0, -1.0], [3.0, 4.0, 5.0, 6.0])]
     _, rows = lived([AHEAD], scans)
@@ -222,7 +222,7 @@ def test_labels_as_large_as_tables_hold_them_are_told_apart():
     np.testing.assert_allclose(np.hypot(*(rows.mean - [1.0, 0.0]).T), [3.0, 4.0, 5.0, 6.0])
 
 
-def test_a_drive_without_any_noise_is_driven_as_told():
+def test_a_drive_without_noise_follows_its_odometry():
     silent = Motion(model="unicycle", control_std=(0.0, 0.0))
     scans = [scan_with([4], [0.3 + 0.2 * k], [np.nan]) for k in range(6)]
     track, _ = lived([AHEAD] * 6, scans, motion=silent, start=EXACT)

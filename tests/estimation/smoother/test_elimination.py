@@ -12,14 +12,7 @@ from pipistrelle.estimation.smoother.history import in_hindsight
 from pipistrelle.geometry import wrap
 from reference import dense_smoothing
 from reference.factor_graph import graph_of, optimum, pose_key, turned
-from reference.missions import (
-    BICYCLE,
-    SENSING,
-    followed,
-    measured_to,
-    paper_mission,
-    ray_config,
-)
+from reference.missions import BICYCLE, SENSING, followed, measured_to, paper_mission, ray_config
 from reference.optimum import poses_of
 from reference.timing import timed
 from reference.walking import roaming_mission, scaled
@@ -71,13 +64,13 @@ def assert_gtsam_agrees(belief, within=1e-6):
 
 @pytest.mark.parametrize("strategy", SENSING)
 @pytest.mark.parametrize("robust", [False, True])
-def test_the_optimum_is_that_of_a_general_solver(strategy, robust):
+def test_the_optimum_matches_a_general_solver(strategy, robust):
     assert_gtsam_agrees(last_belief(strategy, 5, frames=120 if robust else 60, robust=robust))
 
 
 @pytest.mark.parametrize("strategy", SENSING)
 @pytest.mark.parametrize("callers", [(), (13, 45)], ids=["without timing", "with timing"])
-def test_the_optimum_is_that_of_dense_normal_equations(strategy, callers):
+def test_the_optimum_matches_dense_normal_equations(strategy, callers):
     """A step that no longer lowers the cost by what can be told is not taken: landmarks show it."""
     belief = last_belief(strategy, 4, frames=20, callers=callers)
     ours = settled(belief)
@@ -93,11 +86,11 @@ def test_the_optimum_is_that_of_dense_normal_equations(strategy, callers):
 
 
 @pytest.mark.parametrize("strategy", ["passive", "fused"])
-def test_so_it_is_with_excess_paths(strategy):
+def test_the_optimum_with_excess_paths_matches_a_general_solver(strategy):
     assert_gtsam_agrees(last_belief(strategy, 4, frames=30, callers=(13, 45)))
 
 
-def test_so_it_is_with_a_caller_that_moves():
+def test_the_optimum_with_a_moving_caller_matches_a_general_solver():
     motion, start = scaled(0.1)
     mission, _ = roaming_mission(np.random.default_rng(4), frames=16)
     slam = Smoother(motion=motion, rays=ray_config(), speed_std=0.7, walk_std=0.3)
@@ -110,5 +103,5 @@ def test_so_it_is_with_a_caller_that_moves():
 @pytest.mark.parametrize("strategy", SENSING)
 @pytest.mark.parametrize("callers", [(), (13,)], ids=["without timing", "with timing"])
 @pytest.mark.parametrize("seed", range(7))
-def test_the_optimum_of_a_whole_mission_is_that_of_a_general_solver(strategy, callers, seed):
+def test_the_optimum_of_a_whole_mission_matches_a_general_solver(strategy, callers, seed):
     assert_gtsam_agrees(last_belief(strategy, seed, frames=375, callers=callers), 1e-5)

@@ -145,7 +145,7 @@ def relative(found, expected):
 
 
 @pytest.mark.parametrize("strategy", SENSING)
-def test_poses_and_map_are_the_best_there_are_of_everything_at_once(strategy):
+def test_poses_and_map_match_the_batch_solution(strategy):
     """The paper's noise; between the scans a leg is linear, which shows: see the next two."""
     mission, motion, start = scaled_mission(strategy, 1.0)
     *_, (belief, _) = followed(smoother(motion), mission, start)
@@ -159,7 +159,7 @@ def test_poses_and_map_are_the_best_there_are_of_everything_at_once(strategy):
 
 @pytest.mark.parametrize("strategy", SENSING)
 @pytest.mark.parametrize("scale", [1e-2, 1e-4])
-def test_so_are_the_poses_between_the_scans_as_far_as_noise_is_small(strategy, scale):
+def test_poses_between_scans_match_the_batch_solution_with_small_noise(strategy, scale):
     mission, motion, start = scaled_mission(strategy, scale)
     *_, (belief, _) = followed(smoother(motion), mission, start)
     nodes, every, places = differences(belief, *at_once(belief, mission, motion, start))
@@ -168,7 +168,7 @@ def test_so_are_the_poses_between_the_scans_as_far_as_noise_is_small(strategy, s
     assert every[1] < max(1e-6, 0.01 * scale)
 
 
-def test_covariances_of_all_steps_are_those_of_everything_at_once_where_nothing_was_off():
+def test_covariances_without_noise_match_the_batch_solution():
     mission, motion, start = scaled_mission("fused", 1.0)
     mission = without_noise(mission, start)
     *_, (belief, _) = followed(smoother(motion), mission, start)
@@ -179,9 +179,7 @@ def test_covariances_of_all_steps_are_those_of_everything_at_once_where_nothing_
 
 @pytest.mark.parametrize("strategy", ["fused", "passive"])
 @pytest.mark.parametrize("callers", [(13,), (13, 45, 31)], ids=["one caller", "three callers"])
-def test_with_excess_paths_they_are_still_the_best_there_are_of_everything_at_once(
-    strategy, callers
-):
+def test_poses_and_map_with_excess_paths_match_the_batch_solution(strategy, callers):
     mission, motion, start = scaled_mission(strategy, 1e-2, callers=callers)
     *_, (belief, _) = followed(smoother(motion), mission, start)
     nodes, every, places = differences(belief, *at_once(belief, mission, motion, start))
@@ -192,7 +190,7 @@ def test_with_excess_paths_they_are_still_the_best_there_are_of_everything_at_on
     assert spread_of(belief) < 0.98 * spread_of(deaf)
 
 
-def test_without_their_excess_paths_they_are_not():
+def test_poses_and_map_without_excess_paths_do_not_match_the_batch_solution():
     mission, motion, start = scaled_mission("passive", 1e-2, callers=(13,))
     *_, (belief, _) = followed(smoother(motion), mission, start)
     bare = without_excess_paths(mission)
@@ -219,7 +217,7 @@ def test_excess_paths_that_are_off_by_far_count_by_hubers_loss(callers):
 
 
 @pytest.mark.parametrize("strategy", SENSING)
-def test_what_is_off_by_far_counts_by_hubers_loss(strategy):
+def test_outliers_count_by_hubers_loss(strategy):
     mission, motion, start = scaled_mission(strategy, 1.0, outliers=0.05)
     *_, (belief, _) = followed(smoother(motion, robust=True), mission, start)
     best = at_once(belief, mission, motion, start, robust=True)
@@ -247,7 +245,7 @@ def nees(seed, off):
     return own @ np.linalg.solve(pose.covariance, own), np.median(of_map)
 
 
-def test_pose_and_map_are_off_by_what_they_say_with_excess_paths_as_good_as_told():
+def test_pose_and_map_are_consistent_only_with_true_excess_path_noise():
     """Chi-square of 72, within 0.1 %; landmarks of a world are off together, so of 48 in all."""
     pose, of_map = np.transpose([nees(seed, 1.0) for seed in range(24)])
     assert 39.0 < pose.sum() < 116.0
@@ -278,14 +276,14 @@ def check_reached(strategy, frames, seed):
 
 @pytest.mark.parametrize("strategy", SENSING)
 @pytest.mark.parametrize("seed", range(3))
-def test_the_optimum_from_its_own_poses_is_the_one_from_the_truth(strategy, seed):
+def test_the_optimum_from_online_poses_equals_the_optimum_from_the_truth(strategy, seed):
     check_reached(strategy, 60, seed)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("strategy", SENSING)
 @pytest.mark.parametrize("seed", range(8))
-def test_the_optimum_of_a_whole_mission_is_the_one_from_the_truth(strategy, seed):
+def test_the_optimum_of_a_whole_mission_equals_the_optimum_from_the_truth(strategy, seed):
     check_reached(strategy, 375, seed)
 
 
@@ -295,12 +293,9 @@ def test_the_optimum_of_a_whole_mission_is_the_one_from_the_truth(strategy, seed
 @pytest.mark.parametrize("strategy", SENSING)
 @pytest.mark.parametrize(
     ("turn", "within"),
-    [
-        pytest.param(np.pi / 2, 1e-6, id="by a quarter"),
-        pytest.param(2.0, 3e-3, id="by any angle"),
-    ],
+    [pytest.param(np.pi / 2, 1e-6, id="by a quarter"), pytest.param(2.0, 3e-3, id="by any angle")],
 )
-def test_turning_and_shifting_the_world_turns_and_shifts_all_that_is_told(strategy, turn, within):
+def test_turning_and_shifting_the_world_turns_and_shifts_the_belief(strategy, turn, within):
     """A landmark is linearised anew when x or y has moved: exactly so by a quarter alone."""
     mission, shift = paper_mission(strategy, frames=30), np.array([300.0, -40.0])
     c, s = np.cos(turn), np.sin(turn)
@@ -353,7 +348,7 @@ def test_scans_before_any_step_at_one_time_and_while_standing_leave_a_pose_for_e
     assert np.all(np.diff(track.pose.mean[3:9, 0]) > 0.05)
 
 
-def test_a_drive_that_hears_nothing_is_reckoned():
+def test_a_drive_without_measurements_is_dead_reckoned():
     drive, _ = drive_of([CIRCLE] * 6, [])
     track = run_filter(smoother(), drive, [], None)
     np.testing.assert_allclose(track.pose.mean, track.online.mean, rtol=0, atol=1e-12)
@@ -396,7 +391,7 @@ def test_a_belief_left_behind_goes_on_to_the_same_bits_with_excess_paths():
             np.testing.assert_array_equal(now, then)
 
 
-def test_excess_paths_of_a_caller_that_nobody_hears_change_no_bit():
+def test_excess_paths_of_an_unmeasured_caller_change_no_bit():
     mission, motion, start = scaled_mission("passive", 1.0, callers=(13,), frames=50)
     silent = [replace(scan, callers=np.array([-1, 99])) for scan in mission.scans]
     *_, (belief, _) = followed(smoother(motion), replace(mission, scans=silent), start)
@@ -405,7 +400,7 @@ def test_excess_paths_of_a_caller_that_nobody_hears_change_no_bit():
         np.testing.assert_array_equal(now, then)
 
 
-def test_two_ways_on_from_one_belief_do_not_know_of_each_other():
+def test_two_continuations_of_a_belief_are_independent():
     mission, slam = paper_mission("fused", frames=12), smoother()
     *_, (kept, _) = followed(slam, mission)
     here = slam.predict(kept, mission.controls[0], mission.dt[0])[0]
@@ -456,7 +451,7 @@ def timed_scan(rows, caller):
         pytest.param((2, 6.5, 1.3), 0, id="of a landmark that is new"),
     ],
 )
-def test_what_is_outside_the_gate_is_dropped_and_counted(row, dropped):
+def test_rows_outside_the_gate_are_dropped_and_counted(row, dropped):
     slam, belief = known_landmark(0.999)
     after = slam.update(belief, scan_of(row))
     assert after.gated == dropped
@@ -464,7 +459,7 @@ def test_what_is_outside_the_gate_is_dropped_and_counted(row, dropped):
     assert same == bool(dropped)
 
 
-def test_the_gate_is_where_the_distribution_of_what_is_expected_has_it():
+def test_the_gate_is_a_quantile_of_the_predicted_distribution():
     """The landmark known three times over: a fourth look is off by R (1 + 1/3)."""
     slam, belief = known_landmark(0.99)
     edge = np.sqrt(9.2103404 * 0.2**2 * 4 / 3)
@@ -472,7 +467,7 @@ def test_the_gate_is_where_the_distribution_of_what_is_expected_has_it():
         assert slam.update(belief, scan_of((1, 5.0 + off, 0.3))).gated == dropped
 
 
-def test_the_gate_of_a_bearing_alone_is_that_of_one_number():
+def test_the_gate_of_a_single_bearing_has_one_degree_of_freedom():
     slam, belief = known_landmark(0.99)
     bearing = float(np.arctan2(*belief.landmarks().mean[0, ::-1]))
     edge = np.sqrt(6.6348966 * 0.15**2 * 4 / 3)
@@ -482,9 +477,7 @@ def test_the_gate_of_a_bearing_alone_is_that_of_one_number():
 
 @pytest.mark.parametrize(("share", "dropped"), [(0.99, 0), (1.01, 1)])
 @pytest.mark.parametrize("further", [False, True], ids=["beside a bearing", "alone"])
-def test_an_excess_path_is_dropped_alone_where_the_distribution_of_what_is_expected_has_it(
-    share, dropped, further
-):
+def test_an_excess_path_is_gated_separately_by_its_predicted_distribution(share, dropped, further):
     """Landmarks 1 and 2 are known thrice over; the excess path is off by their spread and R."""
     slam, belief, places = two_landmarks(0.99)
     C = np.zeros((4, 4))

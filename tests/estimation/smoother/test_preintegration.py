@@ -87,7 +87,7 @@ def test_ends_as_the_controls_have_them_leave_the_prediction():
     np.testing.assert_allclose(told.covariance, steps.covariance, rtol=0, atol=2e-12)
 
 
-def test_an_end_that_is_known_is_gone_through_and_what_led_to_it_is_moved_less():
+def test_a_known_end_is_met_and_earlier_steps_move_less():
     ends, _ = predicted_joint(A, LEG)
     off = np.array([0.01, -0.02, 0.03])
     told = between(np.array([ends[0], ends[1] + off]), np.zeros((6, 6)), LEG)
@@ -130,7 +130,7 @@ def test_a_leg_without_noise_is_itself_between_any_ends():
     np.testing.assert_allclose(told.covariance, steps.covariance, rtol=0, atol=2e-12)
 
 
-def test_a_leg_moves_unless_it_stands_without_noise():
+def test_a_leg_moves_unless_at_rest_without_noise():
     standing = Motion(model="unicycle", control_std=(0.1, 0.1), noise_at_rest=False)
     still = np.zeros((3, 2)), np.ones(3)
     assert not no_odometry().moves()

@@ -11,9 +11,9 @@ from reference.drives import turn_and_drive
 from reference.optimum import from_the_truth, poses_of
 
 
-def mapped(seed, *, gross=0.0, robust=False):
-    """A drive, its track, and the last belief."""
-    drive, scans = turn_and_drive(seed, gross=gross)
+def mapped(seed, *, gross=0.0, robust=False, looks=300):
+    """Return a drive, its track, and the last belief."""
+    drive, scans = turn_and_drive(seed, gross=gross, looks=looks)
     slam, beliefs = Smoother(motion=drive.motion, rays=RayConfig(), robust=robust), []
     track = run_filter(slam, drive, scans, None, watch=lambda _, belief: beliefs.append(belief))
     return drive, track, beliefs[-1]
@@ -61,11 +61,14 @@ def test_no_log_of_precise_bearings_is_lost():
     assert np.median(online) < 0.06
 
 
-@pytest.mark.parametrize("seed", [0, *(pytest.param(n, marks=pytest.mark.slow) for n in (1, 2))])
-def test_gross_errors_of_one_bearing_in_twenty_cost_little_by_hubers_loss_and_all_without(seed):
+@pytest.mark.parametrize(
+    ("seed", "looks"),
+    [(0, 80), *(pytest.param(seed, 300, marks=pytest.mark.slow) for seed in range(3))],
+)
+def test_hubers_loss_limits_gross_errors_of_one_bearing_in_twenty(seed, looks):
     """Aligned RMSE of three seeds: 0.03 to 0.07 m, and metres without."""
-    drive, track, _ = mapped(seed, gross=0.05, robust=True)
-    _, trusting, _ = mapped(seed, gross=0.05)
+    drive, track, _ = mapped(seed, gross=0.05, robust=True, looks=looks)
+    _, trusting, _ = mapped(seed, gross=0.05, looks=looks)
     assert aligned(track.pose, drive) < 0.1
     assert aligned(track.pose, drive) < 0.1 * aligned(trusting.pose, drive)
 

@@ -34,7 +34,7 @@ def way_to(place, caller=CALLER):
 # How sure
 
 
-def test_the_range_by_an_excess_path_is_that_of_the_landmark_and_of_the_caller():
+def test_an_excess_path_gives_the_range_of_landmark_or_caller():
     no_noise = np.zeros((4, 4))
     assert unscented_range(way_to(BESIDE), no_noise, False) == pytest.approx(
         (np.hypot(*BESIDE), 0.0)
@@ -45,7 +45,7 @@ def test_the_range_by_an_excess_path_is_that_of_the_landmark_and_of_the_caller()
 
 
 @pytest.mark.parametrize("caller", [False, True])
-def test_its_deviation_is_that_of_draws_where_noise_is_small(caller):
+def test_the_deviation_of_a_range_matches_draws_with_small_noise(caller):
     rng = np.random.default_rng(1)
     L = 0.02 * rng.normal(size=(4, 4))
     spread = L @ L.T
@@ -69,7 +69,7 @@ def test_between_vehicle_and_caller_no_range_is_sure_whatever_the_excess_path_is
     )
 
 
-def test_an_excess_path_that_may_be_none_tells_no_range():
+def test_an_excess_path_that_may_be_zero_gives_no_range():
     way = way_to(BESIDE)
     for std, known in ((way[3] / 2.99, False), (way[3] / 20.0, True)):
         share = unscented_range(way, np.diag([0.0, 0.0, 0.0, std**2]), False)[1]
@@ -134,7 +134,7 @@ def test_a_landmark_between_vehicle_and_caller_is_not_placed_and_does_no_harm(of
     np.testing.assert_array_equal(belief.pose().mean, before.pose().mean)
 
 
-def test_one_between_them_that_is_known_by_its_range_is_left_where_it_is():
+def test_a_landmark_between_vehicle_and_caller_stays_in_place():
     """Slopes along the line are none there: e says how far beside it stands, at most."""
     before, between = knowing(9, CALLER), 0.4 * CALLER
     known = (4, between, np.hypot(*between), np.nan)
@@ -166,7 +166,7 @@ def test_of_several_excess_paths_the_surest_places():
     assert vague.history.placed == (9, 8)
 
 
-def test_how_sure_the_caller_is_counts():
+def test_an_imprecise_caller_initialises_no_landmark():
     """The same bearing and excess path: a caller whose range has a std of 2 m places nothing."""
     row = (4, BESIDE, np.nan, excess_path_of(HERE, BESIDE, CALLER))
     vague = slam().init(SURE)

@@ -54,7 +54,7 @@ def whole():
     return driven()
 
 
-def test_the_border_is_as_wide_as_what_is_around(forgetful, whole):
+def test_the_separator_is_as_wide_as_the_surroundings(forgetful, whole):
     """Some seven landmarks are heard at once; a stretch and the window hold some 45 of sixty."""
     widest = max(belief.solution.beta.size for belief in forgetful)
     assert whole[ROUND].solution.beta.size > 115
@@ -62,7 +62,7 @@ def test_the_border_is_as_wide_as_what_is_around(forgetful, whole):
     assert (forgetful[ROUND].solution.columns == 0).sum() > 15
 
 
-def test_what_is_heard_again_is_in_the_border_again(forgetful):
+def test_landmarks_measured_again_return_to_the_separator(forgetful):
     before, after = forgetful[ROUND - 20], forgetful[ROUND + 20]
     left = np.flatnonzero((before.solution.columns == 0) & (before.history.leaves != NEVER))
     again = left[after.solution.columns[left] > 0]
@@ -70,7 +70,7 @@ def test_what_is_heard_again_is_in_the_border_again(forgetful):
     assert (after.history.leaves[again] == NEVER).all()
 
 
-def test_nothing_is_lost_by_it(forgetful, whole):
+def test_a_window_gives_the_estimates_of_the_whole_map(forgetful, whole):
     """Path, map and their covariances at the end; poses at their time but for their points."""
     ours, theirs = forgetful[-1], whole[-1]
     np.testing.assert_allclose(ours.path().mean, theirs.path().mean, rtol=0, atol=1e-6)
@@ -111,7 +111,7 @@ def test_landmarks_known_beforehand_leave_and_come_as_others_do():
     np.testing.assert_allclose(far, 0.01 * np.eye(2)[None], rtol=1e-6, atol=1e-9)
 
 
-def test_beliefs_before_are_not_changed_by_what_leaves():
+def test_earlier_beliefs_are_unchanged_when_landmarks_leave_the_window():
     slam, mission = smoother(window=10.0), round_trip(2 * STRETCH + 2)
     *_, before, _, last = (belief for belief, _ in followed(slam, mission, START))
     state = before.solution.state.copy()

@@ -72,7 +72,7 @@ def test_the_papers_beacon_is_the_list_of_one_to_the_bit(seed, distance):
         assert told == [("vehicle", 35e3, 49.7), ("beacon", 30e3, 42.8)]
 
 
-def test_the_papers_world_is_what_it_was():
+def test_the_papers_world_is_unchanged():
     drawn = world_of(Config(), 3)
     assert drawn.callers[1].place.tolist() == pytest.approx(BEACON, abs=1e-9)
     assert drawn.landmarks[-1].tolist() == pytest.approx(LAST, abs=1e-9)
@@ -90,7 +90,7 @@ MORE = {
 
 @pytest.mark.parametrize("way", MORE)
 @pytest.mark.parametrize("seed", SEEDS)
-def test_one_caller_more_changes_neither_path_nor_landmarks_nor_those_before(seed, way):
+def test_another_caller_changes_no_path_landmark_or_earlier_caller(seed, way):
     one = world_of(config_of({}), seed)
     two = world_of(config_of({}, MATE), seed)
     three = world_of(config_of({}, MATE, {"frequency": 20e3} | MORE[way]), seed)
@@ -110,7 +110,7 @@ def test_path_and_landmarks_do_not_depend_on_where_the_first_caller_is(way):
 
 
 @pytest.mark.parametrize("seed", SEEDS)
-def test_a_caller_at_another_distance_lies_in_the_beacons_direction(seed):
+def test_a_caller_at_another_distance_has_the_beacons_direction(seed):
     near, ever = (
         world_of(c, seed).callers[1].place for c in (config_of({"distance": 5.0}), paper())
     )
@@ -119,7 +119,7 @@ def test_a_caller_at_another_distance_lies_in_the_beacons_direction(seed):
 
 
 @pytest.mark.parametrize("seed", SEEDS)
-def test_drawn_callers_keep_clear_of_all_that_stands_and_of_the_path(seed):
+def test_drawn_callers_keep_clear_of_landmarks_callers_and_path(seed):
     tones = ({"frequency": 5e3 * k, "distance": 8.0} for k in range(1, 6))
     drawn = world_of(config_of({"distance": 8.0}, *tones, clearance=1.5), seed)
     places = np.array([caller.place for caller in drawn.callers[1:]])
@@ -129,7 +129,7 @@ def test_drawn_callers_keep_clear_of_all_that_stands_and_of_the_path(seed):
     assert min(nearest(places[:i], place) for i, place in enumerate(places)) >= 1.5
 
 
-def test_who_moves_is_no_landmark_and_bears_the_label_of_its_place_in_the_list():
+def test_a_moving_caller_is_no_landmark_and_is_labelled_by_list_position():
     drawn = world_of(
         config_of({}, MATE | {"course": "circle"}, {"frequency": 2e4, "place": [1, 2]})
     )
@@ -149,7 +149,7 @@ def test_a_circle_is_gone_round_at_its_speed_and_the_other_way_round_below_zero(
         np.testing.assert_allclose(turned, speed / 6.0 * 0.125, rtol=1e-9)
 
 
-def test_a_circle_says_where_it_says_nothing_what_the_scenario_does():
+def test_a_circle_takes_unset_values_from_the_scenario():
     place = (
         world_of(config_of({"course": "circle"}, beacon_distance=9.0, speed=0.5)).callers[1].place
     )
@@ -170,13 +170,13 @@ def test_a_line_is_gone_along_and_back_to_where_it_began():
     np.testing.assert_allclose(still[:96], place[96:0:-1], atol=1e-12)
 
 
-def test_on_a_route_one_stands_before_it_and_after_it():
+def test_a_caller_rests_before_and_after_its_route():
     told = {"route": [[1.0, 0.0, 9.0], [2.0, 2.0, 13.0]]}
     place = world_of(config_of(told)).callers[1].place
     assert place[[0, 12, 160]].tolist() == [[0.0, 9.0], [1.0, 11.0], [2.0, 13.0]]
 
 
-def test_a_walk_has_the_spread_and_the_memory_that_it_says_and_stays_on_the_disc():
+def test_a_walk_has_its_stated_spread_and_memory_on_the_disc():
     std, memory, dt = 0.4, 2.0, 0.125
     told = {"course": "walk", "speed_std": std, "memory": memory, "place": [0.0, 0.0]}
     config = config_of(told, steps=40_000, radius=1e4, landmarks=0, start=(9e3, 0.0, 0.0))
@@ -220,13 +220,13 @@ def test_the_first_caller_keeps_clear_of_landmarks_unless_it_is_the_papers_beaco
 
 
 @pytest.mark.parametrize("seed", SEEDS)
-def test_what_is_drawn_to_move_keeps_clear_of_the_vehicle(seed):
+def test_drawn_moving_callers_keep_clear_of_the_vehicle(seed):
     for told in ({"course": "circle", "radius": 7.4}, {"course": "walk", "distance": 7.4}):
         drawn = world_of(config_of(told, clearance=2.0), seed)
         assert np.hypot(*(drawn.callers[1].place - drawn.path[:, :2]).T).min() >= 2.0
 
 
-def test_velocities_are_those_of_the_steps_that_end_where_it_calls():
+def test_velocities_are_of_the_steps_that_end_at_the_call():
     drawn = world_of(config_of({"course": "circle", "radius": 5.0}))
     _, boat = callers_at(drawn.callers, drawn.time, np.array([4, 8]))
     place = drawn.callers[1].place
@@ -267,7 +267,7 @@ def test_a_caller_that_cannot_be_is_refused_by_its_key(case):
     assert str(refused.value).startswith(said)
 
 
-def test_a_route_may_be_a_file_and_what_is_wrong_in_it_has_a_line(tmp_path):
+def test_a_route_file_with_mistakes_is_refused_by_line(tmp_path):
     path = tmp_path / "boat.csv"
     path.write_text("time,x,y\n0,1,2\n5,3,4\n")
     told = CallerConfig(route=str(path))
@@ -421,7 +421,7 @@ def test_a_route_with_headings_is_a_vehicle_and_half_of_them_are_refused(tmp_pat
         resolve(from_flags({"callers": mixed}))
 
 
-def test_each_of_two_vehicles_has_noise_of_its_own():
+def test_each_of_two_vehicles_has_independent_noise():
     levels = []
     for vehicle in (1, 2):
         setup = PAIR.scenario.model_copy(update={"vehicle": vehicle, "steps": 40})

@@ -54,17 +54,24 @@ def test_a_jitter_moves_calls_by_so_much_and_nothing_else_of_the_world():
     assert 0.003 < off[1:].std() < 0.005  # the first cannot be before the start
 
 
-@pytest.mark.parametrize("engine", ["block", "dense"])
+TWICE_A_FRAME = {"period": 0.23, "offset": 0.1}
+IN_SOME_FRAMES = {"period": 1.2, "offset": 0.45}
+
+
 @pytest.mark.parametrize(
-    ("clock", "least"),
-    [({"period": 0.23, "offset": 0.1}, 36), ({"period": 1.2, "offset": 0.45}, 7)],
-    ids=["twice in a frame", "in some frames"],
+    ("engine", "clock", "steps", "least"),
+    [
+        ("block", TWICE_A_FRAME, 80, 36),
+        ("block", IN_SOME_FRAMES, 80, 7),
+        ("dense", TWICE_A_FRAME, 24, 11),
+        pytest.param("dense", TWICE_A_FRAME, 80, 36, marks=pytest.mark.slow),
+        pytest.param("dense", IN_SOME_FRAMES, 80, 7, marks=pytest.mark.slow),
+    ],
 )
-def test_excess_paths_and_bearings_are_those_of_the_moment_at_which_a_call_is_heard(
-    engine, clock, least
-):
-    receiver = {"receiver": {"engine": engine}}
-    config = config_of({"distance": 9.0} | clock, **(receiver if engine == "dense" else {}))
+def test_excess_paths_and_bearings_are_of_the_moment_of_reception(engine, clock, steps, least):
+    setup = {"receiver": {"engine": engine}} if engine == "dense" else {}
+    setup["scenario"] = SETUP | {"steps": steps}
+    config = config_of({"distance": 9.0} | clock, **setup)
     world, between, _ = heard_calls(config)
     label, caller = len(world.landmarks) + 1, np.asarray(world.callers[1].place)
     assert least <= len(between) <= len(direct_times(world, config))
@@ -86,7 +93,7 @@ def test_excess_paths_and_bearings_are_those_of_the_moment_at_which_a_call_is_he
     assert np.sqrt(np.mean(np.square(turned))) < 0.03
 
 
-def test_to_a_vehicle_that_stands_a_caller_in_step_by_its_own_clock_sounds_as_one_without():
+def test_a_clock_in_step_changes_nothing_for_a_vehicle_at_rest():
     config = config_of({"distance": 9.0})
     world = world_of(config)
     still = replace(world, path=np.tile(world.path[0], (81, 1)))
@@ -108,7 +115,7 @@ def unaimed(arrivals, **_):
     return arrivals
 
 
-def test_echoes_that_come_after_the_vehicle_has_called_again_are_those_of_their_call():
+def test_echoes_after_the_next_call_belong_to_their_call():
     _, between, _ = heard_calls(config_of({"distance": 9.0, "offset": 0.44}))
     late = [
         heard.rows.time % 0.5 + (np.nan_to_num(heard.rows.excess_path) / 343.0).max()
@@ -120,7 +127,7 @@ def test_echoes_that_come_after_the_vehicle_has_called_again_are_those_of_their_
     assert np.mean(whole) > 0.85 * np.mean([len(heard.rows.landmark) for heard in early])
 
 
-def test_what_arrives_as_the_vehicle_calls_is_drowned():
+def test_arrivals_during_the_vehicles_call_are_lost():
     config = config_of({"distance": 9.0})
     world = world_of(config)
     still = replace(world, path=np.tile(world.path[0], (81, 1)))
@@ -133,7 +140,7 @@ def test_what_arrives_as_the_vehicle_calls_is_drowned():
         assert direct.any() == heard_once
 
 
-def test_the_own_echoes_of_a_world_do_not_hang_on_the_others_clocks():
+def test_own_echoes_do_not_depend_on_other_callers_clocks():
     counts = []
     for clock in ({}, {"offset": 0.25}, {"period": 0.21}):
         _, _, frames = heard_calls(config_of({"distance": 15.0} | clock, timing=False))
@@ -150,7 +157,7 @@ def test_active_sensing_has_a_scan_a_frame_and_listening_one_more_for_every_call
     assert len(scans_of(heard, "fused", config)) == 20 + len(between)
 
 
-def test_further_times_of_a_world_lie_on_its_paths():
+def test_additional_times_of_a_world_are_on_its_paths():
     config = config_of({"course": "circle", "radius": 9.0, "speed": 1.0})
     world = world_of(config)
     times = [1.03, 2.125, 7.77]
@@ -180,7 +187,7 @@ def test_a_clock_that_none_can_have_is_refused(clock, said):
         world_of(config_of(clock))
 
 
-def test_a_vehicle_with_a_clock_of_its_own_is_heard_and_is_no_view_of_the_world():
+def test_a_vehicle_with_a_clock_calls_but_cannot_be_the_listener():
     mate = {"course": "mission", "frequency": 30e3, "offset": 0.2}
     world = world_of(config_of(mate))
     assert world.callers[1].heading is not None
@@ -188,7 +195,7 @@ def test_a_vehicle_with_a_clock_of_its_own_is_heard_and_is_no_view_of_the_world(
         world_of(config_of(mate, scenario=SETUP | {"vehicle": 2}))
 
 
-def test_who_never_calls_is_never_heard():
+def test_a_caller_without_calls_is_never_detected():
     config = config_of({"distance": 15.0, "times": []})
     world, between, frames = heard_calls(config)
     assert not between
@@ -196,6 +203,6 @@ def test_who_never_calls_is_never_heard():
     assert drive_of(world, config).time.size == 81
 
 
-def test_without_a_list_nobody_has_a_clock():
+def test_callers_have_no_clock_without_a_list_of_times():
     world = world_of(Config(scenario=ScenarioConfig(**SETUP), listening=ListeningConfig()))
     assert [caller.calls for caller in world.callers] == [None, None]

@@ -14,7 +14,7 @@ def field(kind, seed=7, path=NOWHERE, callers=NOWHERE, **settings):
     return landmarks_in(setup, path, callers, np.random.default_rng(seed))
 
 
-def test_an_orchard_stands_in_rows_between_the_lanes():
+def test_an_orchard_has_rows_between_the_lanes():
     trees = field("rows", landmarks=60, lane=4.0, extent=12.0, spacing=3.0)
     row = (trees[:, 1] + 12.0) / 4.0 - 0.5
     assert np.abs(row - np.rint(row)).max() <= MAX_ROW_OFFSET * 3.0 / 4.0
@@ -43,13 +43,13 @@ def test_all_keep_clear_of_path_callers_and_each_other(kind):
 
 
 @pytest.mark.parametrize("kind", ["rows", "rooms"])
-def test_other_seeds_draw_others(kind):
+def test_different_seeds_draw_different_fields(kind):
     assert not np.array_equal(field(kind, 1), field(kind, 2))
     assert np.array_equal(field(kind, 1), field(kind, 1))
 
 
 @pytest.mark.parametrize("kind", ["disc", "rows", "rooms"])
-def test_what_does_not_fit_is_refused(kind):
+def test_too_many_landmarks_for_a_field_are_refused(kind):
     with pytest.raises(InputError, match=r"scenario\.landmarks: found 400, but (at most|room)"):
         field(kind, landmarks=400, radius=12.0)
 
@@ -60,5 +60,5 @@ def test_trees_without_a_distance_are_refused():
 
 
 @pytest.mark.parametrize("kind", ["disc", "rows", "rooms"])
-def test_there_may_be_none(kind):
+def test_a_field_may_have_no_landmarks(kind):
     assert field(kind, landmarks=0).shape == (0, 2)

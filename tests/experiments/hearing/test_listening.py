@@ -66,7 +66,7 @@ def bits(beam):
     ]
 
 
-def test_one_beam_sounds_the_same_alone_and_among_twelve_in_any_order():
+def test_a_beam_gives_the_same_bits_single_and_among_twelve():
     world, config = short(40)
     radii = [1e-3 * radius for radius in RADII]
     twelve = listen(world, config, radii)
@@ -84,7 +84,7 @@ def test_the_settings_own_radius_is_not_used():
 
 
 @pytest.mark.parametrize("steps", [4, pytest.param(8, marks=pytest.mark.slow)])
-def test_the_dense_engine_too_hears_each_beam_alone_and_each_world_with_its_own_noise(steps):
+def test_the_dense_engine_separates_beams_and_draws_noise_per_world(steps):
     world, config = short(steps, receiver=ReceiverConfig(engine="dense"))
     wide, narrow = listen(world, config, [0.0025, 0.025])
     assert bits(listen(world, config, [0.025])[0]) == bits(narrow)
@@ -116,7 +116,7 @@ def test_a_narrower_beam_ranges_fewer_landmarks():
     assert count[0] > 1.5 * count[1] > 1.5 * 1.5 * count[2] > 0
 
 
-def test_the_truth_labels_detections_and_enters_nowhere_else():
+def test_the_truth_is_used_only_to_label_detections():
     world, config = short(40)
     as_is = listen(world, config, [0.0088])[0]
 
@@ -136,7 +136,7 @@ def test_the_truth_labels_detections_and_enters_nowhere_else():
     assert sum(heard.clutter for heard in deaf) > sum(heard.clutter for heard in as_is)
 
 
-def test_without_labels_as_much_is_heard_and_what_is_labelled_stays_as_it_was():
+def test_unlabelled_rows_leave_the_labelled_rows_unchanged():
     world, config = short(40)
     (labelled,) = listen(world, config, [0.0088])
     (both,) = listen(world, config, [0.0088], labels=False)
@@ -153,7 +153,7 @@ def test_without_labels_as_much_is_heard_and_what_is_labelled_stays_as_it_was():
         assert rows.landmark.size >= one.rows.landmark.size
 
 
-def test_without_labels_the_direct_call_is_marked_and_excess_paths_are_those_that_labels_have():
+def test_unlabelled_rows_mark_the_direct_call_and_share_excess_paths():
     world, config = short(40)
     (heard,) = listen(world, config, [0.0088], labels=False)
     beacon, marked, same, paths = world.callers[1], 0, 0, 0
@@ -217,9 +217,7 @@ def test_faces_are_averaged_as_the_settings_ask(averaging):
 
 
 @pytest.mark.parametrize(("margin_db", "noise_db", "blocks"), [(0.0, 0.0, 14), (6.0, 4.0, 10)])
-def test_the_oracle_is_told_the_gates_the_call_and_the_faintest_level_of_the_settings(
-    margin_db, noise_db, blocks
-):
+def test_the_oracle_receives_gates_call_duration_and_faintest_level(margin_db, noise_db, blocks):
     gates = MatchingConfig(margin_db=margin_db, delay_gate=0.2)
     settings = {
         "matching": gates,
@@ -239,7 +237,7 @@ def test_the_oracle_is_told_the_gates_the_call_and_the_faintest_level_of_the_set
     assert told == [(gates, blocks * BLOCK, pytest.approx(expected, abs=1e-9))]
 
 
-def test_what_the_callers_call_at_is_heard_and_not_the_settings_tones_and_levels():
+def test_the_callers_tones_and_levels_override_the_settings():
     world, config = short(8)
     vehicle, beacon = world.callers
     callers = (
@@ -272,7 +270,7 @@ def noise_heard(config, iteration=0):
 
 
 @pytest.mark.parametrize("engine", ["block", pytest.param("dense", marks=pytest.mark.slow)])
-def test_every_frame_world_and_seed_has_noise_of_its_own_that_all_beams_share(engine):
+def test_every_frame_world_and_seed_has_independent_noise_for_all_beams(engine):
     alone = ScenarioConfig(steps=8, landmarks=0)
     config = Config(receiver=ReceiverConfig(engine=engine), scenario=alone)
     drawn = [
@@ -307,7 +305,7 @@ def errors_of(config, worlds):
     return [column[~np.isnan(column)] for column in columns]
 
 
-def test_errors_of_what_is_heard_are_a_few_hundredths_of_a_radian_and_a_few_centimetres():
+def test_errors_of_detections_are_a_few_hundredths_of_a_radian_and_centimetres():
     own, other, late = errors_of(CONFIG, 1)
     rms = [np.sqrt(np.mean(error**2)) for error in (own, other, late)]
     assert 0.005 < rms[0] < 0.03
@@ -316,7 +314,7 @@ def test_errors_of_what_is_heard_are_a_few_hundredths_of_a_radian_and_a_few_cent
     assert all(abs(np.mean(error)) < 0.2 * np.std(error) for error in (own, other))
 
 
-def test_ranges_bearings_and_beams_are_those_of_the_air_of_the_settings():
+def test_ranges_bearings_and_beams_use_the_configured_speed_of_sound():
     config = Config(air=AirConfig(speed_of_sound=390.0), scenario=ScenarioConfig(steps=200))
     own, other, late = errors_of(config, 1)
     assert late.size > 20
@@ -331,7 +329,7 @@ def test_ranges_bearings_and_beams_are_those_of_the_air_of_the_settings():
     assert bits(settled[0]) == bits(said[0])
 
 
-def test_the_off_axis_loss_is_that_of_the_settings():
+def test_the_off_axis_loss_follows_the_settings():
     config = Config(scenario=ScenarioConfig(steps=80))
     mild = config.model_copy(update={"emitter": EmitterConfig(off_axis="power")})
     world = draw_scenario(config, np.random.default_rng(7))
@@ -508,7 +506,7 @@ def test_a_third_caller_is_heard_where_it_is_by_either_engine(engine, moving):
         assert abs(wrap(found - bearing[0])) < 0.02
 
 
-def test_a_third_caller_that_stands_is_heard_to_the_bit_as_one_on_a_constant_path():
+def test_a_fixed_third_caller_equals_a_constant_path_to_the_bit():
     world, config = short(16)
     three = chorus(world, moving=False)
     tied = replace(three.callers[2], place=np.tile(three.callers[2].place, (17, 1)))

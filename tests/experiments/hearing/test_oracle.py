@@ -109,7 +109,7 @@ def slow_labels(found, arrivals):
 
 @given(seed=SEEDS)
 @law
-def test_labels_are_those_of_a_slow_second_version(seed):
+def test_labels_match_a_slow_second_version(seed):
     found, arrivals = crowd(seed)
     label = labels(found, arrivals)
     assert label == slow_labels(found, arrivals)

@@ -124,7 +124,7 @@ def test_elements_that_do_not_rise_are_refused(position):
         listen(world_of(CONFIG), CONFIG, (0.0088,), layout=layout)
 
 
-def test_phases_are_those_that_the_recorder_writes():
+def test_phases_match_the_recorded_signal():
     settled = sampling(CONFIG, callers_of(CONFIG, np.zeros(2))[:1])
     signal = record_samples(80, echoes([0.005], 30.0, 0.4), RULER, settled, None)
     n = 1000 - settled.pulse * settled.block + 100
@@ -185,7 +185,7 @@ def test_a_sweep_is_heard_in_a_mission_where_echoes_overlap_less():
     assert np.quantile(off[1], 0.9) < 0.02 < 0.5 * np.quantile(off[0], 0.9)
 
 
-def test_the_block_engine_says_that_it_sums_tone_bursts_alone():
+def test_the_block_engine_refuses_calls_other_than_tone_bursts():
     sums = {"receiver": CONFIG.receiver.model_copy(update={"engine": "block"})}
     with pytest.raises(InputError, match="for a Sweep; expected 'dense'"):
         listen(world_of(CONFIG), CONFIG.model_copy(update=sums), (0.0088,), call=Sweep)
@@ -290,7 +290,7 @@ def test_a_shape_of_ones_own_is_heard_by_its_law_and_kept_in_a_worlds_folder(pla
     assert read.bodies.shape.tolist() == ["plate", "cylinder"]
 
 
-def test_a_shape_that_nobody_knows_is_refused():
+def test_an_unknown_shape_is_refused():
     bodies = Bodies(radius=np.array([0.1]), shape=np.array(["cube"]))
     one = np.array([[6.0, 0.0]])
     callers = callers_of(CONFIG, np.array([2.0, 8.0]))

@@ -26,7 +26,7 @@ def beacon_of(drawn):
     return beacon.place
 
 
-def test_what_there_is_to_map_are_the_landmarks_and_all_who_call_but_the_vehicle():
+def test_landmarks_and_fixed_callers_are_to_be_mapped():
     config = Config(scenario=ScenarioConfig(landmarks=9, steps=20))
     drawn = draw_scenario(config, np.random.default_rng(3))
     labels, _ = standing_landmarks(drawn)
@@ -100,7 +100,7 @@ def test_the_same_seed_draws_the_same_world_and_another_another():
     assert beacon_of(one).tobytes() != beacon_of(other).tobytes()
 
 
-def test_more_landmarks_leave_path_and_beacon_as_they_were():
+def test_more_landmarks_change_neither_path_nor_beacon():
     few, many = world(7, landmarks=5), world(7, landmarks=50)
     assert few.path.tobytes() == many.path.tobytes()
     assert beacon_of(few).tobytes() == beacon_of(many).tobytes()
@@ -119,7 +119,7 @@ def test_landmarks_fill_the_disc_evenly_and_the_beacon_its_circle():
     assert kstest(np.arctan2(*beacon.T) / (2 * np.pi) + 0.5, "uniform").pvalue > 1e-6
 
 
-def test_spacing_evens_them_out_and_no_more():
+def test_spacing_only_evens_out_the_landmarks():
     # In rings of equal area the counts of 100 worlds vary less than independent draws would.
     worlds = [world(seed, steps=4) for seed in range(100)]
     ring = [np.histogram(np.hypot(*w.landmarks.T), 25.0 * np.sqrt(np.linspace(0, 1, 6)))[0]
@@ -149,7 +149,7 @@ def test_an_impossible_world_ends_in_a_clear_error_soon(settings, key):
     assert str(settings.get("landmarks", "m")) in str(error.value)
 
 
-def test_as_many_as_fit_are_placed():
+def test_worlds_with_few_and_many_landmarks_are_drawn():
     assert world(7, landmarks=130).landmarks.shape == (130, 2)
     assert world(7, landmarks=0).landmarks.shape == (0, 2)
     assert world(7, landmarks=1, radius=1.0, spacing=60.0).landmarks.shape == (1, 2)

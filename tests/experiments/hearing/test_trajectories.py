@@ -68,7 +68,7 @@ def test_a_front_wheel_turns_no_further_than_its_lock():
 
 
 @pytest.mark.parametrize("motion", MODELS, ids=lambda m: m.model)
-def test_without_noise_the_controls_told_lead_along_the_path(motion):
+def test_controls_without_noise_lead_along_the_path(motion):
     still = Motion(model=motion.model, control_std=(0.0, 0.0), wheelbase=0.2)
     path, controls = drive(None, still, course="eight", steps=300)
     for k, control in enumerate(controls):
@@ -88,16 +88,14 @@ def test_a_unicycles_circle_is_the_bicycles():
     heading=st.floats(-math.pi, math.pi),
     backwards=st.booleans(),
 )
-def test_controls_between_two_poses_are_those_that_led_from_one_to_the_other(
-    motion, speed, turn, heading, backwards
-):
+def test_controls_between_two_poses_invert_the_motion_step(motion, speed, turn, heading, backwards):
     control = np.array([-speed if backwards else speed, turn])
     start = np.array([1.0, -2.0, heading])
     path = np.array([start, motion_step(motion, start, control, 0.125)])
     np.testing.assert_allclose(controls_between(path, 0.125, motion)[0], control, atol=1e-9)
 
 
-def test_poses_are_followed_to_the_bit_and_told_with_noise():
+def test_given_poses_are_followed_to_the_bit_with_noisy_controls():
     path, controls = drive(None, BICYCLE, steps=200)
     time = np.arange(201) * 0.125
     again, told = drive(Poses(time=time, path=path), BICYCLE, 3, steps=200)

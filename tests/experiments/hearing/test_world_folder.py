@@ -64,7 +64,7 @@ def test_a_world_that_was_drawn_is_read_back_to_the_bit(tmp_path, model):
     assert again_config.motion == config.motion
 
 
-def test_the_world_of_a_second_vehicle_is_read_back_as_that_of_the_first_and_only(tmp_path):
+def test_a_second_vehicles_world_is_read_back_as_a_single_vehicles(tmp_path):
     pair = (CallerConfig(name="mate", course="mission"),)
     config = Config(callers=pair, scenario=ScenarioConfig(steps=80, landmarks=12, vehicle=2))
     drawn = world_of(config, 5)
@@ -81,7 +81,7 @@ def test_the_world_of_a_second_vehicle_is_read_back_as_that_of_the_first_and_onl
     np.testing.assert_array_equal(again.callers[1].place, drawn.callers[1].place)
 
 
-def test_bodies_and_routes_are_read_back_too(tmp_path):
+def test_bodies_and_routes_are_read_back(tmp_path):
     time = np.arange(9) * 0.125
     boat = np.column_stack((time, -time))
     drawn = Scenario(
@@ -103,7 +103,7 @@ def test_bodies_and_routes_are_read_back_too(tmp_path):
     assert again.callers[1].level_db == 40.0
 
 
-def test_what_a_world_leaves_open_is_drawn_as_ever(tmp_path):
+def test_a_worlds_missing_parts_are_drawn_as_without_it(tmp_path):
     config = Config(scenario=ScenarioConfig(steps=40, landmarks=8))
     drawn = world_of(config)
     world = read_world(folder_with(tmp_path, landmarks_csv=LANDMARKS))
@@ -125,12 +125,10 @@ def test_bodies_go_with_the_numbers_of_their_landmarks(tmp_path):
     assert bodies.shape.tolist() == ["cylinder", "sphere"]
 
 
-def test_only_a_body_whose_radius_is_stated_has_a_size_and_is_written_with_it(tmp_path):
+def test_only_bodies_with_a_stated_radius_have_and_keep_a_size(tmp_path):
     rows = "landmark,x,y,radius,shape\n1,0,1,0.2,\n2,0,2,,sphere\n3,0,3,,\n"
     folder = folder_with(
-        tmp_path,
-        landmarks_csv=rows,
-        world_toml="format = 1\n[config.target]\nradius = 0.07\n",
+        tmp_path, landmarks_csv=rows, world_toml="format = 1\n[config.target]\nradius = 0.07\n"
     )
     world = read_world(folder)
     np.testing.assert_array_equal(world.bodies.radius, [0.2, np.nan, np.nan])
@@ -140,7 +138,7 @@ def test_only_a_body_whose_radius_is_stated_has_a_size_and_is_written_with_it(tm
     assert written[1:] == ["1,0.0,1.0,0.2,cylinder", "2,0.0,2.0,,sphere", "3,0.0,3.0,,cylinder"]
 
 
-def test_the_beacon_is_drawn_beside_bodies_that_have_a_size(tmp_path):
+def test_the_beacon_is_drawn_clear_of_bodies_with_a_size(tmp_path):
     config, angles = Config(scenario=ScenarioConfig(steps=8)), np.arange(0.2, 6.1, 0.03)
     ring = config.scenario.beacon_distance * np.column_stack((np.cos(angles), np.sin(angles)))
     rows = [f"{i},{x},{y},0.3" for i, (x, y) in enumerate(ring.tolist(), 1)]
@@ -155,7 +153,7 @@ def test_the_beacon_is_drawn_beside_bodies_that_have_a_size(tmp_path):
     assert apart >= config.scenario.clearance
 
 
-def test_columns_say_what_a_path_is(tmp_path):
+def test_columns_determine_the_kind_of_a_path(tmp_path):
     def course(text):
         return read_world(folder_with(tmp_path, path_csv=text)).course
 
@@ -170,7 +168,7 @@ def test_columns_say_what_a_path_is(tmp_path):
     assert both.commands.rows.tolist() == [[1.0, 0.0], [0.0, 0.0]]
 
 
-def test_steps_are_those_of_the_path_unless_given(tmp_path):
+def test_steps_follow_from_the_path_unless_given(tmp_path):
     world = read_world(folder_with(tmp_path, path_csv="x,y\n0,0\n7.5,0\n"))
     assert resolve(settled(world, {})).scenario.steps == 80
     fast = from_flags({"scenario": {"speed": 1.5}})
@@ -201,7 +199,7 @@ def test_in_a_grid_the_plans_callers_call_in_a_world_that_lists_none(tmp_path):
     assert [*caller_names(resolve(laid_over(world, layer, {})).callers)] == ["boat"]
 
 
-def test_callers_have_names_of_their_own(tmp_path):
+def test_callers_without_names_get_distinct_names(tmp_path):
     one = "[[callers]]\nfrequency = 30e3\nlevel_db = 40.0\nplace = [1.0, 2.0]\n"
     named = [
         [*caller_names(read_world(folder).callers)]
@@ -211,7 +209,7 @@ def test_callers_have_names_of_their_own(tmp_path):
     assert named == [["beacon"], ["beacon", "caller2"]]
 
 
-def test_a_worlds_callers_say_what_those_of_the_settings_may(tmp_path):
+def test_a_worlds_callers_may_state_the_settings_keys(tmp_path):
     told = "[[callers]]\n[[callers]]\nfrequency = 25e3\ncourse = 'circle'\nradius = 6.0\n"
     config = Config(scenario=ScenarioConfig(steps=8, landmarks=5))
     world = heard(config, read_world(folder_with(tmp_path, world_toml="format = 1\n" + told)))
@@ -221,7 +219,7 @@ def test_a_worlds_callers_say_what_those_of_the_settings_may(tmp_path):
     np.testing.assert_allclose(np.hypot(*circling.place.T), 6.0)
 
 
-def test_callers_that_settings_list_stand_over_the_worlds_unless_it_is_one_of_a_grid(tmp_path):
+def test_callers_in_the_settings_override_the_worlds_except_in_a_grid(tmp_path):
     told = "format = 1\n[[callers]]\nname = 'mate'\nplace = [1.0, 2.0]\n"
     world = read_world(folder_with(tmp_path, world_toml=told))
     layer = from_flags({"callers": [{"name": "boat", "place": [9.0, 9.0]}]})
@@ -251,7 +249,7 @@ def test_a_caller_of_any_name_is_written_without_harm_to_the_worlds_files(tmp_pa
         np.testing.assert_array_equal(one.place, other.place)
 
 
-def test_there_may_be_nobody_else_who_calls(tmp_path):
+def test_a_world_may_have_no_callers_except_the_vehicle(tmp_path):
     world = read_world(folder_with(tmp_path, world_toml="format = 1\ncallers = []\n"))
     config = Config(scenario=ScenarioConfig(steps=8, landmarks=5))
     scenario = heard(config, world)
@@ -259,14 +257,14 @@ def test_there_may_be_nobody_else_who_calls(tmp_path):
     assert len(checked_scenario(config, world=world).callers) == 1
 
 
-def test_a_header_alone_says_that_nothing_reflects(tmp_path):
+def test_a_landmark_table_with_only_a_header_has_no_landmarks(tmp_path):
     bare = world_of(Config(scenario=ScenarioConfig(steps=8, landmarks=0)), 0, ALL_DRAWN)
     OwnFiles(tmp_path / "bare", WORLD).replace(world_files(bare, Config()))
     assert len(read_world(tmp_path / "bare").landmarks) == 0
 
 
 @pytest.mark.parametrize("name", ["landmark.csv", "Landmarks.csv", "paths.csv", "World.toml"])
-def test_a_file_that_is_misspelt_is_not_passed_over(tmp_path, name):
+def test_a_misspelt_file_is_refused(tmp_path, name):
     right = {"l": "landmarks.csv", "p": "path.csv", "w": "world.toml"}[name[0].lower()]
     kept = {"landmarks_csv": LANDMARKS, "path_csv": "x,y\n0,0\n9,0\n", "world_toml": "format = 1"}
     folder = folder_with(tmp_path, **kept)
@@ -277,13 +275,13 @@ def test_a_file_that_is_misspelt_is_not_passed_over(tmp_path, name):
     assert str(refused.value) == f"{folder}: found {name!r}, expected {right!r}; rename it"
 
 
-def test_a_route_may_be_called_almost_as_a_path(tmp_path):
+def test_a_route_file_may_have_a_name_like_a_path(tmp_path):
     told = '[[callers]]\nname = "boat"\nfrequency = 30e3\nlevel_db = 40\nroute = "path2.csv"\n'
     files = {"world_toml": f"format = 1\n{told}", "path2_csv": "time,x,y\n0,1,2\n9,1,3\n"}
     assert read_world(folder_with(tmp_path, **files)).callers is not None
 
 
-def test_a_link_to_nothing_is_not_passed_over(tmp_path):
+def test_a_broken_link_is_refused(tmp_path):
     folder = folder_with(tmp_path, path_csv="x,y\n0,0\n9,0\n")
     (folder / "landmarks.csv").symlink_to("gone")
     with pytest.raises(InputError, match=r"landmarks\.csv: found a link to no file"):
@@ -403,7 +401,7 @@ WRONG = {
 
 
 @pytest.mark.parametrize("case", WRONG)
-def test_what_is_wrong_is_refused_where_it_stands(tmp_path, case):
+def test_mistakes_are_refused_with_their_location(tmp_path, case):
     files, said = WRONG[case]
     with pytest.raises(InputError) as refused:
         read_world(folder_with(tmp_path, **files))

@@ -83,7 +83,7 @@ def test_a_system_without_symbolic_links_only_lacks_the_link(here, monkeypatch):
 
 
 @pytest.mark.parametrize("kind", ["file", "folder", "link of another tool", "link to nothing"])
-def test_what_somebody_else_calls_latest_is_left_alone(here, kind):
+def test_a_foreign_file_named_latest_is_not_touched(here, kind):
     here.mkdir()
     mine = here / "latest"
     if kind == "file":
@@ -118,7 +118,7 @@ def test_a_folder_with_results_is_refused_unless_overwriting(earlier):
     assert names(earlier) == [SUMS, "summary.json"]
 
 
-def test_overwriting_accepts_a_folder_with_files_of_the_users_beside_the_results(earlier):
+def test_overwriting_keeps_the_users_files_in_the_folder(earlier):
     mine = ("notes.txt", "mission.txt", "map_house.csv", "track_jazz.tum", "a.partial")
     for name in mine:
         (earlier / name).write_text("mine")

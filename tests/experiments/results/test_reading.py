@@ -30,7 +30,7 @@ def refused(folder):
     return str(refusal.value)
 
 
-def test_a_summary_is_read_whatever_else_it_says(tmp_path):
+def test_a_summary_with_unknown_keys_is_read(tmp_path):
     summary = read_summary(written(tmp_path, more={"later": 1}))
     assert [(run.strategy, run.filter) for run in summary.runs] == [("fused", "ekf")]
     assert summary.log is None
@@ -49,7 +49,7 @@ def test_a_summary_is_read_whatever_else_it_says(tmp_path):
         ([], "found no summary.json"),
     ],
 )
-def test_another_folder_is_told_what_it_is_and_what_to_do(tmp_path, files, said):
+def test_another_folder_is_refused_with_its_kind_and_a_remedy(tmp_path, files, said):
     for name in files:
         (tmp_path / name).parent.mkdir(exist_ok=True)
         (tmp_path / name).write_text("")
@@ -61,7 +61,7 @@ def test_another_folder_is_told_what_it_is_and_what_to_do(tmp_path, files, said)
 
 
 @pytest.mark.parametrize("kind", [COMPARISON, WORLD])
-def test_another_folder_of_ours_is_told_by_its_kind(tmp_path, kind):
+def test_another_pipistrelle_folder_is_refused_with_its_kind(tmp_path, kind):
     OwnFiles(tmp_path, kind).replace({"README.md": "one"})
     assert f"{tmp_path}: found {kind.title} of Pipistrelle, expected" in refused(tmp_path)
 
@@ -77,7 +77,7 @@ def test_a_reports_own_summary_is_no_missions(tmp_path):
     assert "found a report" in refused(tmp_path)
 
 
-def test_what_is_not_there_or_is_a_file_is_told_so(tmp_path):
+def test_a_missing_folder_or_a_file_is_refused(tmp_path):
     assert "found no such folder" in refused(tmp_path / "none")
     (tmp_path / "file").write_text("")
     assert "found a file" in refused(tmp_path / "file")
@@ -96,7 +96,7 @@ def test_what_is_not_there_or_is_a_file_is_told_so(tmp_path):
         ({"log": "here"}, "summary.json: log: found 'here'"),
     ],
 )
-def test_a_summary_that_lacks_what_it_takes_is_refused_by_the_key(tmp_path, changed, said):
+def test_an_incomplete_summary_is_refused_with_the_key(tmp_path, changed, said):
     told = refused(written(tmp_path, **changed))
     assert said in told
     assert "anew" in told

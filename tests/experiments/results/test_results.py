@@ -170,7 +170,7 @@ def test_scores_count_full_and_partial_landmarks_and_measurements_per_frame():
     assert timed.measurements_per_frame == 1.0, "a further excess path is no measurement of its own"
 
 
-def test_the_map_error_is_that_of_full_landmarks_with_known_positions():
+def test_the_map_error_counts_full_landmarks_with_known_positions():
     track = drifting_track()
     mapped = track.landmarks.mean[[0, 3]]
     true = TRUE_LANDMARKS[1][[1, 2]]
@@ -187,7 +187,7 @@ def test_without_truth_only_the_counts_are_scored():
     assert known == ["landmarks_full", "landmarks_total", "measurements_per_frame", "gated"]
 
 
-def test_what_there_is_nothing_of_is_not_scored():
+def test_scores_without_data_are_none():
     empty = score(drifting_track(landmarks=()), TRUTH, (), EKF_LIMIT)
     assert empty.map_rmse_m is None
     assert empty.measurements_per_frame is None

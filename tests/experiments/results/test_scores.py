@@ -50,14 +50,14 @@ def test_the_floor_is_the_true_path_led_on_from_where_reckoning_had_arrived():
     assert 0.02 < expected < 1.0
 
 
-def test_a_scan_that_holds_nothing_tells_nothing():
+def test_an_empty_scan_does_not_change_the_floor():
     empty = scan_with(time=float(DRIVE.time[4]))
     later = [empty, *heard_at(8)]
     assert position_floor(DRIVE, later) == position_floor(DRIVE, heard_at(8))
     assert position_floor(DRIVE, later) != position_floor(DRIVE, heard_at(4))
 
 
-def test_where_nothing_is_ever_heard_the_floor_is_reckoning_alone():
+def test_the_floor_without_measurements_is_dead_reckoning():
     everywhere = np.array([reckoned(k)[:2] for k in range(1, 401)])
     expected = rmse(np.hypot(*(everywhere - WORLD.path[1:, :2]).T))
     assert position_floor(DRIVE, []) == pytest.approx(expected, rel=1e-9)
@@ -73,7 +73,7 @@ def test_without_the_truth_there_is_no_floor():
     assert position_floor(unknown, heard_at(8)) is not None
 
 
-def test_alignment_removes_it_and_a_filter_told_everything_comes_near_it():
+def test_a_filter_with_exact_measurements_is_near_the_floor_before_alignment():
     """Exact ranges and bearings of all landmarks: what is left is the turn before them."""
     labels = np.arange(1, 51)
     scans = []
@@ -109,7 +109,7 @@ def sure(*steps, bearing_std=0.05):
     ]
 
 
-def test_the_bound_of_a_drive_is_put_beside_its_scores_and_changes_no_other():
+def test_the_bound_is_added_without_changing_other_scores():
     scans = sure(4, 8, 12)
     scores = run_trial(Case(strategy="active", filter="ekf"), DRIVE, scans, CONFIG).scores
     bound = drive_bound(DRIVE, scans, Config())
@@ -121,7 +121,7 @@ def test_the_bound_of_a_drive_is_put_beside_its_scores_and_changes_no_other():
     assert with_bound(scores, None) is scores
 
 
-def test_the_bound_of_a_drive_hangs_on_no_start_and_rises_with_the_noise():
+def test_the_bound_is_independent_of_the_start_and_grows_with_noise():
     apart = replace(DRIVE.start, covariance=np.eye(3))
     unsure = drive_bound(replace(DRIVE, start=apart), sure(4, 8, 12), Config())
     np.testing.assert_array_equal(unsure, drive_bound(DRIVE, sure(4, 8, 12), Config()))

@@ -38,7 +38,7 @@ def sealed(folder, name, text):
     (folder / SUMS).write_text("\n".join(lines) + "\n")
 
 
-def test_what_was_written_is_read(folder):
+def test_written_missions_are_read_back(folder):
     mission = read_mission(folder)
     assert list(mission.scores) == list(PATHS)
     assert (mission.folder, mission.settings["seed"]) == (folder, 9)
@@ -66,7 +66,7 @@ def test_a_path_that_is_lost_is_read_as_such(tmp_path):
     assert mission.scores["fused", "ekf"]["diverged"] is True
 
 
-def test_a_folder_that_holds_something_else_is_named_as_what_it_is(tmp_path):
+def test_another_kind_of_folder_is_refused_with_its_kind(tmp_path):
     refused(tmp_path / "nowhere", "nowhere: found no such folder")
     (tmp_path / "file").write_text("one")
     refused(tmp_path / "file", "found a file")
@@ -119,13 +119,11 @@ def test_results_that_were_interrupted_are_not_whole(folder):
         ("map_fused_ekf.csv", "landmark,x,y,status\n1,left,2,full\n", "would not write"),
     ],
 )
-def test_what_pipistrelle_would_not_write_is_refused_though_its_sum_is_right(
-    folder, name, text, part
-):
+def test_invalid_files_with_a_right_checksum_are_refused(folder, name, text, part):
     sealed(folder, name, text)
     refused(folder, str(folder), part)
 
 
-def test_scores_are_those_of_the_summary(folder):
+def test_scores_equal_the_summarys(folder):
     runs = json.loads((folder / "summary.json").read_text())["runs"]
     assert [read_mission(folder).scores[run["strategy"], run["filter"]] for run in runs] == runs

@@ -64,11 +64,7 @@ def test_a_map_survives_its_text(landmarks):
     header, *lines = map_text(landmarks).splitlines()
     assert header == "landmark,x,y,xx,xy,yy,status"
     rows = [line.split(",") for line in lines]
-    assert [(row[0], row[-1]) for row in rows] == [
-        ("51", "full"),
-        ("4", "partial"),
-        ("17", "full"),
-    ]
+    assert [(row[0], row[-1]) for row in rows] == [("51", "full"), ("4", "partial"), ("17", "full")]
     chosen = [0, 2, 4]
     P = landmarks.covariance[chosen]
     expected = np.column_stack([landmarks.mean[chosen], P[:, 0, 0], P[:, 0, 1], P[:, 1, 1]])
@@ -134,7 +130,7 @@ def test_landmark_table_joins_the_truth_by_the_names_that_a_map_has_there(landma
     assert table["error_m"].drop_nulls().to_list() == pytest.approx(error.tolist())
 
 
-def test_the_landmark_table_tells_each_hypothesis_its_covariance_term_by_term(landmarks):
+def test_the_landmark_table_contains_the_covariance_of_each_hypothesis(landmarks):
     table = landmark_table(landmarks, None)
     terms = table.select("xx_m2", "xy_m2", "yy_m2").to_numpy()
     np.testing.assert_array_equal(terms, landmarks.covariance.reshape(-1, 4)[:, [0, 1, 3]])
@@ -160,7 +156,7 @@ def test_a_passive_measurement_has_no_range_in_the_table():
     assert table.schema["landmark"] == pl.Int64
 
 
-def test_excess_paths_stand_beside_whose_call_it_was_and_are_null_where_there_are_none():
+def test_the_measurement_table_has_excess_paths_with_their_callers():
     timed = make_scan(
         1.0,
         np.array([4, 4, 5]),

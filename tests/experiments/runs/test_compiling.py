@@ -68,7 +68,7 @@ def test_the_first_of_the_kernels_that_are_compiled_is_announced_before_and_no_o
     assert said == [kernel_clock.COMPILING]
 
 
-def test_nobody_need_be_told(said, capfd):
+def test_the_announcement_may_be_silent(said, capfd):
     kernel_clock.announce(None)
     numba.njit(lambda x: x - 1)(1.0)
     assert capfd.readouterr() == ("", "")
@@ -92,7 +92,7 @@ def test_nothing_is_announced_while_input_is_judged(said, monkeypatch):
     assert said == [kernel_clock.COMPILING]
 
 
-def test_what_is_compiled_while_a_filter_runs_is_no_part_of_its_time(monkeypatch):
+def test_compilation_does_not_count_as_a_filters_time(monkeypatch):
     compiled, took, run_filter, run_trial = [], [], trial.run_filter, trial.run_trial
     trial.run_mission(TINY, ("fused",))  # all else is loaded
 
@@ -133,19 +133,6 @@ def test_an_empty_cache_costs_no_filter_time_with_timing_or_without(tmp_path):
         assert shared or compiled > took / 2.0, f"{name}, {timed}: little is compiled, or proved"
 
 
-def test_kernels_that_are_there_are_loaded_and_nothing_is_announced(tmp_path):
-    code = "from pipistrelle.geometry import wrap_angle; wrap_angle(4.0)"
-    for wanted in (kernel_clock.COMPILING + "\n", ""):
-        done = subprocess.run(
-            [sys.executable, "-c", code],
-            env=os.environ | {"NUMBA_CACHE_DIR": str(tmp_path / "kernels")},
-            capture_output=True,
-            text=True,
-            check=True,
-        )
-        assert (done.stdout, done.stderr) == ("", wanted)
-
-
 def test_kernels_are_compiled_for_the_filters_and_timings_that_are_named(monkeypatch):
     tried = []
 
@@ -184,7 +171,7 @@ def test_a_second_process_starts_with_the_first_kernel_and_ends_with_the_work(sa
 
 
 @pytest.mark.parametrize("trouble", ["one core", "no interpreter"])
-def test_without_a_second_process_the_first_goes_on_alone(said, second, monkeypatch, trouble):
+def test_a_missing_second_process_does_not_stop_the_first(said, second, monkeypatch, trouble):
     if trouble == "one core":
         monkeypatch.setattr(compiling, "cores", lambda: 1)
     else:
@@ -198,7 +185,7 @@ def test_without_a_second_process_the_first_goes_on_alone(said, second, monkeypa
 @pytest.mark.slow
 @pytest.mark.parametrize("name", CATALOGUE)
 @pytest.mark.parametrize("timing", [False, True])
-def test_the_second_process_compiles_what_the_filters_of_a_mission_need(tmp_path, name, timing):
+def test_the_second_process_compiles_the_kernels_of_a_missions_filters(tmp_path, name, timing):
     """Else it would be of no use: of a filter's kernels, nearly none is left for the mission."""
     code = """
 import sys

@@ -20,7 +20,7 @@ def with_(**sections):
     return Config(scenario=SHORT, **sections)
 
 
-def test_what_is_not_assumed_otherwise_is_the_truth():
+def test_assumptions_default_to_the_truth():
     config = with_(motion=MotionConfig(wheelbase=0.4, speed_std=0.2))
     assert assumed_motion(config) == motion_of(config.motion)
     assert config.assumed_sound_speed == config.air.sound_speed
@@ -34,7 +34,7 @@ def test_what_is_not_assumed_otherwise_is_the_truth():
         ({"steering_std": 0.2}, ("control_std", (0.1, 0.2))),
     ],
 )
-def test_filters_are_told_another_motion_in_the_same_world(assumed, found):
+def test_filters_assume_another_motion_in_the_same_world(assumed, found):
     config, other = with_(), with_(assumed=AssumedConfig(**assumed))
     world = world_of(config)
     assert world_of(other).path.tobytes() == world.path.tobytes()
@@ -67,7 +67,7 @@ def test_ranges_are_counted_by_the_speed_of_sound_that_is_assumed():
 
 
 @pytest.mark.parametrize("model", ["bicycle", "unicycle"])
-def test_a_bias_moves_the_vehicle_and_is_told_to_nobody(model):
+def test_a_bias_moves_the_vehicle_and_not_its_controls(model):
     still = {"model": model, "speed_std": 0.0, "steering_std": 0.0, "angular_rate_std": 0.0}
     plain, biased = (
         world_of(with_(motion=MotionConfig(**still, **bias)))
@@ -81,7 +81,7 @@ def test_a_bias_moves_the_vehicle_and_is_told_to_nobody(model):
     assert turned[1] - turned[0] == pytest.approx(gained, rel=1e-3)
 
 
-def test_starts_are_drawn_as_surely_as_the_filters_are_told():
+def test_drawn_starts_have_the_filters_initial_deviation():
     config = with_(filter=FilterConfig(first_pose="drawn"))
     world, std = world_of(config), np.array(config.filter.initial_pose_std)
     off = np.array([drive_of(world, config, i).start.mean for i in range(2000)]) - world.path[0]
@@ -94,7 +94,7 @@ def test_starts_are_drawn_as_surely_as_the_filters_are_told():
     assert again.tobytes() == drive_of(world, config, 5).start.mean.tobytes()
 
 
-def test_the_bound_of_a_drawn_start_is_that_of_not_knowing_it():
+def test_the_bound_of_a_drawn_start_includes_its_uncertainty():
     exact, drawn = (with_(filter=FilterConfig(first_pose=start)) for start in ("exact", "drawn"))
     missions = [run_mission(config, ["fused"]) for config in (exact, drawn)]
     bounds = [mission.trials[0].scores.position_bound_m for mission in missions]

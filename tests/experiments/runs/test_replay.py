@@ -8,13 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pipistrelle.config import (
-    AssociationConfig,
-    Config,
-    FilterConfig,
-    InputError,
-    ListeningConfig,
-)
+from pipistrelle.config import AssociationConfig, Config, FilterConfig, InputError, ListeningConfig
 from pipistrelle.detection.logs.folder import read_log, write_log
 from pipistrelle.detection.logs.readers import Reader
 from pipistrelle.detection.logs.recording import Log, LogCaller
@@ -73,7 +67,7 @@ def test_truth_is_linear_between_its_rows_and_unknown_outside_them(folder):
     assert np.isnan(truth.path[5]).all()
 
 
-def test_headings_turn_the_shorter_way_between_the_rows_that_stand(folder):
+def test_true_headings_are_interpolated_in_the_shorter_direction(folder):
     rows = "time,x,y,heading\n0.0,0,0,0\n1.0,0,0,2\n1.0,0,0,3.5\n2.0,0,0,3\n"
     (folder / "truth.csv").write_text(rows)
     heading = read_truth(folder, np.array([0.0, 0.5, 1.0, 1.5])).path[:, 2]
@@ -81,7 +75,7 @@ def test_headings_turn_the_shorter_way_between_the_rows_that_stand(folder):
     np.testing.assert_allclose(heading, [0.0, there / 2, there, there - 0.25], atol=1e-15)
 
 
-def test_truth_at_its_own_times_is_exact(folder):
+def test_truth_at_its_rows_times_is_exact(folder):
     rows = np.loadtxt(folder / "truth.csv", delimiter=",", skiprows=1)
     truth = read_truth(folder, rows[:, 0])
     np.testing.assert_array_equal(truth.path[:, :2], rows[:, 1:3])
@@ -119,7 +113,7 @@ def test_truth_survives_being_written(tmp_path):
     np.testing.assert_array_equal(again.landmarks[1], truth.landmarks[1])
 
 
-def test_what_is_not_known_is_not_written(tmp_path):
+def test_unknown_truth_is_not_written(tmp_path):
     write_truth(tmp_path, NO_TRUTH)
     assert list(tmp_path.iterdir()) == []
 
@@ -158,14 +152,14 @@ def test_a_folder_that_is_not_there_is_refused(tmp_path):
         (["walk.txt"], "a file", "check the path"),
     ],
 )
-def test_a_recording_that_no_reader_takes_is_called_what_it_is(tmp_path, names, what, fix):
+def test_an_unreadable_recording_is_refused_with_its_kind(tmp_path, names, what, fix):
     for name in names:
         (tmp_path / name).parent.mkdir(exist_ok=True)
         (tmp_path / name).touch()
     refused(lambda: load(tmp_path / names[0].split("/")[0]), what, "a log folder or a MRC", fix)
 
 
-def test_a_log_beside_a_recording_is_read(folder):
+def test_a_log_in_the_folder_of_a_recording_is_read(folder):
     (folder / "walk.wav").touch()
     assert load(folder)[0].scans
 
@@ -184,7 +178,7 @@ def test_a_robot_is_found_by_the_text_of_its_number():
 # A format from elsewhere
 
 
-def test_a_reader_of_ones_own_is_asked_and_finds_files_of_truth_beside_its_log(folder):
+def test_a_users_reader_reads_the_log_and_its_truth_files(folder):
     log, truth = load(folder)
     (folder / "log.toml").rename(folder / "other.toml")
     tape = Reader(
@@ -198,7 +192,7 @@ def test_a_reader_of_ones_own_is_asked_and_finds_files_of_truth_beside_its_log(f
     np.testing.assert_array_equal(beside.path, truth.path)
 
 
-def test_the_truth_of_ones_own_format_may_say_how_the_log_begins(folder):
+def test_a_users_truth_may_set_the_initial_pose_of_the_log(folder):
     tape = Reader(
         name="tape",
         title="a tape",
@@ -304,7 +298,7 @@ def test_a_strategy_hears_its_part(strategy, beamwidth, landmark, distance):
     np.testing.assert_array_equal(heard.bearing, SCAN.bearing[np.isin(SCAN.landmark, landmark)])
 
 
-def test_hiding_leaves_all_but_the_range_as_it_was_recorded():
+def test_hiding_ranges_leaves_all_other_columns_unchanged():
     said = {name: np.arange(1, 6) + 10 * i for i, name in enumerate(COLUMNS)}
     scan = with_columns(SCAN, **said | {"bearing": SCAN.bearing, "range": SCAN.range})
     (heard,) = as_heard_by([scan], "fused", 0.5)
@@ -331,13 +325,13 @@ TIMED = make_scan(
         ("active", [1, 3], [np.nan, np.nan]),
     ],
 )
-def test_excess_paths_are_heard_by_who_listens_to_others(strategy, landmark, excess_path):
+def test_excess_paths_are_kept_by_strategies_that_listen_to_others(strategy, landmark, excess_path):
     (heard,) = as_heard_by([TIMED], strategy)
     assert heard.landmark.tolist() == landmark
     np.testing.assert_array_equal(heard.excess_path, excess_path)
 
 
-def test_what_is_not_listened_for_is_as_if_it_had_not_been_recorded():
+def test_excess_paths_are_dropped_without_timing():
     callers = (LogCaller(name="boat", landmark=9), LogCaller(name="mate", landmark=8))
     log = replace(looks((0.1, 0.1, 0.1)), callers=callers)
     (look,) = log.scans
@@ -367,7 +361,7 @@ def test_hiding_changes_no_scan_and_keeps_empty_ones():
     assert [scan.landmark.size for scan in as_heard_by([behind], "active", 1.0)] == [0]
 
 
-def test_fused_hears_what_active_and_passive_hear_together():
+def test_fused_is_the_union_of_active_and_passive():
     scans = read_log(DATA / "unicycle_log").scans
     for fused, active, passive in zip(
         *(as_heard_by(scans, strategy, 1.0) for strategy in ("fused", "active", "passive")),
@@ -434,7 +428,7 @@ def test_a_row_stated_ten_times_more_precise_pulls_the_estimate_a_hundred_times_
     assert bearing_of_post(unsaid) == pytest.approx(0.02 / 2, rel=1e-3)
 
 
-def test_constant_noise_ignores_what_the_rows_state():
+def test_constant_noise_ignores_the_rows_deviations():
     rows = [(0.0, 0.3, NAN), (0.02, 0.01, 0.02), (0.01, NAN, 0.5)]
     said = replayed(looks(*rows), "constant")
     unsaid = replayed(looks(*((bearing, NAN, NAN) for bearing, *_ in rows)), "constant")
@@ -466,7 +460,7 @@ def test_fields_that_are_empty_are_filled_with_the_logs_own_constants(folder):
     assert set(map(tuple, told.T.tolist())) == pairs
 
 
-def test_what_rows_state_is_heard_by_every_strategy():
+def test_the_rows_deviations_are_kept_by_every_strategy():
     log = looks((0.3, 0.01, 0.02), (0.0, NAN, 0.03))
     for strategy in ("active", "fused", "passive"):
         first, second = as_heard_by(log.scans, strategy, 2.0)
@@ -475,7 +469,7 @@ def test_what_rows_state_is_heard_by_every_strategy():
 
 
 @pytest.mark.parametrize("estimator", ["ekf", "iekf", "smoother"])
-def test_the_place_of_a_logs_caller_places_what_it_lights_up(estimator):
+def test_the_stated_position_of_a_caller_initialises_its_echoes(estimator):
     posts, boat = np.array([[3.0, 4.0], [-2.0, 6.0], [5.0, -1.0]]), np.array([8.0, 5.0])
     _, bearing = range_and_bearing(np.zeros(3), posts)
     e = np.array([excess_path_of(np.zeros(2), post, boat) for post in posts])
@@ -530,7 +524,7 @@ def test_log_without_labels_is_scored_by_the_positions_of_its_landmarks(shift):
     assert run_entry(trial, {})["landmarks_missed"] == scores.landmarks_missed
 
 
-def test_rows_of_two_scans_at_one_time_are_each_scored_by_their_own_labels():
+def test_rows_of_simultaneous_scans_are_scored_by_their_labels():
     log = looks(*[(0.0, 0.01, 0.1)] * 6)
     beside = [scan_with([8], [1.0], [3.0], time=scan.time, bearing_std=0.01) for scan in log.scans]
     pairs = [scan for both in zip(log.scans, beside, strict=True) for scan in both]
@@ -543,7 +537,7 @@ def test_rows_of_two_scans_at_one_time_are_each_scored_by_their_own_labels():
     assert {*trial.mapped.landmark.tolist()} == {7, 8}
 
 
-def test_a_post_stands_where_a_sensor_aside_of_the_vehicle_sees_it():
+def test_a_landmark_is_mapped_from_the_pose_of_an_offset_sensor():
     # The sensor is 1 m ahead and 2 m to the left and looks to the left: 3 m ahead of it is (1, 5).
     log = replace(a_log(), sensor_pose=(1.0, 2.0, np.pi / 2))
     log = replace(log, scans=(scan_with([7], [0.0], [3.0], time=0.0),))
@@ -554,14 +548,14 @@ def test_a_post_stands_where_a_sensor_aside_of_the_vehicle_sees_it():
 
 
 @pytest.mark.parametrize("asked", ["speed_scale", "turn_bias"])
-def test_odometry_is_not_calibrated_beside_a_sensor_that_is_elsewhere(asked):
+def test_odometry_calibration_with_an_offset_sensor_is_refused(asked):
     config = Config(filter=FilterConfig(calibrate=(asked,)))
     log = replace(a_log(), sensor_pose=(1.0, 0.0, 0.0))
     with pytest.raises(InputError, match=rf"filter\.calibrate: found '{asked}'.*sensor_pose"):
         replay(log, NO_TRUTH, ["active"], ["smoother"], None, config)
 
 
-def test_what_a_log_says_of_its_sensor_is_the_default_of_the_settings():
+def test_a_logs_sensor_settings_are_defaults():
     log = replace(a_log(), association={"clutter": 0.01, "max_range": 50.0})
     settled, _ = with_log({}, log, Path("log"))
     assert (settled.association.clutter, settled.association.max_range) == (0.01, 50.0)
@@ -588,7 +582,7 @@ def a_log():
     )
 
 
-def test_a_caller_whose_place_is_stated_stands_on_the_map_once_without_labels():
+def test_a_caller_with_a_stated_position_is_mapped_once_without_labels():
     place = np.array([4.0, 5.0])
     log = heard_without_labels(place)
     config = Config(

@@ -14,6 +14,7 @@ from pipistrelle.__main__ import main
 from pipistrelle.config import InputError
 from pipistrelle.experiments.runs.rerun import rerun
 from reference.command_line import SHORT
+from reference.pictures import without_picture
 
 OWN = Path(__file__).parents[2] / "data"
 
@@ -22,10 +23,8 @@ OWN = Path(__file__).parents[2] / "data"
 def made(tmp_path_factory):
     """Result folders of a run and of two replays of its log, and the log."""
     place = tmp_path_factory.mktemp("made")
-    with pytest.MonkeyPatch.context() as patch:
+    with without_picture() as patch:
         patch.setattr(sys, "argv", ["pipistrelle"])
-        patch.setattr("pipistrelle.figures.mission.draw_mission", lambda *_, **__: None)
-        patch.setattr("pipistrelle.figures.style.save_figure", lambda *_: None)
         words = {
             "run": ("run", *SHORT, "--seed", "5", "--filter", "both", "--beamwidth", "60",
                     "--filter.gate", "0.99", "--save-log", place / "log"),
@@ -56,7 +55,7 @@ def refused(folder, **options):
 
 
 @pytest.mark.parametrize("name", ["run", "slam", "robot"])
-def test_the_tracks_are_those_of_the_folder_bit_for_bit(made, name):
+def test_reruns_give_the_tracks_of_the_folder_to_the_bit(made, name):
     done = rerun(made / name)
     assert done.difference == ""
     kept = json.loads((made / name / "summary.json").read_text())["runs"]
@@ -107,7 +106,7 @@ def test_a_recorded_one_comes_with_its_log_and_the_beam_that_hid_its_ranges(made
     assert rerun(made / "robot").beamwidth is None
 
 
-def test_whoever_watches_sees_every_frame(made):
+def test_the_watcher_sees_every_frame(made):
     seen, told = [], []
     done = rerun(
         made / "run",
@@ -118,7 +117,7 @@ def test_whoever_watches_sees_every_frame(made):
     assert {"listening", "fused ekf", "passive fastslam"} <= set(told)
 
 
-def test_a_folder_in_which_a_track_was_changed_is_told_by_how_much(folders):
+def test_a_changed_track_is_reported_with_its_difference(folders):
     path = Path("run/track_fused_ekf.tum")
     first, *others = path.read_text().splitlines()
     time, x, *rest = first.split()
@@ -127,14 +126,14 @@ def test_a_folder_in_which_a_track_was_changed_is_told_by_how_much(folders):
     assert found == f"{path}: is not as it is found now, by up to 0.25 m"
 
 
-def test_a_track_that_is_gone_and_one_of_other_rows_are_told(folders):
+def test_missing_and_unreadable_tracks_are_reported(folders):
     Path("run/track_active_ekf.tum").unlink()
     Path("run/track_fused_fastslam.tum").write_text("not a track\n")
     found = rerun(Path("run")).difference
     assert found == "run/track_active_ekf.tum: cannot be read, nor are 1 more"
 
 
-def test_settings_that_were_changed_are_told_and_followed(folders):
+def test_changed_settings_are_reported_and_followed(folders):
     path = Path("run/config.toml")
     path.write_text(re.sub(r"(?m)^bearing_std = .*$", "bearing_std = 0.5", path.read_text()))
     done = rerun(Path("run"))
@@ -146,7 +145,7 @@ def test_settings_that_were_changed_are_told_and_followed(folders):
     )
 
 
-def test_another_version_is_told(folders):
+def test_another_version_is_reported(folders):
     summary = json.loads(Path("run/summary.json").read_text())
     Path("run/summary.json").write_text(json.dumps({**summary, "version": "0.0.9"}))
     assert rerun(Path("run")).difference == "", "what is the same is the same"
@@ -190,13 +189,13 @@ def test_a_truth_that_came_later_is_a_change(folders):
     assert "(truth.csv is new)" in refused("solved")
 
 
-def test_what_does_not_belong_to_a_log_may_change(folders):
+def test_files_outside_a_log_may_change(folders):
     Path("log/notes.txt").write_text("a user's")
     Path("log/README.md").write_text("a user's")
     assert rerun(Path("slam")).difference == ""
 
 
-def test_a_folder_that_does_not_say_which_log_it_was_is_refused(folders):
+def test_a_folder_without_the_name_of_its_log_is_refused(folders):
     summary = json.loads(Path("slam/summary.json").read_text())
     del summary["log"]
     Path("slam/summary.json").write_text(json.dumps(summary))
@@ -210,7 +209,7 @@ def test_a_log_for_a_mission_that_had_none_is_refused(folders):
     assert "option --log: found log, expected none" in refused("run", log=Path("log"))
 
 
-def test_settings_that_are_none_are_refused_where_they_stand(folders):
+def test_unknown_settings_are_refused_with_file_and_key(folders):
     Path("run/config.toml").write_text("[rays]\npowr = 1\n")
     assert refused("run").startswith("run/config.toml: rays.powr: no such setting")
 
@@ -224,7 +223,7 @@ def test_a_device_in_place_of_a_file_is_refused_by_name(folders, name):
     )
 
 
-def test_a_device_in_place_of_a_track_is_told(folders):
+def test_a_device_in_place_of_a_track_is_reported(folders):
     Path("run/track_fused_ekf.tum").unlink()
     Path("run/track_fused_ekf.tum").symlink_to("/dev/null")
     assert rerun(Path("run")).difference.startswith("run/track_fused_ekf.tum: cannot be read")

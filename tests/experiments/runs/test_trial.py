@@ -71,7 +71,7 @@ def test_strategies_do_not_disturb_each_other():
     assert contents(alone) == contents(among)
 
 
-def test_fused_hears_what_active_or_passive_hear_in_every_frame_of_a_mission():
+def test_fused_is_the_union_of_active_and_passive_in_every_frame():
     mission = run_mission(Config(scenario=ScenarioConfig(steps=400)), STRATEGIES)
     active, fused, passive = (trial.scans for trial in mission.trials)
     for a, f, p in zip(active, fused, passive, strict=True):
@@ -181,7 +181,7 @@ def further(**columns):
     return scan_with([4, 4], [0.5, np.nan], time=1.5, **(known | columns))
 
 
-def test_a_row_may_be_but_a_further_excess_path():
+def test_a_row_may_contain_only_an_excess_path():
     ledger = Ledger()
     run_filter(ledger, drive(5), [further()], RNG(7))
     assert 1.5 in ledger.log
@@ -197,9 +197,7 @@ def test_a_row_may_be_but_a_further_excess_path():
         ({"excess_path_std": np.array([0.0, 0.1])}, "no standard deviations above 0"),
     ],
 )
-def test_a_row_of_nothing_and_an_excess_path_of_which_nobody_says_how_sure_are_refused(
-    columns, said
-):
+def test_empty_rows_and_excess_paths_without_deviation_are_refused(columns, said):
     with pytest.raises(InputError, match=rf"scan at 1\.5 s: found {said}.*\[4\]"):
         run_filter(Ledger(), drive(5), [further(**columns)], RNG(7))
 
@@ -292,7 +290,7 @@ def line_drive(rng, steps=60):
     return line, scans, x
 
 
-def test_a_path_that_is_revised_is_the_batch_solution_and_the_online_one_is_beside_it():
+def test_a_revised_path_is_the_batch_solution_and_keeps_the_online_path():
     line, scans, _ = line_drive(RNG(5))
     track = run_filter(Retraced(), line, scans, RNG(7))
     k = line.time.size
@@ -328,7 +326,7 @@ def test_a_path_that_is_revised_is_nearer_to_the_truth():
 
 
 @pytest.mark.parametrize("name", ["ekf", "fastslam"])
-def test_a_filter_told_at_the_start_and_left_alone_at_the_end_keeps_what_it_knows(name):
+def test_a_filter_predicts_after_its_only_scan_at_the_start(name):
     motion = motion_of(Config().motion)
     known = replace(drive(5), motion=motion)
     first = scan_with([3, 4], [0.1, -0.2], [2.0, np.nan], time=0.0)
@@ -372,7 +370,7 @@ def test_a_trial_is_scored_against_the_path_and_all_landmarks_the_beacon_last():
 @pytest.mark.parametrize(
     ("off", "ekf", "fastslam"), [(0.0, False, False), (1.0, True, False), (5.0, True, True)]
 )
-def test_whether_a_trial_diverged_is_judged_by_its_own_filters_limit(off, ekf, fastslam):
+def test_divergence_is_judged_by_the_filters_limit(off, ekf, fastslam):
     mission = run_mission(SHORT, ("fused",))
     truth = mission.drive.truth
     beside = replace(truth, path=truth.path + np.array([0.0, off, 0.0]))
@@ -383,7 +381,7 @@ def test_whether_a_trial_diverged_is_judged_by_its_own_filters_limit(off, ekf, f
         assert trial.scores.diverged is diverged
 
 
-def test_a_filter_starts_as_sure_of_its_pose_as_the_settings_say():
+def test_the_initial_covariance_follows_the_settings():
     config = Config(filter=FilterConfig(initial_pose_std=(0.1, 0.3, 0.2)), scenario=SHORT.scenario)
     start = drive_of(draw_scenario(config, RNG(3)), config).start
     np.testing.assert_allclose(start.covariance, np.diag([0.01, 0.09, 0.04]), rtol=1e-12)
@@ -428,7 +426,7 @@ def test_the_smoother_follows_a_caller_that_circles_by_its_sound(seed):
 
 
 @pytest.mark.slow
-def test_the_smoother_has_a_map_where_cholesky_cannot_tell_its_covariances():
+def test_the_smoother_has_a_map_though_cholesky_fails():
     config = Config(
         seed=774396,
         scenario=ScenarioConfig(steps=160, landmarks=3),
@@ -459,7 +457,7 @@ def test_trials_of_one_world_do_not_depend_on_their_order():
     assert contents(other.track) != contents(one.track)
 
 
-def test_what_a_filter_draws_is_of_the_seed_and_one_that_draws_nothing_does_not_care():
+def test_only_a_filter_that_draws_depends_on_the_seed():
     scenario = draw_scenario(SHORT, RNG(3))
     told = drive_of(scenario, SHORT)
     scans = scans_of(run_mission(SHORT, ("fused",)).heard, "fused", SHORT)
@@ -488,7 +486,7 @@ OF_MAPS = ("map_", "gospa_", "landmarks_missed", "landmarks_false", "landmarks_t
 
 
 @pytest.mark.parametrize("timing", [False, True])
-def test_an_association_that_knows_what_the_oracle_knows_maps_as_the_oracle_does(timing):
+def test_an_association_with_the_oracles_labels_gives_the_oracles_map(timing):
     listening = {"listening": ListeningConfig(timing=timing)}
     config = SHORT.model_copy(update=listening)
     world = draw_scenario(config, RNG(3))

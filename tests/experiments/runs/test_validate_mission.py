@@ -50,7 +50,7 @@ def test_the_lobe_that_is_warned_of_is_where_the_array_has_one(spacing):
     assert beampattern(angles[angles < -0.6], steered=math.radians(angle - 6), **array).max() < 0.8
 
 
-def test_a_lobe_beyond_what_is_scanned_confuses_nobody():
+def test_a_lobe_outside_the_scanned_angles_counts_at_the_scan_limit():
     receiver, detection = ReceiverConfig(spacing=0.007), DetectionConfig(scan_limit_deg=30.0)
     (warning,) = warnings_of(Config(receiver=receiver, detection=detection))
     assert "echoes 64 degrees off" in warning
@@ -62,7 +62,7 @@ def test_cold_air_makes_half_a_wave_shorter():
     assert "0.51 of a wave at emitter.frequency (35000 Hz)" in warning
 
 
-def test_what_is_left_from_air_is_named_in_water():
+def test_settings_for_air_are_reported_in_water():
     water = ScenarioConfig(medium="water")
     deaf, close = warnings_of(Config(scenario=water))
     assert deaf.startswith("emitter.pulse: nothing nearer than 2.1 m is heard")  # c T / 2
@@ -77,7 +77,7 @@ def test_what_is_left_from_air_is_named_in_water():
     assert warnings_of(Config(scenario=water, **fits)) == ()
 
 
-def test_a_tone_that_real_samples_cannot_hold_is_named_with_what_they_hold():
+def test_an_undersampled_tone_is_reported_with_its_alias():
     config = Config(emitter=EmitterConfig(frequency=120e3), receiver=ReceiverConfig(spacing=0.0014))
     (warning,) = warnings_of(config)
     assert warning.startswith(
@@ -107,13 +107,13 @@ def test_without_room_for_a_recording_the_setting_that_makes_it_long_is_named(mo
         )
 
 
-def test_a_mission_is_refused_at_the_same_door(monkeypatch):
+def test_running_a_mission_checks_its_recording(monkeypatch):
     monkeypatch.setattr(validate_mission, "check_recording", lambda *_, **__: pytest.fail("asked"))
     with pytest.raises(pytest.fail.Exception, match="asked"):
         run_mission(Config(), ["fused"])
 
 
-def test_a_vehicle_faster_than_sound_is_refused_by_what_makes_it_so():
+def test_a_vehicle_faster_than_sound_is_refused_with_the_setting():
     with pytest.raises(InputError, match=r"^scenario\.speed: the vehicle reaches 3[45]\d m/s"):
         checked_scenario(settings(scenario=("speed", -345.0)))
     with pytest.raises(InputError, match=r"^motion\.speed_std: the vehicle reaches"):

@@ -19,7 +19,7 @@ def width_of(case, tone=35e3):
     return math.degrees(beamwidth(case.config.emitter.radius, frequency=tone, speed_of_sound=343.0))
 
 
-def test_a_beamwidth_is_the_radius_whose_beam_is_that_wide(tmp_path):
+def test_a_beamwidth_is_converted_to_its_radius(tmp_path):
     plan = plan_of(tmp_path, GRID)
     assert list(plan.grid) == ["emitter.radius", "rays.power"], "in the place of the beamwidths"
     cases = [case for case in cases_of(plan) if case.strategy == "active"]
@@ -28,14 +28,14 @@ def test_a_beamwidth_is_the_radius_whose_beam_is_that_wide(tmp_path):
     assert widths[1:] == pytest.approx([90.0, 33.2, 11.0], rel=1e-9)
 
 
-def test_a_radius_is_that_of_run_but_for_what_machines_may_differ_in(tmp_path):
+def test_a_radius_is_rounded_to_12_digits(tmp_path):
     radius = plan_of(tmp_path, GRID).grid["emitter.radius"][2]
     exact = float(piston_radius(math.radians(33.2), frequency=35e3, speed_of_sound=343.0))
     assert radius == pytest.approx(exact, rel=2e-12)
     assert radius == float(f"{radius:.12g}")
 
 
-def test_the_tone_and_the_speed_of_sound_are_the_plans_whoever_gives_them(tmp_path):
+def test_radii_use_the_plans_tone_and_speed_of_sound(tmp_path):
     told = plan_of(tmp_path, GRID, over=from_flags({"emitter": {"frequency": 20e3}}))
     widths = [width_of(case, tone=20e3) for case in cases_of(told) if case.strategy == "active"]
     assert sorted(set(widths)) == pytest.approx([11.0, 33.2, 90.0, 180.0], rel=1e-9)
@@ -89,18 +89,18 @@ WIDE = "expected degrees above 0 and up to 180, the widest beam of a back-baffle
         ('strategies = ["passive"]\n' + ALONE, "the beam is that of the vehicle's call, which"),
     ],
 )  # fmt: skip
-def test_what_is_no_beamwidth_is_refused_by_that_name(tmp_path, text, said):
+def test_an_invalid_beamwidth_is_refused_by_name(tmp_path, text, said):
     with pytest.raises(InputError) as refused:
         plan_of(tmp_path, BARE + text)
     assert str(refused.value).startswith(f"{tmp_path / 'small.toml'}: grid.beamwidth: {said}")
 
 
-def test_temperatures_may_vary_where_they_are_not_what_sets_the_speed_of_sound(tmp_path):
+def test_temperatures_may_vary_if_the_speed_of_sound_is_set(tmp_path):
     text = ALONE + '"air.temperature_c" = [0.0, 20.0]\n[config]\nair.speed_of_sound = 343.0\n'
     assert len(plan_of(tmp_path, BARE + text).grid["emitter.radius"]) == 2
 
 
-def test_a_radius_of_its_own_beside_beamwidths_is_refused_and_a_misspelt_one_is_known(tmp_path):
+def test_a_radius_next_to_beamwidths_is_refused(tmp_path):
     beside = "the plan varies this setting as beamwidth; take it out of"
     with pytest.raises(InputError, match=f"^--emitter.radius: {beside}"):
         plan_of(tmp_path, BARE + ALONE, over=from_flags({"emitter": {"radius": 0.01}}))

@@ -56,7 +56,7 @@ def named(plan):
     return {name: list(table) for name, table in config.items() if name != "seed"}
 
 
-def test_the_plans_of_the_package_name_what_was_fitted_and_the_papers_how_it_is_read():
+def test_packaged_plans_name_only_fitted_settings_and_readings():
     fitted = {"emitter": ["level_db"], "beacon": ["level_db"], "rays": ["prune", "power"]}
     assert named("physics") == fitted
     readings = {"detection": ["snapshots", "peak_db"], "emitter": ["off_axis", "level_db"]}
@@ -70,7 +70,7 @@ def test_the_plans_of_the_package_have_the_same_cases_and_worlds():
     assert (paper.iterations, paper.config.seed) == (physics.iterations, physics.config.seed)
 
 
-def test_the_papers_radii_are_those_that_its_appendix_lists_beamwidths_for():
+def test_the_papers_radii_are_logarithmically_spaced():
     radii = read_plan(find_plan("paper")).grid["emitter.radius"]
     spaced = [2.5e-3 * 10 ** (i / 11) for i in range(12)]
     assert list(radii) == [round(radius, 4) for radius in spaced]
@@ -131,7 +131,7 @@ def test_cases_are_numbered_by_the_grid_then_the_strategies_then_the_filters(tmp
     assert [case.number for case in cases] == list(range(8))
 
 
-def test_a_passive_case_stands_once_for_all_radii_and_is_heard_beside_the_narrowest_beam(tmp_path):
+def test_one_passive_case_serves_all_radii_with_the_narrowest_beam(tmp_path):
     text = SMALL.replace("[0.0025, 0.025]", "[0.025, 0.0025]") + '"rays.power" = [1.0, 2.0, 3.0]\n'
     passive = [case for case in cases_of(plan_of(tmp_path, text)) if case.strategy == "passive"]
     assert len(passive) == 3 * 2
@@ -153,7 +153,7 @@ def test_settings_may_vary_that_are_no_numbers(tmp_path):
 
 
 @pytest.mark.parametrize("values", ["[0.01]", '["loud"]', '["loud", "soft"]'])
-def test_refused_items_are_not_said_to_be_missing_too(refused, values):
+def test_refused_items_are_not_also_reported_missing(refused, values):
     said = refused(BARE + f"strategies = {values}\n").splitlines()
     assert [line.partition(": found")[0] for line in said] == [
         f"PLAN: strategies.{i}" for i in range(1 + values.count(","))
@@ -177,7 +177,7 @@ def test_a_plan_made_of_both_a_setting_and_its_values_can_be_read_again(tmp_path
     assert changed_settings(there, plan) == []
 
 
-def test_settings_laid_over_a_plan_go_before_its_own(tmp_path):
+def test_given_settings_override_the_plans(tmp_path):
     plan = plan_of(tmp_path, SMALL, over=from_flags({"scenario": {"steps": 8}}), iterations=9)
     assert (plan.config.scenario.steps, plan.config.scenario.landmarks) == (8, 12)
     assert plan.iterations == 9
@@ -205,18 +205,12 @@ def test_settings_laid_over_a_plan_go_before_its_own(tmp_path):
             "PLAN: config.rays.powr: no such setting; did you mean rays.power?",
         ),
         (BARE + "[config.sonar]\n", "PLAN: config.sonar: no such setting"),
-        (
-            BARE + "[config]\nrays = 3\n",
-            "PLAN: config.rays: no such setting",
-        ),
+        (BARE + "[config]\nrays = 3\n", "PLAN: config.rays: no such setting"),
         (
             BARE + "[config.rays]\npower = 0\n",
             "PLAN: config.rays.power: found 0, expected greater than 0",
         ),
-        (
-            BARE + '[grid]\n"radius" = [1]\n',
-            "PLAN: grid.radius: no such setting; did you mean",
-        ),
+        (BARE + '[grid]\n"radius" = [1]\n', "PLAN: grid.radius: no such setting; did you mean"),
         (
             BARE + '[grid]\n"emitter.radius" = [0.01, -1.0]\n',
             "PLAN: grid.emitter.radius: found -1.0, expected greater than 0",
@@ -241,11 +235,11 @@ def test_settings_laid_over_a_plan_go_before_its_own(tmp_path):
         (BARE + "[grid]\nseed = [1, 2]\n", "PLAN: grid.seed: every iteration is another world"),
     ],
 )
-def test_a_mistake_is_named_with_its_file_its_key_and_what_was_expected(refused, text, said):
+def test_a_mistake_is_named_with_file_key_and_expectation(refused, text, said):
     assert refused(text).startswith(said)
 
 
-def test_values_that_are_right_alone_and_wrong_together_are_refused(refused):
+def test_values_that_are_wrong_together_are_refused(refused):
     text = BARE + ('[grid]\n"rays.range_bounds" = [[0.5, 20.0], [20.0, 30.0], [9.0, 3.0]]\n')
     assert "range_bounds must rise, found [9.0, 3.0]" in refused(text)
 
@@ -262,13 +256,13 @@ def test_a_setting_both_set_and_varied_by_a_plan_is_refused(refused):
     assert refused(varied + "power = 3.0\n") == said
 
 
-def test_a_default_beside_the_values_of_a_grid_says_nothing(tmp_path):
+def test_a_default_of_a_varied_setting_has_no_effect(tmp_path):
     path = tmp_path / "plan.toml"
     path.write_text(BARE + '[grid]\n"rays.power" = [1.0, 3.0]\n[config.rays]\npower = 2.0\n')
     assert read_plan(path).grid == {"rays.power": (1.0, 3.0)}
 
 
-def test_a_flag_for_what_the_plan_varies_is_refused(refused):
+def test_a_flag_for_a_varied_setting_is_refused(refused):
     over = from_flags({"emitter": {"radius": 0.01}})
     said = refused(SMALL, over=over)
     assert said.startswith("--emitter.radius: the plan varies this setting; take it out of [grid]")
@@ -312,7 +306,7 @@ def test_how_many_worlds_the_file_names_is_remembered_and_is_no_setting(tmp_path
         plan_of(tmp_path, 'planned = "many"\n' + SMALL)
 
 
-def test_the_settings_that_are_not_varied_are_those_of_the_plan(tmp_path):
+def test_settings_that_are_not_varied_follow_the_plan(tmp_path):
     text = SMALL + '"emitter.level_db" = [40.0]\n'
     for case in cases_of(plan_of(tmp_path, text)):
         expected = EmitterConfig(radius=case.config.emitter.radius, level_db=40.0)
@@ -331,7 +325,7 @@ OWN = BARE + (
 )
 
 
-def test_a_filters_own_settings_are_those_of_its_cases_alone(tmp_path):
+def test_settings_of_one_filter_apply_only_to_its_cases(tmp_path):
     plan = plan_of(tmp_path, OWN)
     assert plan.own["iekf"] == {"filter.noise": "measured", "rays.spacing": "auto"}
     for case in cases_of(plan):
@@ -348,13 +342,13 @@ def test_a_filters_own_settings_are_those_of_its_cases_alone(tmp_path):
             assert told.initial_pose_std == (0.1, 0.1, 0.2)
 
 
-def test_a_plan_with_settings_of_a_filters_own_reads_as_it_was_written(tmp_path):
+def test_a_plan_with_settings_per_filter_is_read_back(tmp_path):
     plan = plan_of(tmp_path, OWN)
     assert plan_of(tmp_path, plan_text(plan)) == plan
     assert changed_settings(plan, plan_of(tmp_path, plan_text(plan))) == []
 
 
-def test_a_plan_without_them_is_written_as_ever(tmp_path):
+def test_a_plan_without_settings_per_filter_has_no_table_of_them(tmp_path):
     plan = plan_of(tmp_path, SMALL)
     assert plan.own == {}
     keys = ["format", "name", "iterations", "strategies", "filters", "config", "grid"]
@@ -405,14 +399,14 @@ def test_settings_that_cannot_be_a_filters_own_are_refused_in_a_line(refused, te
     assert "\n" not in found
 
 
-def test_settings_that_are_wrong_beside_a_value_of_the_grid_are_refused(refused):
+def test_settings_that_contradict_a_grid_value_are_refused(refused):
     text = '[own.ekf]\nrays.spacing = "auto"\n[grid]\n"rays.likelihood" = ["normal", "printed"]\n'
     said = refused(BARE + text)
     assert said.startswith("PLAN: ")
     assert 'spacing "auto" needs likelihood "normal", found "printed"' in said
 
 
-def test_plans_that_differ_in_what_is_a_filters_own_are_told_apart(tmp_path):
+def test_changed_settings_of_one_filter_are_listed(tmp_path):
     there = plan_of(tmp_path, OWN)
     asked = plan_of(tmp_path, OWN.replace('filter.noise = "measured"', "filter.gate = 0.9"))
     assert changed_settings(there, asked) == [
@@ -421,7 +415,7 @@ def test_plans_that_differ_in_what_is_a_filters_own_are_told_apart(tmp_path):
     ]
 
 
-def test_a_table_of_a_filters_own_that_is_empty_says_nothing(tmp_path):
+def test_an_empty_table_of_one_filter_has_no_effect(tmp_path):
     bare, empty = plan_of(tmp_path, BARE), plan_of(tmp_path, BARE + "[own.ekf]\n")
     assert changed_settings(bare, empty) == []
     assert plan_text(bare) == plan_text(empty)
@@ -471,10 +465,7 @@ def test_a_grid_may_list_callers_and_the_plan_holds_their_routes(tmp_path):
         ("[grid]\ncallers = [[{}], [{}]]", "PLAN: grid.callers: found [{}] twice"),
         ("[config.callers]\nx = 1", "PLAN: config.callers: found {'x': 1}, expected a list of"),
         ("[[config.callers]]\nspeed = 1", "PLAN: config.callers.1: found speed, which a caller"),
-        (
-            "[[config.callers]]\nroute = 'boat.csv'",
-            "boat.csv: found no such file",
-        ),
+        ("[[config.callers]]\nroute = 'boat.csv'", "boat.csv: found no such file"),
         (
             "[config]\ncallers = [{}]\n[grid]\ncallers = [[]]",
             "PLAN: config.callers: the plan varies this setting",
@@ -495,7 +486,7 @@ def test_timing_is_beyond_with_timing_and_nothing_else():
 
 
 @pytest.mark.parametrize("name", ["callers", "pair"])
-def test_who_calls_is_asked_in_the_worlds_of_the_papers_study_and_timed(name):
+def test_plans_with_callers_use_the_papers_worlds_with_timing(name):
     plan, physics = (read_plan(find_plan(word)) for word in (name, "physics"))
     assert plan.config.listening.timing
     for part in ("seed", "emitter", "beacon", "motion", "air", "target", "detection"):

@@ -26,7 +26,7 @@ def test_a_study_opens_with_its_plan_its_settings_and_an_explanation(folder, pla
     assert leftovers(folder) == []
 
 
-def test_a_study_opens_again_with_its_own_plan_and_touches_nothing(folder, plan, records):
+def test_reopening_a_study_with_its_plan_changes_no_file(folder, plan, records):
     write_world(folder, plan, 0, records)
     before = contents(folder)
     open_store(folder, plan)
@@ -106,7 +106,7 @@ def test_a_folder_of_somebodys_partial_downloads_is_no_study(tmp_path, plan, nam
     assert contents(tmp_path / "mine") == {Path(name): b"mine"}
 
 
-def test_what_a_killed_start_left_goes_and_what_is_somebodys_stays(folder, plan):
+def test_leftovers_of_a_killed_start_are_removed_and_other_files_kept(folder, plan):
     (folder / "plan.toml.deadbeef.partial").write_text("form")
     (folder / "movie.mkv.partial").write_text("mine")
     open_store(folder, plan)
@@ -122,7 +122,7 @@ def test_a_plan_of_the_users_own_is_not_taken_for_a_study(tmp_path, plan):
     assert contents(tmp_path / "plans") == {Path("plan.toml"): text.encode()}
 
 
-def test_those_who_open_a_new_study_at_once_do_not_take_each_other_for_strangers(tmp_path, plan):
+def test_a_new_study_may_be_opened_by_several_threads_at_once(tmp_path, plan):
     rounds, together = 10, 6
     start = Barrier(together)
 

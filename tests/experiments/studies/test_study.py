@@ -58,7 +58,7 @@ def test_a_study_runs_every_world_once_and_goes_on_where_it_stopped(plan, tmp_pa
     assert ran == [0, 1, 2]
 
 
-def test_more_worlds_of_one_plan_are_added_to_those_done(plan, tmp_path, ran):
+def test_more_worlds_of_a_plan_are_added_to_finished_worlds(plan, tmp_path, ran):
     run_study(plan, tmp_path / "study")
     run_study(plan_of(tmp_path, iterations=5), tmp_path / "study")
     assert ran == [0, 1, 2, 3, 4]
@@ -73,7 +73,7 @@ def test_the_progress_counts_worlds_and_trials_by_strategy(plan, tmp_path):
     assert all(set(so_far.failed.values()) == {0} for so_far in seen)
 
 
-def test_of_several_failures_the_first_is_told(plan, tmp_path, monkeypatch):
+def test_the_first_of_several_failures_is_reported(plan, tmp_path, monkeypatch):
     def failing(case, drive, scans, config, **_):
         raise FloatingPointError(f"\nweights of world {case.iteration}\nsee the manual")
 
@@ -127,7 +127,7 @@ def test_failed_trials_are_run_again_when_asked_and_only_their_worlds(plan, tmp_
     assert_same(results(tmp_path / "study"), results(tmp_path / "untroubled"))
 
 
-def test_a_world_run_again_stays_as_it_was_until_it_is_done(plan, tmp_path, moody, monkeypatch):
+def test_a_retried_world_keeps_its_results_until_it_is_done(plan, tmp_path, moody, monkeypatch):
     run_study(plan, tmp_path / "study")
     before = results(tmp_path / "study")
 
@@ -141,7 +141,7 @@ def test_a_world_run_again_stays_as_it_was_until_it_is_done(plan, tmp_path, mood
     assert leftovers(tmp_path / "study") == []
 
 
-def test_a_world_whose_trials_were_removed_is_run_again_to_the_same_end(plan, tmp_path, ran):
+def test_a_world_without_trials_is_run_again_with_equal_results(plan, tmp_path, ran):
     run_study(plan, tmp_path / "study")
     before = results(tmp_path / "study")
     world_file(tmp_path / "study", "trials", 1).unlink()

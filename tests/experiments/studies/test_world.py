@@ -43,7 +43,7 @@ def alone(plan):
     return [run_mission(c.config, (c.strategy,), (c.filter,)) for c in cases_of(plan)]
 
 
-def test_each_case_of_a_world_scores_as_it_does_alone(records, alone):
+def test_each_case_scores_as_in_a_separate_mission(records, alone):
     assert len(records) == 2 * 2 * (2 * 2 * 2 + 2)
     for record, mission in zip(records, alone, strict=True):
         (trial,) = mission.trials
@@ -63,7 +63,7 @@ def test_steps_are_the_errors_and_the_nees_at_the_frames(records, alone):
             np.testing.assert_allclose(record.steps[frame, :3], expected, rtol=1.2e-7, atol=1e-14)
 
 
-def test_beside_the_nees_stands_that_of_a_consistent_filter_whatever_the_filter(records, alone):
+def test_steps_contain_the_expected_nees_of_a_consistent_filter(records, alone):
     for record, mission in zip(records, alone, strict=True):
         drive, path = mission.drive, mission.scenario.path
         scans = scans_of(mission.heard, record.case.strategy, mission.config)
@@ -90,7 +90,7 @@ def test_the_map_is_kept_with_the_distance_of_each_landmark_from_its_place(recor
     assert rows > len(records)
 
 
-def test_particles_tell_their_mean_number_of_full_landmarks(records, alone):
+def test_particles_record_their_mean_number_of_full_landmarks(records, alone):
     for record, mission in zip(records, alone, strict=True):
         full = mission.trials[0].track.full
         expected = record.scores.landmarks_full if full is None else full
@@ -98,7 +98,7 @@ def test_particles_tell_their_mean_number_of_full_landmarks(records, alone):
         assert (full is None) == (record.case.filter == "ekf")
 
 
-def test_a_passive_case_has_no_beamwidth_and_the_others_that_of_their_piston(records):
+def test_only_active_and_fused_cases_have_their_pistons_beamwidth(records):
     for record in records:
         if record.case.strategy == "passive":
             assert record.beamwidth_deg is None
@@ -107,14 +107,14 @@ def test_a_passive_case_has_no_beamwidth_and_the_others_that_of_their_piston(rec
             assert record.beamwidth_deg == pytest.approx(np.degrees(width), rel=1e-12)
 
 
-def test_clutter_is_what_bears_no_label_in_a_frame_of_the_cases_own_beam(records, alone):
+def test_clutter_per_frame_is_counted_in_the_cases_beam(records, alone):
     for record, mission in zip(records, alone, strict=True):
         clutter = [heard.clutter for heard in mission.heard]
         assert record.clutter_per_frame == pytest.approx(np.mean(clutter), rel=1e-12)
     assert len({record.clutter_per_frame for record in records}) > 1
 
 
-def test_the_beamwidth_is_that_of_the_call_and_the_air_of_the_case():
+def test_the_beamwidth_uses_the_cases_frequency_and_speed_of_sound():
     for setting, values in (
         ("emitter.frequency", (35e3, 50e3)),
         ("air.speed_of_sound", (343.0, 320.0)),
@@ -266,7 +266,7 @@ FEW = ("air.spreading", "water.spreading", "target.shape", "emitter.radius", "be
 """One of each section."""
 
 
-def test_the_settings_that_are_varied_here_are_all_there_are():
+def test_every_setting_is_varied_here_or_listed_as_exempt():
     # Folders (test_worlds_of_ones_own), associations (estimation/data_association), bags, and what
     # holds other settings (test_named_settings).
     known = {".".join(key) for key in known_settings()}
@@ -336,7 +336,7 @@ def found_in(plan):
     "setting",
     [name if name in FEW else pytest.param(name, marks=pytest.mark.slow) for name in OTHERS],
 )
-def test_values_of_a_grid_are_heard_and_tried_as_they_are_alone(setting):
+def test_values_of_a_grid_give_the_results_of_separate_runs(setting):
     short = from_flags({"scenario": {"steps": 40, "landmarks": 20, "radius": 15.0}})
     short |= from_flags(NEEDS.get(setting, {}))
     key = tuple(setting.split("."))
@@ -354,14 +354,14 @@ def test_values_of_a_grid_are_heard_and_tried_as_they_are_alone(setting):
     assert alone[0] != alone[1], "or nothing is proved"
 
 
-def test_worlds_differ(plan, records):
+def test_different_worlds_have_different_scores(plan, records):
     again, other = run_world(plan, 0), run_world(plan, 1)
     assert [r.scores for r in again] == [r.scores for r in records]
     pairs = zip(other, records, strict=True)
     assert all(a.scores.position_rmse_m != b.scores.position_rmse_m for a, b in pairs)
 
 
-def test_each_case_of_a_later_world_is_the_trial_that_it_would_be_alone(plan):
+def test_each_case_of_a_later_world_equals_a_separate_trial(plan):
     for record in run_world(plan, 1):
         config, number = record.case.config, replace(record.case, iteration=1)
         scenario = world_of(config, 1)
@@ -393,7 +393,7 @@ def test_a_trial_that_raises_is_recorded_and_the_others_go_on(plan, records, mon
             assert record.scores == whole.scores
 
 
-def test_a_world_that_cannot_be_drawn_is_a_failure_of_its_cases_alone(tmp_path):
+def test_a_world_that_cannot_be_drawn_fails_only_its_cases(tmp_path):
     text = SMALL.replace("landmarks = 12", "radius = 12.0") + '"scenario.landmarks" = [5, 900]\n'
     plan = plan_of(tmp_path, text)
     for record in run_world(plan, 0):
@@ -414,7 +414,7 @@ def test_a_failed_trial_keeps_its_case_its_seed_and_its_error(plan):
     assert len(tables["steps"]) == len(tables["landmarks"]) == 0
 
 
-def test_what_is_not_finite_stays_so_and_what_is_not_there_is_null(plan, records):
+def test_tables_keep_infinities_and_store_missing_values_as_null(plan, records):
     scores = replace(
         records[0].scores, nees_max=np.inf, position_rmse_m=np.nan, map_rmse_m=None, diverged=True
     )
@@ -451,7 +451,7 @@ def test_an_exact_start_leaves_frames_unscored_until_the_covariance_is_positive_
     assert np.isinf(steps[:, 2]).tolist() == [True] + 9 * [False]
 
 
-def test_every_column_of_a_worlds_tables_holds_what_its_name_says(plan, records):
+def test_columns_of_a_worlds_tables_equal_their_records(plan, records):
     tables = world_tables(plan, 3, records)
     trials, scored = as_rows(tables["trials"]), asdict(records[0].scores)
     for row, record in zip(trials, records, strict=True):
@@ -470,7 +470,7 @@ def test_every_column_of_a_worlds_tables_holds_what_its_name_says(plan, records)
         np.testing.assert_array_equal(own["error_m"], record.landmark_error.astype(np.float32))
 
 
-def test_columns_bear_the_names_of_what_varies(plan, records):
+def test_columns_have_the_names_of_varied_settings(plan, records):
     tables = world_tables(plan, 0, records)
     for row, case in zip(as_rows(tables["trials"]), cases_of(plan), strict=True):
         assert (row["strategy"], row["filter"]) == (case.strategy, case.filter)
@@ -525,7 +525,7 @@ def bounds_of(records, strategy, radius=0.0025):
 
 
 @pytest.mark.parametrize("strategy", ["active", "fused", "passive"])
-def test_the_bound_is_one_for_all_filters_whatever_they_are_told(bounded, strategy):
+def test_the_bound_is_the_same_for_all_filters_and_their_settings(bounded, strategy):
     assert {record.error for record in bounded} == {None}
     for radius in (0.0025, 0.025):
         found = bounds_of(bounded, strategy, radius)
@@ -544,9 +544,7 @@ def test_hearing_more_never_raises_the_bound(bounded):
     assert all(one <= other for one, other in zip(wide, narrow, strict=True))
 
 
-def test_twice_the_noise_that_the_signal_tells_raises_the_bound_and_no_constant_does(
-    plan, monkeypatch
-):
+def test_only_measured_noise_raises_the_bound(plan, monkeypatch):
     def doubled(rows, settings, **options):
         rows = without_hidden(rows, settings, **options)
         more = {name: 2.0 * getattr(rows, name) for name in ("bearing_std", "range_std")}

@@ -39,7 +39,7 @@ def test_a_world_is_done_when_its_trials_are_there(folder, plan, records):
     assert read_ended_trials(folder, plan, 2) == [(r.case.strategy, r.error) for r in records]
 
 
-def test_the_trials_go_last(folder, plan, records, monkeypatch):
+def test_the_trials_are_written_last(folder, plan, records, monkeypatch):
     order = []
     rename = world_files.put_in_place
     monkeypatch.setattr(
@@ -53,7 +53,7 @@ def test_the_trials_go_last(folder, plan, records, monkeypatch):
 @pytest.mark.skipif(
     not Path("/dev/full").exists(), reason="this system has no device that is always full"
 )
-def test_a_full_disk_ends_in_a_clear_error_and_leaves_what_was_there(
+def test_a_full_disk_raises_a_clear_error_and_keeps_existing_files(
     folder, plan, records, monkeypatch, table
 ):
     write_world(folder, plan, 1, records)
@@ -94,9 +94,7 @@ def test_a_rename_that_fails_leaves_no_half_a_world_that_counts(
     assert len(load_study(folder).steps.collect()) == 0
 
 
-def test_what_a_killed_writer_left_is_no_result_and_goes_when_its_world_is_done(
-    folder, plan, records
-):
+def test_leftovers_of_a_killed_writer_are_removed_with_its_world(folder, plan, records):
     for table in TABLES:
         path = world_file(folder, table, 0)
         path.with_name(f"{path.name}.deadbeef.partial").write_bytes(b"PAR1 half a")
@@ -135,7 +133,7 @@ def test_tables_that_a_killed_writer_left_without_trials_block_nothing(folder, p
     refuse_strange(folder, plan, range(3))
 
 
-def test_a_writer_that_was_overtaken_is_content(folder, plan, records, monkeypatch):
+def test_an_overtaken_writer_succeeds(folder, plan, records, monkeypatch):
     write = world_files.write_down
 
     def overtaken(path, data):
@@ -252,15 +250,11 @@ def test_no_name_of_a_folder_is_a_pattern_or_a_place_elsewhere(
     for folder in {Path(name), beside}:
         assert len(read_ended_trials(folder, plan, 0)) == len(records)
         study = load_study(folder)
-        assert [len(getattr(study, table).collect()) for table in TABLES] == [
-            0,
-            0,
-            len(records),
-        ]
+        assert [len(getattr(study, table).collect()) for table in TABLES] == [0, 0, len(records)]
 
 
 @pytest.mark.skipif(os.name == "nt", reason="all names are Unicode there")
-def test_a_folder_whose_name_is_no_text_is_read_as_well(tmp_path, plan, records):
+def test_a_folder_with_an_undecodable_name_is_read(tmp_path, plan, records):
     folder = tmp_path / os.fsdecode(b"log\xff")
     world_files_of(folder, plan, records)
     assert len(load_study(folder).trials.collect()) == len(records)

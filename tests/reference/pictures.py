@@ -1,0 +1,14 @@
+"""Missions without their picture, which is most of a short mission's time."""
+
+from contextlib import contextmanager
+
+import pytest
+
+
+@contextmanager
+def without_picture():
+    """Leave out the picture of missions; yield the patch, to leave out more."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("pipistrelle.figures.mission.draw_mission", lambda *_, **__: None)
+        patch.setattr("pipistrelle.figures.style.save_figure", lambda *_: None)
+        yield patch
