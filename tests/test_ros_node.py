@@ -98,7 +98,7 @@ def test_the_nodes_messages_equal_slam_on_the_log(started, logs, name, estimator
     folder, poses = logs[name]
     node = driven(started(folder / "log.toml", estimator=estimator), folder, poses)
     done = pipistrelle.slam(folder, filters=estimator)
-    track = done._mission.trials[0].track
+    track = done.mission.trials[0].track
     time, found = poses_told(node)
     assert not node.warned
     np.testing.assert_allclose(time, track.time, rtol=0, atol=1e-9)
@@ -119,7 +119,7 @@ def test_bearings_the_wrong_way_round_are_another_track(started, logs):
         for row in fields.get("sensed_data", ()):
             row["yaw"] = -row["yaw"]
         hand(node, topic, kind, fields)
-    track = pipistrelle.slam(folder, filters="iekf")._mission.trials[0].track
+    track = pipistrelle.slam(folder, filters="iekf").mission.trials[0].track
     assert off(poses_told(node)[1], track.pose.mean) > 1e-3
 
 

@@ -1,4 +1,4 @@
-"""Sonar SLAM with one's own calls, someone else's, or both: from waveform to verdict.
+"""Sonar SLAM with the calls of a vehicle, of other emitters, or both: from waveform to scores.
 
 >>> import pipistrelle
 >>> done = pipistrelle.run(seed=7, duration=4.0, strategies="fused")
@@ -13,7 +13,7 @@ _ROOMS = {
     "InputError": "config",
     "Slam": "scripting.live",
     "hear": "scripting.hearing",
-    "load": "scripting.loading",
+    "load": "scripting.results",
     "run": "scripting.results",
     "slam": "scripting.results",
     "study": "scripting.studies",
@@ -21,7 +21,7 @@ _ROOMS = {
 
 
 def __getattr__(name: str) -> object:
-    """Find what is asked for when it is asked for: importing the package loads nothing else."""
+    """Import a public name on first use."""
     from importlib import import_module
 
     if name == "__version__":
@@ -32,5 +32,5 @@ def __getattr__(name: str) -> object:
 
 
 def __dir__() -> list[str]:
-    """List what there is."""
+    """Return the public names."""
     return [*__all__, "__version__"]

@@ -1,24 +1,23 @@
 """The command line: signals, streams and exit statuses.
 
-0: done. 1: done, with failed trials. 2: bad input, said in a line. 130: interrupted, 143: asked to
-end; what is done is kept. A traceback is always a bug of ours.
+0: done. 1: done, with failed trials. 2: bad input, explained in a line. 130: interrupted, 143:
+terminated; finished work is kept. A traceback is always a bug of Pipistrelle.
 """
 
 import signal
 import sys
 from collections.abc import Sequence
 
-from pipistrelle.verbs.signals import heard_signals
-from pipistrelle.verbs.streams import hold_streams, say
+from pipistrelle.verbs.streams import heard_signals, hold_streams, say
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Obey a command line.
+    """Run a command line.
 
     Parameters
     ----------
     arguments : sequence of str, optional
-        Those of this process if none are given.
+        Command line, by default that of this process.
 
     Returns
     -------

@@ -389,7 +389,7 @@ def test_a_third_estimator_changes_nothing_of_the_papers(monkeypatch):
     monkeypatch.setitem(CATALOGUE, "third", third)
     assert plan_text(read_plan(find_plan("paper"))) == plan
     assert read_plan(find_plan("paper")).filters == PAPERS == ("ekf", "fastslam")
-    from pipistrelle.verbs.options import filters
+    from pipistrelle.scripting.arguments import named_filters
 
-    assert filters("both", None) == PAPERS
-    assert filters("third", None) == ("third",)
+    assert named_filters("both") == PAPERS
+    assert named_filters("third") == ("third",)

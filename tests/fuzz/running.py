@@ -182,7 +182,7 @@ def load_all() -> None:
     import pipistrelle.figures.mission
     import pipistrelle.figures.style
     import pipistrelle.report.page
-    import pipistrelle.verbs.delivery  # noqa: F401
+    import pipistrelle.verbs.missions  # noqa: F401
     from pipistrelle.__main__ import main
     from pipistrelle.experiments.runs.compiling import compile_kernels
 

@@ -7,7 +7,7 @@ from fuzz.running import Ending
 
 RAISED = """\
 Traceback (most recent call last):
-  File "/x/pipistrelle/verbs/slam.py", line 3, in slam
+  File "/x/pipistrelle/verbs/missions.py", line 3, in slam
     read(log)
   File "/x/pipistrelle/detection/logs/folder.py", line 9, in read_log
     return int("x")
@@ -18,7 +18,7 @@ Timeout (0:00:10)!
 Thread 0x00007f (most recent call first):
   File "/x/python/pathlib.py", line 3 in read_text
   File "/x/pipistrelle/detection/logs/text_tables.py", line 9 in read_text
-  File "/x/pipistrelle/verbs/slam.py", line 3 in slam
+  File "/x/pipistrelle/verbs/missions.py", line 3 in slam
 """
 WARNED = "/x/pipistrelle/a.py:7: RuntimeWarning: overflow in 3 values\n  return a * b\n"
 

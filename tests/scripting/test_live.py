@@ -87,21 +87,21 @@ def test_how_many_steps_come_at_once_changes_no_bit(logs):
 
 
 @pytest.mark.parametrize("name", ["ekf", "iekf"])
-def test_named_settings_are_those_of_the_log_with_what_the_estimator_has_alone(logs, name):
+def test_named_settings_apply_with_overrides_per_estimator(logs, name):
     best = pipistrelle.slam(logs["known"], filters=name, settings="best")
     assert same(driven(logs["known"], filter=name, settings="best"), best)
 
 
 @AS_FOUND
 @pytest.mark.parametrize("name", ["iekf", "smoother"])
-def test_rows_without_labels_are_associated_as_those_of_the_log(logs, name):
+def test_unlabelled_rows_are_associated_as_by_slam(logs, name):
     options = {"association__method": "marginal"}
     slam = driven(logs["bare"], filter=name, **options)
     done = pipistrelle.slam(logs["bare"], filters=name, **options)
     assert slam.map.height > 1
     there = done.landmarks.filter(pl.col("status") != "unseen").select(slam.map.columns)
     assert slam.map.equals(there)
-    online = done._mission.trials[0].track.online or done._mission.trials[0].track.pose
+    online = done.mission.trials[0].track.online or done.mission.trials[0].track.pose
     assert slam.pose.x == online.mean[-1, 0]
 
 
@@ -133,7 +133,7 @@ def test_a_copy_leaves_the_first_where_it_is():
 
 
 @AS_FOUND
-def test_a_sensor_beside_the_vehicle_is_driven_as_in_a_log(tmp_path, logs):
+def test_an_offset_sensor_gives_the_results_of_a_log(tmp_path, logs):
     log = shutil.copytree(logs["known"], tmp_path / "arm")
     (log / "SHA256SUMS").unlink()
     text = (log / "log.toml").read_text()
@@ -196,7 +196,7 @@ REFUSED = {
 
 @pytest.mark.parametrize("what", REFUSED)
 @pytest.mark.parametrize("name", ["iekf", "smoother"])
-def test_what_cannot_be_is_refused_and_changes_nothing(name, what):
+def test_invalid_input_is_rejected_and_changes_nothing(name, what):
     act, words = REFUSED[what]
     slam = Slam(ROBOT, filter=name)
     slam.move([1.0, 0.1], dt=1.0)
@@ -212,7 +212,7 @@ def test_what_cannot_be_is_refused_and_changes_nothing(name, what):
     assert slam.map.equals(untouched.map)
 
 
-def test_an_estimator_that_fails_leaves_all_as_it_was(monkeypatch):
+def test_a_failing_estimator_changes_nothing(monkeypatch):
     slam = Slam(ROBOT)
     slam.move([1.0, 0.1], dt=1.0)
     before = slam.copy()
@@ -229,7 +229,7 @@ def test_an_estimator_that_fails_leaves_all_as_it_was(monkeypatch):
     assert slam.map.equals(before.map)
 
 
-def test_what_is_handed_out_is_the_callers_to_write_to():
+def test_returned_arrays_may_be_overwritten_by_the_caller():
     slam = Slam(ROBOT)
     slam.move([1.0, 0.1], dt=1.0)
     labels = slam.hear(**ONE)
@@ -243,7 +243,7 @@ def test_what_is_handed_out_is_the_callers_to_write_to():
     assert slam.map.equals(before.map)
 
 
-def test_what_is_masked_is_not_measured():
+def test_masked_values_count_as_missing():
     masked, none = Slam(ROBOT), Slam(ROBOT)
     masked.hear(**ONE | {"range": np.ma.masked_array([2.0, 3.0], mask=[False, True])})
     none.hear(**ONE | {"range": [2.0, None]})
@@ -290,7 +290,7 @@ def test_a_vehicle_that_is_none_is_refused(vehicle, words):
     assert words in str(refused.value)
 
 
-def test_settings_are_those_of_slam_and_what_is_none_is_refused():
+def test_settings_of_slam_are_accepted_and_others_rejected():
     assert Slam(ROBOT, filter="smoother", filter__window=50, seed=3).time == 0.0
     for options, words in (
         ({"rays__powr": 2.0}, "did you mean rays__power"),
@@ -315,7 +315,7 @@ def test_poses_of_the_last_steps_are_kept_and_no_more():
     assert slam.path["time_s"][-1] == slam.time
 
 
-def test_a_file_of_somebody_is_neither_overwritten_nor_loaded(tmp_path):
+def test_foreign_files_are_neither_overwritten_nor_loaded(tmp_path):
     slam, mine = Slam(ROBOT), tmp_path / "notes.txt"
     mine.write_text("mine")
     for act in (slam.save, Slam.load):

@@ -14,6 +14,7 @@ import pipistrelle
 from pipistrelle import Config, InputError
 from pipistrelle.__main__ import main
 from pipistrelle.estimation.ekf.filter import EkfSlam
+from pipistrelle.verbs.options import spell
 
 SHORT = {"settings": "paper", "duration": 4.0, "landmarks": 10}
 LOG = Path(__file__).parents[1] / "data" / "unicycle_log"
@@ -31,7 +32,7 @@ def done():
 
 
 @pytest.mark.usefixtures("undrawn")
-def test_frames_are_those_of_the_folder_of_the_command_line(capsys, done):
+def test_tables_equal_the_result_folder_of_the_command_line(capsys, done):
     words = ("--duration", "4", "--landmarks", "10", "--filter", "both", "--particles", "7")
     assert main(["run", "--settings", "paper", *words, "-o", "one"]) == 0
     capsys.readouterr()
@@ -64,7 +65,7 @@ def test_nothing_is_written_unless_a_folder_is_named(done, tmp_path):
     assert again.tracks.equals(kept.tracks)
 
 
-def test_called_twice_it_finds_the_same(done):
+def test_repeated_calls_give_equal_results(done):
     again = pipistrelle.run(**SHORT, filters="both", fastslam__particles=7)
     assert again.tracks.equals(done.tracks)
     assert again.summary.drop("wall_s").equals(done.summary.drop("wall_s"))
@@ -130,7 +131,7 @@ def test_settings_to_start_from_may_be_settings_a_table_or_a_file(done):
         ((), {"filter": "iekf"}, "filter: found 'iekf', expected a section of settings; did you"),
     ],
 )
-def test_mistakes_are_told_in_the_words_of_the_call(words, asked, said):
+def test_mistakes_are_explained_by_the_names_of_keywords(words, asked, said):
     with pytest.raises(InputError) as refused:
         pipistrelle.run(*words, **asked)
     assert said in str(refused.value)
@@ -168,6 +169,51 @@ def test_a_log_is_solved_as_by_the_command_line(capsys):
         pipistrelle.slam(LOG, beamwidth=0.0)
 
 
+@pytest.mark.usefixtures("undrawn")
+def test_folders_saved_from_python_equal_the_command_lines(capsys):
+    short = {"duration": 2.0, "landmarks": 5, "strategies": "fused", "receiver__elements": 2}
+    saved = {"save_log": "log", "save_world": "world", "save_sound": "sound"}
+    pipistrelle.run(settings="paper", **short, **saved, frames="0:2", sound_bits=16)
+    words = ("--settings", "paper", "--duration", "2", "--landmarks", "5", "--strategy", "fused")
+    words = (*words, "--receiver.elements", "2", "--frames", "0:2", "--sound-bits", "16")
+    flags = [word for name, it in saved.items() for word in (spell(name), f"{it}2")]
+    assert main(["run", *words, *flags, "-o", "one", "--quiet"]) == 0
+    capsys.readouterr()
+    for name in saved.values():
+        assert contents(name) == contents(f"{name}2")
+    assert {"recording.wav", "recording.toml", "truth.csv"} <= contents("sound").keys()
+    heard, solved = pipistrelle.hear("sound"), pipistrelle.slam("log")
+    assert heard.measurements.height > 0
+    assert solved.tracks.height == 1 + 16
+    same = pipistrelle.run(settings="paper", **short, world="world")
+    assert same.landmarks["landmark"].n_unique() == 6
+
+
+@pytest.mark.parametrize(
+    ("asked", "said"),
+    [
+        ({"frames": "0:2"}, "frames: found 0:2, which is of save_sound; add it"),
+        ({"output": "one", "save_log": "./one"}, "save_log: one is that of output; name another"),
+        ({"animate": "gif"}, "animate: found 'gif', expected a result folder for it; name one by"),
+        ({"save_bag": True}, "save_bag: found True, expected a result folder for it; name one by"),
+        ({"particles": 9}, "particles: found 9, but filters is smoother, which has none; add filt"),
+    ],
+)
+def test_options_without_their_counterpart_are_rejected_by_keyword(asked, said, tmp_path):
+    with pytest.raises(InputError) as refused:
+        pipistrelle.run(duration=2.0, landmarks=5, strategies="fused", **asked)
+    assert said in str(refused.value)
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.usefixtures("undrawn")
+def test_a_bag_and_a_film_are_written_from_python(done):
+    pytest.importorskip("rosbags", reason="the extra ros is not installed")
+    pipistrelle.slam(LOG, output="one", save_bag=True, animate="gif")
+    assert {"mission.mcap", "mission.gif"} <= contents("one").keys()
+    assert "mission.mcap" in contents(done.save("two", save_bag=True))
+
+
 def test_figures_and_films_are_drawn_of_the_mission(done):
     figure = done.figure()
     assert isinstance(figure, matplotlib.figure.Figure)
@@ -186,7 +232,7 @@ def test_loaded_results_are_done_again_where_they_must_be_drawn(done):
         pipistrelle.load("one").figure()
 
 
-def test_what_is_no_path_is_refused_in_words(tmp_path):
+def test_values_that_are_not_paths_are_rejected(tmp_path):
     for ask in (pipistrelle.load, pipistrelle.slam):
         with pytest.raises(InputError, match="found 7, expected the path of a folder"):
             ask(7)
@@ -194,7 +240,7 @@ def test_what_is_no_path_is_refused_in_words(tmp_path):
         pipistrelle.run(str(tmp_path))
 
 
-def test_what_is_no_folder_of_ours_is_refused(tmp_path):
+def test_folders_without_results_are_rejected(tmp_path):
     for name in ("nowhere", "."):
         with pytest.raises(InputError):
             pipistrelle.load(name)
@@ -212,7 +258,7 @@ def test_a_table_that_is_cut_or_none_is_refused_by_name(done):
         _ = pipistrelle.load("one").tracks
 
 
-def test_a_notebook_tells_a_mistake_in_a_line():
+def test_a_notebook_shows_an_input_error_in_a_line():
     assert InputError("rays__powr: no such setting")._render_traceback_() == [
         "InputError: rays__powr: no such setting"
     ]
@@ -282,7 +328,7 @@ def test_a_filter_may_be_a_class_and_goes_by_its_name(done):
     assert again.tracks.equals(found.tracks)
 
 
-def test_a_class_that_nobody_else_finds_is_refused():
+def test_a_class_that_workers_cannot_import_is_rejected():
     class Hidden(Deaf):
         """Of this function alone."""
 
@@ -300,7 +346,7 @@ CALLERS = ({"name": "bee", "frequency": 25000.0, "course": "circle"},)
 
 @pytest.mark.usefixtures("undrawn")
 @pytest.mark.parametrize("kind", ["a log", "a caller that moves", "a world of one's own"])
-def test_what_is_loaded_is_saved_as_it_was_kept_first(kind, tmp_path):
+def test_loaded_results_are_saved_with_equal_files(kind, tmp_path):
     if kind == "a log":
         pipistrelle.slam(LOG, beamwidth=90.0, output="one")
     elif kind == "a caller that moves":

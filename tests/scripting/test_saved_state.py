@@ -9,8 +9,7 @@ import pytest
 
 from pipistrelle import InputError, Slam
 from pipistrelle.estimation.catalogue import CATALOGUE
-from pipistrelle.scripting.saved_records import RECORDS
-from pipistrelle.scripting.saved_state import DEEPEST, HEAD
+from pipistrelle.scripting.saved_state import DEEPEST, HEAD, RECORDS
 
 ROBOT = {
     "motion": "unicycle",
@@ -330,7 +329,7 @@ def mutated(rng, header, data):
     return header, bytes(data)
 
 
-def test_a_file_that_is_changed_and_summed_anew_is_refused_or_drives(tmp_path):
+def test_a_forged_file_with_a_right_checksum_is_rejected_or_drives(tmp_path):
     rng, ends = np.random.default_rng(11), {"drives": 0, "refused": 0}
     files = [
         made(name, method, 10).save(tmp_path / f"{name}_{method}.slam")
@@ -393,7 +392,7 @@ def test_a_file_names_no_module_that_the_caller_does_not_name(mine, saved, tmp_p
 @pytest.mark.parametrize(
     "name", ["dataclass", "np", "np.f2py.subprocess.Popen", "Motion", "no_landmarks", "Mine.init"]
 )
-def test_of_a_module_from_outside_only_its_own_records_are_made(mine, tmp_path, name):
+def test_only_records_defined_in_the_named_module_are_constructed(mine, tmp_path, name):
     named = {"filter": f"{mine}:Mine"}
     header, data = parts_of(driven(Slam(ROBOT, **named), 1).save(tmp_path / "own.slam"))
     for node in header["nodes"]:
@@ -404,7 +403,7 @@ def test_of_a_module_from_outside_only_its_own_records_are_made(mine, tmp_path, 
 
 
 @pytest.mark.parametrize("value", ["object()", "print", "np.array([None])", "type('X', (), {})()"])
-def test_what_is_no_value_is_refused_when_it_is_saved(mine, tmp_path, value):
+def test_unsupported_values_are_rejected_by_save(mine, tmp_path, value):
     text = OWN.replace("np.float32([7])", value)
     (tmp_path / "mine_saved.py").write_text(text)
     slam = Slam(ROBOT, filter=f"{mine}:Mine")
@@ -413,5 +412,5 @@ def test_what_is_no_value_is_refused_when_it_is_saved(mine, tmp_path, value):
     assert not (tmp_path / "own.slam").exists()
 
 
-def test_records_bear_names_of_their_own():
+def test_names_of_records_are_unique():
     assert len({*RECORDS.values()}) == len(RECORDS) == len({*map(str, RECORDS)})

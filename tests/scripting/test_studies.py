@@ -28,7 +28,7 @@ def small(tmp_path, monkeypatch):
     Path("small.toml").write_text(SMALL)
 
 
-def test_its_tables_are_those_of_the_command_line(capsys):
+def test_tables_of_a_study_equal_the_command_lines(capsys):
     found = pipistrelle.study("small.toml", iterations=2)
     assert main(["study", "small.toml", "--iterations", "2", "--workers", "1", "-o", "s"]) == 0
     capsys.readouterr()
@@ -54,7 +54,7 @@ def test_its_summary_is_the_mean_over_the_worlds():
     assert "Study small" in repr(found)
 
 
-def test_it_goes_on_where_it_stopped_and_settings_lie_over_the_plan():
+def test_a_study_continues_and_settings_override_its_plan():
     one = pipistrelle.study("small.toml", iterations=1, output="s", scenario__landmarks=9)
     more = pipistrelle.study("small.toml", iterations=2, output="s", scenario={"landmarks": 9})
     assert more.trials.filter(pl.col("iteration") == 0).equals(one.trials)
@@ -67,7 +67,7 @@ def test_it_goes_on_where_it_stopped_and_settings_lie_over_the_plan():
         pipistrelle.study("nowhere")
 
 
-def test_a_plan_may_be_a_table_and_is_refused_in_its_own_words():
+def test_a_plan_as_a_table_is_accepted_and_its_mistakes_named():
     told = tomllib.loads(SMALL)
     from_file = pipistrelle.study("small.toml", iterations=1)
     assert pipistrelle.study(told, iterations=1).plan == from_file.plan
@@ -88,7 +88,7 @@ def test_a_plan_may_be_a_table_and_is_refused_in_its_own_words():
         pipistrelle.study({})
 
 
-def test_its_report_is_a_page_and_answers_and_draws_as_it_does(monkeypatch):
+def test_answer_and_figure_equal_the_report(monkeypatch):
     draw_only(monkeypatch)
     found = pipistrelle.study("small.toml", iterations=2, output="s")
     page = found.report("page")

@@ -1,5 +1,6 @@
-"""What ends a command before its time, on its own account or another's."""
+"""Tables for a terminal, and commands that end early."""
 
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -7,6 +8,7 @@ from pathlib import Path
 import pytest
 
 from pipistrelle.scripting import missions
+from pipistrelle.verbs.console import text_table
 
 
 def test_a_bug_keeps_its_traceback(obey, monkeypatch):
@@ -18,7 +20,7 @@ def test_a_bug_keeps_its_traceback(obey, monkeypatch):
         obey("run", "-o", "one")
 
 
-def test_an_interrupted_run_says_so_and_leaves_no_empty_folder(obey, monkeypatch):
+def test_an_interrupted_run_leaves_no_empty_folder(obey, monkeypatch):
     def interrupted(*_, **__):
         raise KeyboardInterrupt
 
@@ -27,7 +29,7 @@ def test_an_interrupted_run_says_so_and_leaves_no_empty_folder(obey, monkeypatch
     assert not Path("runs").exists()
 
 
-def test_memory_that_ends_is_said_in_a_line(refused, tmp_path, monkeypatch):
+def test_exhausted_memory_is_explained_in_a_line(refused, tmp_path, monkeypatch):
     def full(*_, **__):
         raise MemoryError("unable to allocate")
 
@@ -44,7 +46,7 @@ def test_a_reader_that_leaves_early_sees_no_traceback():
     assert process.returncode == 0
 
 
-def test_a_full_disk_behind_the_output_is_said_in_a_line():
+def test_a_full_disk_is_explained_in_a_line():
     if not Path("/dev/full").exists():
         pytest.skip("needs /dev/full")
     with Path("/dev/full").open("w") as full:
@@ -53,3 +55,35 @@ def test_a_full_disk_behind_the_output_is_said_in_a_line():
     assert done.returncode == 2
     assert done.stderr.startswith("pipistrelle: error: the output could not be written")
     assert "Traceback" not in done.stderr
+
+
+HEADS = [["fused", "A", "B"], ["", "ekf", "smoother"]]
+ROWS = [["position RMSE [m]", "0.388", "-"], ["[bold]x", "1", "2"]]
+
+
+def test_where_no_terminal_is_columns_are_plain_and_no_line_ends_in_spaces():
+    lines = text_table("Scores", HEADS, ROWS).splitlines()
+    assert lines == [
+        "Scores",
+        "fused                  A         B",
+        "                     ekf  smoother",
+        "position RMSE [m]  0.388         -",
+        "[bold]x                1         2",
+    ]
+
+
+def test_a_table_without_rows_is_its_heads():
+    assert text_table("", [["setting", "A"]], []) == "setting  A"
+
+
+@pytest.mark.parametrize("columns", [60, 200])
+def test_a_table_on_a_terminal_keeps_its_width_and_names(monkeypatch, columns):
+    monkeypatch.setattr(sys.stdout, "isatty", lambda: True, raising=False)
+    monkeypatch.setenv("COLUMNS", str(columns))
+    monkeypatch.setenv("NO_COLOR", "1")
+    drawn = text_table("Scores [1]", HEADS, ROWS)
+    for word in ("Scores [1]", "[bold]x", "position RMSE [m]", "smoother", "0.388"):
+        assert word in drawn
+    assert "─" in drawn
+    plain = re.sub(r"\x1b\[[0-9;]*m", "", drawn)
+    assert max(map(len, plain.splitlines())) <= columns

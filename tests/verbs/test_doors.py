@@ -101,7 +101,7 @@ def contents(folder):
     return found
 
 
-def test_each_flag_that_takes_a_path_is_known_to_read_or_to_write():
+def test_each_flag_with_a_path_is_listed_as_reading_or_writing():
     found = {
         f"{verb} {argument.names[0]}"
         for verb in ("array", "run", "hear", "slam", "view", "report", "compare", "study")
@@ -120,7 +120,7 @@ def test_each_flag_that_takes_a_path_is_known_to_read_or_to_write():
     ],
     ids=lambda words: " ".join(map(str, words[:1] + words[-2:])),
 )
-def test_a_command_loses_nothing_of_a_users(obey, users, words):
+def test_a_command_keeps_all_files_of_a_user(obey, users, words):
     status, printed, said = obey(*words)
     assert (status, printed) == (2, "")
     assert "d/debian" in said or "d: is not empty" in said or "d: holds" in said
@@ -130,7 +130,7 @@ def test_a_command_loses_nothing_of_a_users(obey, users, words):
 
 @pytest.mark.parametrize("overwrite", [False, True])
 @pytest.mark.parametrize("door", CALLS)
-def test_a_call_from_python_loses_nothing_of_a_users(users, door, overwrite):
+def test_a_python_call_keeps_all_files_of_a_user(users, door, overwrite):
     options = {} if door in ALWAYS else {"overwrite": overwrite}
     with pytest.raises(InputError, match=r"^d: "):
         CALLS[door](options)
@@ -138,7 +138,7 @@ def test_a_call_from_python_loses_nothing_of_a_users(users, door, overwrite):
 
 
 @pytest.mark.parametrize("door", COMMANDS)
-def test_a_door_replaces_what_it_wrote_itself_and_leaves_what_stands_beside(obey, users, door):
+def test_a_command_replaces_only_the_files_that_it_wrote(obey, users, door):
     shutil.rmtree("d")
     again = [] if door in ALWAYS else ["--overwrite"]
     assert obey(*COMMANDS[door])[0] == 0

@@ -47,7 +47,7 @@ def test_some_frames_are_written_and_some_are_heard(obey, tape):
     assert not Path("none").exists()
 
 
-def test_the_size_is_told_before_and_a_disk_without_room_is_refused(obey, monkeypatch):
+def test_the_size_of_the_sound_is_checked_before_the_mission(obey, monkeypatch):
     line = ("run", *FEW, "--strategy", "fused", "-o", "run", "--save-sound", "tape")
     monkeypatch.setattr("shutil.disk_usage", lambda _: type("Usage", (), {"free": 1000})())
     status, _, said = obey(*line)
@@ -57,7 +57,7 @@ def test_the_size_is_told_before_and_a_disk_without_room_is_refused(obey, monkey
     monkeypatch.undo()
 
 
-def test_only_sound_of_our_own_is_replaced(obey):
+def test_only_recordings_of_pipistrelle_are_replaced(obey):
     line = ("run", "--receiver.elements", "2", "--duration", "1", "--strategy", "fused", "--quiet")
     assert obey(*line, "-o", "a", "--save-sound", "tape")[0] == 0
     first = OwnFiles(Path("tape"), SOUND).read("recording.wav")
@@ -86,7 +86,7 @@ def test_the_dense_engine_and_frames_without_sound_are_refused(obey):
     assert not Path("tape").exists()
 
 
-def test_a_check_says_nothing_of_a_sound_recording_and_names_a_fault(obey, tmp_path):
+def test_check_reports_only_faulty_recordings(obey, tmp_path):
     folder = foreign(tmp_path / "tape")
     assert obey("hear", folder, "--check")[:2] == (0, "nothing odd was found\n")
     samples, rate = soundfile.read(folder / "tape.wav", dtype="float32")
@@ -107,7 +107,7 @@ def test_hear_names_a_log_before_it_asks_for_an_output(obey, tape):
     assert "found no folder for the log" in obey("hear", tape)[2]
 
 
-def test_hear_says_the_band_of_a_sweep_whose_edges_pass_half_the_rate(obey, tmp_path):
+def test_hear_names_the_band_of_a_sweep_beyond_half_the_rate(obey, tmp_path):
     folder, _ = swept(tmp_path / "tape", [5e-3, 5e-3])
     about = (folder / "recording.toml").read_text()
     about = about.replace("36000.0, 22000.0", "40000.0, 20000.0").replace("taper = 0.2\n", "")
@@ -129,7 +129,7 @@ def test_the_figure_ends_where_echoes_do_though_noise_makes_a_row_later(tmp_path
     assert 10.0 < right < 30.0
 
 
-def test_what_is_no_recording_is_refused(obey):
+def test_folders_without_a_recording_are_rejected(obey):
     Path("file").touch()
     Path("empty").mkdir()
     Path("link").symlink_to("nowhere")

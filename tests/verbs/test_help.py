@@ -1,12 +1,14 @@
-"""What `--help` tells: the verbs, every setting with its default, the filters there are."""
+"""`--help` lists verbs and common options, `--help-all` all settings with their defaults."""
 
 import re
 import subprocess
 import sys
+from inspect import signature
 from math import degrees
 
 import pytest
 
+import pipistrelle
 from pipistrelle.acoustics.emitter import beamwidth
 from pipistrelle.config import BagConfig, Config
 from pipistrelle.settings import known_settings
@@ -34,19 +36,40 @@ def test_help_names_the_verbs(obey):
     assert obey()[1] == printed
 
 
-@pytest.mark.parametrize("verb", [("run",), ("config", "show")])
-def test_every_setting_is_in_the_help_with_its_default(obey, verb):
-    status, printed, _ = obey(*verb, "--help")
+@pytest.mark.parametrize("verb", [("run",), ("config", "show"), ("study",)])
+def test_help_all_lists_every_setting_with_its_default(obey, verb):
+    status, printed, _ = obey(*verb, "--help-all")
     assert status == 0
     known = known_settings()
     flags = {"--" + ".".join(key).replace("_", "-") for key in known}
     assert flags <= set(re.findall(r"--[a-z0-9.-]+", printed))
-    settled = [key for key, field in known.items() if field.default is not None]
+    settled = [key for key, field in known.items() if field.default not in (None, ())]
     assert printed.count("[default:") >= len(settled)
 
 
-def test_the_help_of_slam_leaves_out_what_a_log_decides(obey):
-    found = set(re.findall(r"--[a-z]+\.[a-z-]+", obey("slam", "--help")[1]))
+@pytest.mark.parametrize("verb", ["run", "slam", "hear", "study", "view", "array"])
+def test_help_lists_at_most_twenty_two_options_without_empty_defaults(obey, verb):
+    status, printed, _ = obey(verb, "--help")
+    assert status == 0
+    flags = re.findall(r"^│ (--[a-z-]+)", printed, re.M)
+    assert 0 < len(flags) <= 22
+    assert not re.search(r"--empty-|default: (none|no|False|\(\))\]", printed)
+    assert "--rays.power" not in printed.partition("╯\n\n")[0]
+
+
+@pytest.mark.parametrize("verb", ["run", "slam", "hear"])
+def test_parameters_of_python_are_options_with_the_same_words(obey, verb):
+    function = getattr(pipistrelle, verb)
+    words = " ".join(re.sub("[│╭╮╰╯─]", " ", obey(verb, "--help")[1]).split())
+    named = {"strategies": "strategy", "filters": "filter", "config": "settings"}
+    for name in set(signature(function).parameters) - {"progress", "settings", "log", "recording"}:
+        assert f"--{named.get(name, name).replace('_', '-')} " in words
+    text = "Half-power beamwidth" if verb == "run" else "A:B is from number A, counted from 0"
+    assert verb == "slam" or (text in words and text in " ".join(function.__doc__.split()))
+
+
+def test_help_all_of_slam_omits_settings_that_a_log_decides(obey):
+    found = set(re.findall(r"--[a-z]+\.[a-z-]+", obey("slam", "--help-all")[1]))
     rays = ("ratio", "density", "prune", "power", "weights", "likelihood", "spacing")
     rays = (*rays, "merge", "ranged")
     swarm = ("particles", "resample-below", "mixture", "weights", "estimate", "resampled-rays")
@@ -66,7 +89,7 @@ def test_the_help_of_slam_leaves_out_what_a_log_decides(obey):
     }
 
 
-def test_the_defaults_that_the_help_names_are_those_of_the_settings(obey):
+def test_defaults_in_the_help_equal_the_defaults_of_the_settings(obey):
     words = " ".join(re.sub("[│╭╮╰╯─]", " ", obey("run", "--help")[1]).split())
     told = dict(re.findall(r"--([a-z]+) [A-Z]+ (?:(?! --).)*?\[default: ([^]]+)\]", words))
     config = Config()
@@ -85,8 +108,9 @@ def test_the_defaults_that_the_help_names_are_those_of_the_settings(obey):
 @pytest.mark.parametrize(
     ("verb", "default"), [("run", "of best the smoother"), ("slam", "else smoother")]
 )
-def test_the_help_names_the_filters_there_are(obey, verb, default):
+def test_the_help_lists_the_filters_and_their_default(obey, verb, default):
     words = " ".join(re.sub("[│╭╮╰╯─]", " ", obey(verb, "--help")[1]).split())
     choices = "[choices: ekf, fastslam, iekf, smoother, both, all]"
-    assert f"[default: that of the settings, {default}] {choices}" in words
+    assert f"{choices} [default: that of the settings, {default}]" in words
+    assert "--filter --estimator CHOICE Estimators, separated by commas" in words
     assert "sets fastslam.particles" in words

@@ -124,10 +124,13 @@ import pytest
         ),
         ("slam . --beamwidth 0", "--beamwidth: found 0, expected above 0 and up to 360"),
         ("slam . --beamwidth nan", "--beamwidth: found nan, expected above 0"),
-        ("slam . --robot one", "--robot: found 'one', expected a whole number"),
+        (
+            "slam . --robot one",
+            "but robot one was asked for, expected a MRCLAM set; leave out --robot",
+        ),
     ],
 )
-def test_a_mistake_is_said_in_a_line_and_nothing_is_made(refused, words, said):
+def test_mistakes_are_explained_in_a_line_and_write_nothing(refused, words, said):
     assert said in refused(*words.split())
     assert [path.name for path in Path().iterdir() if path.name != "runs"] == []
     assert not any(Path().glob("runs/*"))
@@ -145,11 +148,11 @@ def test_a_mistake_is_said_in_a_line_and_nothing_is_made(refused, words, said):
         ),
     ],
 )
-def test_an_empty_path_is_refused_and_not_taken_for_this_folder(refused, words, said):
+def test_an_empty_path_is_rejected(refused, words, said):
     assert said in refused(*words)
 
 
-def test_a_folder_of_ours_that_is_no_log_is_called_what_it_is(refused):
+def test_slam_names_the_kind_of_a_result_folder(refused):
     for title in ("results", "a report"):
         Path("d").mkdir(exist_ok=True)
         Path("d/SHA256SUMS").write_text(f"# Of Pipistrelle: {title}\n{'0' * 64}  summary.json\n")
@@ -160,14 +163,14 @@ def test_a_folder_of_ours_that_is_no_log_is_called_what_it_is(refused):
     assert "s: found a study of Pipistrelle" in refused("slam", "s")
 
 
-def test_a_list_of_sums_that_is_a_users_is_not_said_to_name_ours(refused):
+def test_a_users_list_of_checksums_is_recognised_as_foreign(refused):
     Path("d").mkdir()
     Path("d/SHA256SUMS").write_text(f"{'0' * 64}  notes.txt\n")
     Path("d/notes.txt").touch()
     assert "(its SHA256SUMS is not Pipistrelle's)" in refused("run", "-o", "d")
 
 
-def test_a_mistake_in_a_file_or_the_environment_is_said_with_its_place(refused, monkeypatch):
+def test_mistakes_in_a_file_or_the_environment_are_located(refused, monkeypatch):
     Path("mission.toml").write_text("[rays]\npowr = 3\n")
     found = refused("run", "--config", "mission.toml")
     assert found == "mission.toml: rays.powr: no such setting; did you mean rays.power?"
@@ -188,7 +191,7 @@ def test_a_mistake_in_a_file_or_the_environment_is_said_with_its_place(refused, 
         ("seed = " + '"' + "x" * 5000 + '"', "x..., expected a valid integer"),
     ],
 )
-def test_a_file_that_no_parser_was_made_for_is_refused_as_any_other(refused, text, said):
+def test_a_pathological_file_is_rejected_in_a_line(refused, text, said):
     Path("mission.toml").write_text(text)
     for words in (["run", "--config", "mission.toml"], ["study", "mission.toml"]):
         found = refused(*words)
@@ -198,7 +201,7 @@ def test_a_file_that_no_parser_was_made_for_is_refused_as_any_other(refused, tex
     assert not Path("runs").exists()
 
 
-def test_a_film_that_needs_what_is_missing_is_refused_before_anything_is_made(refused, monkeypatch):
+def test_a_film_without_ffmpeg_is_rejected_before_the_mission(refused, monkeypatch):
     monkeypatch.setenv("PATH", "")
     assert "found no ffmpeg" in refused("run", "--animate", "mp4")
     assert not Path("runs").exists()

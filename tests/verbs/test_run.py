@@ -1,28 +1,37 @@
-"""`pipistrelle run`: what it tells, what it writes, what it leaves alone."""
+"""`pipistrelle run` and `pipistrelle config`: output, result folders, settings."""
 
+import json
 import re
 import tomllib
 from dataclasses import replace
+from math import degrees, pi, radians, sin
 from pathlib import Path
 
 import numba
 import numpy as np
+import polars
 import polars as pl
 import pytest
+from scipy.special import j1
 
 import pipistrelle
 from pipistrelle import files as own_files
 from pipistrelle import kernel_clock
+from pipistrelle.acoustics.emitter import beamwidth
+from pipistrelle.config import Config
 from pipistrelle.estimation.catalogue import PAPERS
 from pipistrelle.estimation.fastslam.filter import FastSlam
 from pipistrelle.evaluation.bound import IN_ONE_WORLD
+from pipistrelle.evaluation.scores import EVERYWHERE, SCORES
+from pipistrelle.experiments.studies.plan import Plan
 from pipistrelle.scripting import missions
 from pipistrelle.settings import from_text
 from reference.command_line import COMPILING, SHORT, contents, summary, table, track
-from reference.results import loop, mission_folder
+from reference.results import loop, mission_folder, study_folder
+from report.drawing import draw_only
 
 
-def test_a_run_tells_its_stages_its_scores_and_last_its_folder(obey):
+def test_a_run_prints_its_stages_scores_and_folder(obey):
     status, printed, said = obey("run", *SHORT, "-o", "one")
     assert status == 0
     assert printed.splitlines()[-1] == "one"
@@ -49,7 +58,7 @@ def test_a_run_tells_its_stages_its_scores_and_last_its_folder(obey):
 
 
 @pytest.mark.parametrize(("words", "said"), [((), 1), (("--quiet",), 0)])
-def test_compiling_is_told_of_when_kernels_are_compiled(obey, undrawn, monkeypatch, words, said):
+def test_compilation_is_announced(obey, undrawn, monkeypatch, words, said):
     run_mission = missions.run_mission
 
     def compiling(*given, **named):
@@ -61,7 +70,7 @@ def test_compiling_is_told_of_when_kernels_are_compiled(obey, undrawn, monkeypat
     assert obey("run", *SHORT, *words)[2].count(COMPILING) == said
 
 
-def test_an_estimate_far_from_its_bound_is_told_of_once(obey, undrawn, monkeypatch):
+def test_an_estimate_far_from_its_bound_is_reported_once(obey, undrawn, monkeypatch):
     words = ("run", *SHORT, "--strategy", "fused", "--filter", "ekf,iekf", "--quiet", "-o")
     assert "times the bound" not in obey(*words, "one")[2]
     monkeypatch.setattr(missions, "MAX_TIMES_BOUND", 0.0)
@@ -98,12 +107,12 @@ def test_failing_warning_loses_no_results(obey, undrawn, monkeypatch):
     assert Path("log/log.toml").exists()
 
 
-def test_nothing_is_told_of_kernels_that_are_loaded(obey, undrawn):
+def test_loading_kernels_is_not_announced(obey, undrawn):
     obey("run", *SHORT)
     assert COMPILING not in obey("run", *SHORT)[2]
 
 
-def test_both_filters_are_told_compared_and_drawn_in_100_columns(obey, monkeypatch):
+def test_two_filters_are_printed_within_100_columns(obey, monkeypatch):
     run_mission, seen = missions.run_mission, []
 
     def seeing(*words, **named):
@@ -146,7 +155,7 @@ def test_the_closing_table_keeps_its_columns_however_large_its_numbers(obey, mon
     assert {len(cells) for cells in rows.values()} == {3}
 
 
-def test_a_quiet_run_prints_its_folder_alone(obey, undrawn):
+def test_a_quiet_run_prints_only_its_folder(obey, undrawn):
     assert obey("run", *SHORT, "-o", "one", "--strategy", "active", "--quiet") == (0, "one\n", "")
     assert len(summary("one")["runs"]) == 1
 
@@ -170,7 +179,7 @@ def test_results_are_replaced_only_when_asked(obey, refused, undrawn):
 @pytest.mark.parametrize(
     "place", ["scripting.missions.run_mission", "figures.mission.draw_mission"]
 )
-def test_earlier_results_and_logs_outlive_a_mission_that_comes_to_nothing(
+def test_earlier_results_and_logs_survive_a_failed_mission(
     obey, undrawn, monkeypatch, trouble, place
 ):
     def interrupted(*_, **__):
@@ -202,7 +211,7 @@ def test_an_estimate_that_is_not_finite_is_a_failed_trial(obey, monkeypatch, und
     assert "warning: active ekf failed" in said
 
 
-def test_an_estimator_that_fails_costs_its_own_estimate_alone(obey, undrawn, monkeypatch):
+def test_a_failing_estimator_loses_only_its_estimate(obey, undrawn, monkeypatch):
     def failing(*_):
         raise RuntimeError("\n  No solution\nwas found.\n\nfor more information.")
 
@@ -223,7 +232,7 @@ def test_an_estimator_that_fails_costs_its_own_estimate_alone(obey, undrawn, mon
     assert done.summary["filter"].to_list() == ["ekf", "fastslam"]
 
 
-def test_what_was_heard_hangs_on_no_filter(obey, undrawn):
+def test_measurements_do_not_depend_on_the_filter(obey, undrawn):
     boat = '[{name="boat",frequency=25000.0,course="circle"}]'
     words = ("--duration", "4", "--landmarks", "8", "--particles", "20", "--strategy", "fused")
     words += ("--listening.timing", "true", "--callers", boat, "--quiet")
@@ -270,7 +279,7 @@ def test_order_of_filters_changes_no_table_and_no_log(obey, undrawn, method):
         assert one["landmark"].unique().to_list() == [-1]
 
 
-def test_measurements_of_a_log_have_the_label_assigned_beside_the_recorded(obey, undrawn):
+def test_measurements_of_a_log_have_assigned_and_recorded_labels(obey, undrawn):
     obey("run", *SHORT, "--strategy", "fused", "--beamwidth", "90", "--save-log", "log", "-o", "1")
     obey("slam", "log", "--association.method", "nearest", "--filter", "ekf", "-o", "2")
     rows = pl.read_parquet("2/measurements.parquet")
@@ -293,7 +302,7 @@ def test_a_saved_log_is_the_six_files_that_the_readme_promises(obey, undrawn):
     assert "six text files" in page.read_text(encoding="utf-8")
 
 
-def test_a_log_is_saved_to_a_folder_of_its_own(obey, refused, undrawn):
+def test_a_log_is_saved_to_a_separate_folder(obey, refused, undrawn):
     Path("log").mkdir()
     Path("log/notes.txt").write_text("mine")
     assert "log: is not empty" in refused("run", *SHORT, "--save-log", "log")
@@ -347,7 +356,165 @@ def test_a_log_for_which_there_is_no_room_leaves_nothing(refused, undrawn, monke
 
 
 @pytest.mark.parametrize("estimator", ["ekf", pytest.param("fastslam", marks=pytest.mark.slow)])
-def test_a_film_is_drawn_as_gif_unless_said_otherwise(obey, estimator):
+def test_a_film_is_a_gif_by_default(obey, estimator):
     words = ("--strategy", "passive", "--filter", estimator, "--quiet", "--animate")
     assert obey("run", "--duration", "1", "--landmarks", "5", *words, "-o", "one")[0] == 0
     assert Path("one/mission.gif").read_bytes().startswith(b"GIF8")
+
+
+@pytest.fixture
+def settings(obey):
+    """Resolve settings as every verb does."""
+
+    def settings(*words):
+        status, printed, said = obey("config", "show", *words)
+        assert (status, said) == (0, "")
+        return Config.model_validate(tomllib.loads(printed))
+
+    return settings
+
+
+def test_settings_as_shown_are_a_file_of_the_same_settings(settings, obey):
+    config = settings("--rays.power", "3", "--scenario.start", "1", "-2", "0.5", "--seed", "9")
+    assert config.rays.power == 3.0
+    assert config.scenario.start == (1.0, -2.0, 0.5)
+    Path("mission.toml").write_text(obey("config", "show", "--rays.power", "3")[1])
+    assert settings("--config", "mission.toml") == settings("--rays.power", "3")
+
+
+def test_short_options_set_their_settings(settings):
+    config = settings(
+        *("--beamwidth", "60", "--landmarks", "3", "--duration", "10", "--engine", "dense"),
+        *("--scenario.step", "0.25", "--air.speed-of-sound", "340", "--particles", "30"),
+    )
+    width = beamwidth(
+        config.emitter.radius, frequency=config.emitter.frequency, speed_of_sound=340.0
+    )
+    assert degrees(width) == pytest.approx(60, rel=1e-12)
+    assert config.scenario.landmarks == 3
+    assert config.scenario.steps == 40
+    assert config.receiver.engine == "dense"
+    assert config.fastslam.particles == 30
+
+
+def test_the_beamwidth_accounts_for_the_given_speed_of_sound(settings):
+    words = ("--emitter.frequency", "50000", "--air.speed-of-sound", "330")
+    radius = settings("--beamwidth", "60", *words).emitter.radius
+    ka = 2.0 * pi * 50e3 / 330.0 * radius
+    pressure = 2.0 * j1(ka * sin(radians(30.0))) / (ka * sin(radians(30.0)))
+    assert pressure**2 == pytest.approx(0.5, rel=1e-9)
+
+
+def test_flags_go_over_the_environment_over_the_file(settings, monkeypatch):
+    Path("mission.toml").write_text("seed = 2\n[rays]\npower = 2\nratio = 0.2\n")
+    monkeypatch.setenv("PIPISTRELLE_SEED", "3")
+    monkeypatch.setenv("PIPISTRELLE_RAYS__POWER", "3")
+    monkeypatch.setenv("PIPISTRELLE_DATA", "/nowhere")
+    config = settings("--config", "mission.toml", "--seed", "4")
+    assert (config.seed, config.rays.power, config.rays.ratio) == (4, 3.0, 0.2)
+
+
+def test_the_schema_describes_every_setting(obey):
+    schema = json.loads(obey("config", "schema")[1])
+    sections = schema["$defs"].values()
+    listed = 1  # those of a caller, of which there may be several
+    assert len(sections) == sum(type(v) is dict for v in Config().model_dump().values()) + listed
+    assert all("description" in field for s in sections for field in s["properties"].values())
+
+
+TITLE = "echoes of a new kind"
+
+
+def test_a_score_added_to_the_table_is_in_result_compare_and_report(
+    obey, in_a_folder_of_its_own, monkeypatch
+):
+    name = "measurements_per_frame"
+    monkeypatch.setitem(SCORES, name, replace(SCORES[name], title=TITLE, shown=EVERYWHERE))
+    draw_only(monkeypatch)
+    for folder, seed in (("one", 7), ("two", 8)):
+        plan = Plan(
+            name=folder, iterations=4, strategies=("active", "fused"), filters=("ekf",),
+            config=Config(seed=seed), grid={},
+        )  # fmt: skip
+        study_folder(Path(folder), plan, lambda case, world: 2.0 + world + case.number)
+    for words in (("run", *SHORT, "--strategy", "fused"), ("compare", "one", "two")):
+        _, printed, _ = obey(*words)
+        assert TITLE in printed
+    assert obey("report", "one", "--quiet")[0] == 0
+    page = Path("one/report/index.html").read_text(encoding="utf-8")
+    assert page.count(f">{TITLE}<") > 1, "among the effects and among the cases"
+    assert TITLE.capitalize() in page, "over what is varied"
+
+
+def assert_both_tracks(folder, name):
+    """The path by all that was heard, and as it was believed at its time, are there and scored."""
+    smoothed, online = track(folder, name), track(folder, f"{name}_online")
+    np.testing.assert_array_equal(smoothed[:, 0], online[:, 0])
+    np.testing.assert_allclose(smoothed[-1], online[-1], rtol=0, atol=0.05)
+    assert np.abs(smoothed[1:, 1:3] - online[1:, 1:3]).max() > 1e-4
+    assert f"track_{name}_online.tum" in (Path(folder) / "SHA256SUMS").read_text()
+    assert "_online.tum" in (Path(folder) / "README.md").read_text()
+    (run,) = summary(folder)["runs"]
+    assert set(run["online"]) == {
+        "position_rmse_m", "heading_rmse_rad", "position_rmse_aligned_m", "nees_mean", "nees_max",
+    }  # fmt: skip
+    assert run["online"]["position_rmse_m"] != run["position_rmse_m"]
+
+
+def test_a_run_and_its_log_give_both_tracks_of_the_smoother(obey, undrawn):
+    words = ("--filter", "smoother", "--strategy", "fused", "--quiet")
+    assert obey("run", *SHORT, *words, "--save-log", "log", "-o", "one") == (0, "one\n", "")
+    assert_both_tracks("one", "fused_smoother")
+    words = ("--filter", "smoother", "--filter.gate", "1.0", "--quiet")
+    assert obey("slam", "log", *words, "-o", "two") == (0, "two\n", "")
+    assert_both_tracks("two", "fused_smoother")
+    for name in ("fused_smoother", "fused_smoother_online"):
+        ran, replayed = track("one", name), track("two", name)
+        np.testing.assert_allclose(replayed, ran, rtol=0, atol=1e-6)
+
+
+def test_a_filter_that_revises_nothing_has_one_track(obey, undrawn):
+    obey("run", *SHORT, "--filter", "ekf", "--strategy", "fused", "--quiet", "-o", "one")
+    assert not list(Path("one").glob("*_online.tum"))
+    assert "online" not in summary("one")["runs"][0]
+
+
+def test_calibrated_parameters_are_in_the_table_and_the_summary(obey, undrawn):
+    words = ("--filter", "smoother", "--strategy", "active", "--scenario.steps", "80")
+    asked = ("--filter.calibrate", "speed_scale", "sensor_place")
+    status, printed, _ = obey("run", *words, *asked, "-o", "out")
+    assert status == 0
+    (run,) = summary("out")["runs"]
+    numbers = ("speed_scale", "sensor_place_x", "sensor_place_y")
+    assert [*run["calibration"]] == [one for name in numbers for one in (name, f"{name}_std")]
+    assert run["calibration"]["speed_scale"] == pytest.approx(1.0, abs=0.3)
+    rows = {line[:32].strip(): line[32:].split() for line in printed.splitlines()}
+    assert rows["speed scale"] == [f"{run['calibration']['speed_scale']:.5g}"]
+    assert rows["sensor place x, 1 sigma"] == [f"{run['calibration']['sensor_place_x_std']:.2g}"]
+
+
+def test_a_filter_that_calibrates_nothing_refuses_to(obey):
+    status, _, said = obey("run", "--filter", "ekf", "--filter.calibrate", "speed_scale")
+    assert status == 2
+    assert "filter.calibrate: found speed_scale with the filter ekf" in said
+    assert "take smoother" in said
+
+
+def test_a_parameter_that_there_is_not_is_refused(obey):
+    status, _, said = obey("run", "--filter", "smoother", "--filter.calibrate", "gravity")
+    assert status == 2
+    assert "gravity" in said
+    assert "speed_scale" in said
+
+
+def test_a_study_has_columns_of_calibrated_parameters(obey):
+    Path("plan.toml").write_text(
+        'format = 1\nname = "own"\niterations = 1\nfilters = ["smoother", "ekf"]\n'
+        'strategies = ["active"]\n[config]\nscenario.steps = 40\n'
+        '[own.smoother]\nfilter.calibrate = ["turn_bias"]\n'
+    )
+    status, *_ = obey("study", "plan.toml", "-o", "out")
+    assert status == 0
+    trials = polars.read_parquet("out/trials/*.parquet").sort("case")
+    assert trials["turn_bias_std"].is_null().to_list() == [False, True]
+    assert 0.0 < trials["turn_bias_std"][0] <= 0.02

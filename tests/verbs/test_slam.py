@@ -65,7 +65,7 @@ CHORUS = (
 
 
 @pytest.mark.parametrize("noise", ["constant", "measured"])
-def test_a_log_keeps_excess_paths_and_whose_they_are_to_the_bit(obey, noise, undrawn):
+def test_a_log_keeps_excess_paths_and_their_callers_bit_for_bit(obey, noise, undrawn):
     told = ("--filter.noise", noise, "--filter.gate", "0.99")
     words = ("--callers", CHORUS, "--listening.timing", "true", "--strategy", "fused")
     obey("run", *SHORT, *words, *told, "--save-log", "log", "-o", "one")
@@ -75,7 +75,7 @@ def test_a_log_keeps_excess_paths_and_whose_they_are_to_the_bit(obey, noise, und
         strategies="fused", settings="paper", duration=4, landmarks=10, **settings, **timing
     )  # the same again: its scans are in no file
     solved = pipistrelle.slam("log", filters="ekf", **settings)
-    (one,), (two,) = ran._mission.trials, solved._mission.trials
+    (one,), (two,) = ran.mission.trials, solved.mission.trials
     assert [scan.time for scan in one.scans if scan.landmark.size] == [s.time for s in two.scans]
     rows = 0
     for scan, again in zip((s for s in one.scans if s.landmark.size), two.scans, strict=True):
@@ -89,7 +89,7 @@ def test_a_log_keeps_excess_paths_and_whose_they_are_to_the_bit(obey, noise, und
     assert {*solved.measurements["caller"].drop_nulls()} == {"beacon", "caller2", "boat"}
 
 
-def test_slam_listens_for_excess_paths_where_there_are_some_unless_told_otherwise(obey, undrawn):
+def test_slam_uses_excess_paths_of_a_log_by_default(obey, undrawn):
     words = ("--listening.timing", "true", "--strategy", "fused")
     obey("run", *SHORT, *words, "--save-log", "log", "-o", "one")
     for more, timing in (((), True), (("--listening.timing", "false"), False)):
@@ -141,7 +141,7 @@ def told_by_poses(log, folder):
 
 @pytest.mark.parametrize("estimator", CATALOGUE)
 @pytest.mark.parametrize("name", ["unicycle_log", "bicycle_log"])
-def test_a_log_told_by_poses_gives_the_logs_track_and_map(obey, name, estimator, undrawn):
+def test_a_log_with_pose_odometry_gives_the_same_track_and_map(obey, name, estimator, undrawn):
     poses = told_by_poses(DATA / name, Path("poses"))
     words = ("--filter", estimator, "--quiet")
     for log, folder in ((DATA / name, "one"), (poses, "two")):
@@ -161,7 +161,7 @@ def test_a_log_of_poses_is_mapped_and_scored(obey):
     assert run["landmarks_full"] == 3, "the bearings of one never cross at half a radian"
 
 
-def test_a_frame_that_was_begun_anew_is_asked_about(obey, undrawn):
+def test_a_restarted_odometry_frame_is_questioned(obey, undrawn):
     log = shutil.copytree(DATA / "poses_log", "log")
     header, *rows = [line.split(",") for line in Path("log/odometry.csv").read_text().splitlines()]
     for row in rows[20:]:
@@ -201,7 +201,7 @@ def test_slam_hides_ranges_by_strategy_and_beam(obey, log, undrawn):
     assert "position RMSE, aligned [m]" in printed
 
 
-def test_the_gate_of_a_log_is_the_one_asked_for_else_its_own_else_the_filters(obey, log, undrawn):
+def test_the_gate_is_given_or_of_the_log_or_of_the_filter(obey, log, undrawn):
     def gate(*words):
         assert obey("slam", log, "--quiet", "--overwrite", "-o", "two", *words)[0] == 0
         return tomllib.loads(Path("two/config.toml").read_text())["filter"]["gate"]
@@ -247,7 +247,7 @@ def test_slam_fits_the_rays_to_the_bearings_unless_asked_otherwise(obey, log, un
     assert (status, "needs likelihood" in said) == (2, True)
 
 
-def test_slam_takes_from_the_log_what_the_log_decides_and_says_so(obey, log, undrawn):
+def test_slam_overrules_settings_that_the_log_decides(obey, log, undrawn):
     own = Config().filter.range_std
     Path("mission.toml").write_text("[filter]\nrange_std = 0.7\n")
     _, _, said = obey("slam", log, "--config", "mission.toml", "-o", "two", "--quiet")
@@ -312,7 +312,7 @@ def test_of_poses_the_unit_of_headings_is_asked_about_too(obey, undrawn):
     assert "are bearings and headings in radians" in said
 
 
-def test_a_gate_that_rejects_more_than_it_should_is_told_of_with_what_helps(obey, log, undrawn):
+def test_a_gate_with_too_many_rejections_is_reported_with_advice(obey, log, undrawn):
     rows = [row.split(",") for row in (log / "measurements.csv").read_text().splitlines()]
     last = max(i for i, row in enumerate(rows) if row[3])
     rows[last][2] = repr(float(rows[last][2]) + 1.5)
@@ -369,7 +369,7 @@ def test_excess_paths_in_seconds_or_millimetres_are_asked_about(obey, factor, sa
     assert re.search(said, obey("slam", "log", "-o", "three", "--quiet")[2])
 
 
-def test_a_former_name_of_excess_paths_is_told_in_a_line(obey, undrawn):
+def test_a_former_name_of_excess_paths_is_reported(obey, undrawn):
     obey("run", *SHORT, *EXCESS_PATHS, "--save-log", "log", "-o", "one")
     table = Path("log/measurements.csv")
     table.write_text(table.read_text().replace("excess_path", "detour"))
@@ -438,7 +438,7 @@ def test_a_log_without_truth_is_mapped_and_not_scored(obey, log):
 
 
 @pytest.mark.parametrize(("share", "warned"), [(1.0, False), (0.05, True)])
-def test_innovations_larger_than_a_filter_expects_are_said(obey, log, undrawn, share, warned):
+def test_innovations_larger_than_predicted_are_reported(obey, log, undrawn, share, warned):
     path = log / "log.toml"
     stds = re.compile(r"(?m)^((?:range|bearing|speed|steering)_std = )(\S+)$")
     path.write_text(stds.sub(lambda row: f"{row[1]}{share * float(row[2])}", path.read_text()))
@@ -448,7 +448,7 @@ def test_innovations_larger_than_a_filter_expects_are_said(obey, log, undrawn, s
     assert (f"(NIS {run['nis_mean']:.3g}, 1 where it believes rightly)" in said) == warned
 
 
-def test_a_log_whose_truth_ends_early_is_scored_where_it_is_known(obey, log, undrawn):
+def test_a_log_with_partial_truth_is_scored_on_that_part(obey, log, undrawn):
     rows = (log / "truth.csv").read_text().splitlines()
     (log / "truth.csv").write_text("\n".join(rows[:20]))
     status, _, _ = obey("slam", log, "-o", "two")
@@ -458,7 +458,7 @@ def test_a_log_whose_truth_ends_early_is_scored_where_it_is_known(obey, log, und
     assert run["diverged"] is False
 
 
-def test_a_truth_that_covers_part_of_the_path_is_said_in_a_line(obey, tmp_path, undrawn):
+def test_partial_truth_is_reported_in_a_line(obey, tmp_path, undrawn):
     log = tmp_path / "log"
     shutil.copytree(Path(__file__).parents[1] / "data" / "unicycle_log", log)
     rows = (log / "truth.csv").read_text().splitlines()
@@ -513,7 +513,7 @@ def test_slam_solves_a_bag_scores_it_by_a_topic_and_does_it_again(obey, undrawn)
         pipistrelle.load("one").figure()
 
 
-def test_a_bags_topics_are_listed_with_what_they_are_taken_for(obey, refused):
+def test_topics_of_a_bag_are_listed_with_their_roles(obey, refused):
     bagged("walk", late=0.5)
     status, printed, _ = obey("slam", "walk", "--topics", "--truth", "/true")
     assert status == 0
@@ -525,7 +525,7 @@ def test_a_bags_topics_are_listed_with_what_they_are_taken_for(obey, refused):
     assert "--bag.odometry names it" in obey("slam", "walk", "--topics")[1]
 
 
-def test_what_is_of_bags_is_refused_beside_a_log_folder(log, refused):
+def test_options_of_bags_are_rejected_for_a_log_folder(log, refused):
     assert refused("slam", log, "--truth", "/true").startswith("--truth: means nothing to a log")
     assert "no ROS bag" in refused("slam", log, "--topics")
 
@@ -590,7 +590,7 @@ def test_a_bag_of_two_sonars_maps_landmarks_however_wide_their_cones_are(obey, u
     assert "nothing in it is heard" not in said
 
 
-def test_unsure_rows_are_counted_by_the_limits_of_their_own_filter(obey, undrawn):
+def test_discarded_rows_are_counted_by_the_limits_of_each_filter(obey, undrawn):
     sonars(Path("walk.mcap"))
     words = ["slam", "walk.mcap", "--association.method", "marginal", "--filter", "ekf,smoother"]
     Path("own.toml").write_text("[own.ekf.association]\nbearing_std = 0.04\n")

@@ -1,14 +1,17 @@
-"""Streams that are closed, full, or left by their reader decide nothing of what is done."""
+"""Closed, full or abandoned streams, and signals to end."""
 
 import os
+import signal
 import subprocess
 import sys
+import time
 from pathlib import Path
 
 import pytest
 
 from pipistrelle.__main__ import main
 from pipistrelle.experiments.studies.world import done_worlds
+from pipistrelle.verbs.streams import heard_signals
 from reference.command_line import SHORT, summary
 
 TINY = """\
@@ -71,7 +74,7 @@ def test_a_report_is_whole_whatever_becomes_of_its_words(streams):
 
 
 @FULL
-def test_a_result_that_cannot_be_printed_is_told_by_the_status():
+def test_an_unprintable_result_is_reported_by_the_status():
     status, said = shell(f"{PIPISTRELLE} config show >/dev/full")
     assert status == 2
     assert said == (
@@ -81,7 +84,7 @@ def test_a_result_that_cannot_be_printed_is_told_by_the_status():
 
 @FULL
 @pytest.mark.parametrize("streams", ["2>/dev/full", "2>&-"])
-def test_a_mistake_that_cannot_be_said_is_one_all_the_same(streams):
+def test_a_mistake_without_standard_error_keeps_its_status(streams):
     assert shell(f"{PIPISTRELLE} run --bemwidth 3 {streams}") == (2, "")
 
 
@@ -91,7 +94,7 @@ def test_a_file_is_never_given_the_number_of_a_closed_stream():
     assert (status, printed, Path("notes").read_text()) == (0, "", "")
 
 
-def test_what_a_stream_has_no_letters_for_is_printed_by_its_number():
+def test_characters_outside_the_encoding_are_printed_as_numbers():
     code = "import pipistrelle.verbs.streams as s; s.hold_streams(); s.put('\\u03c3', '\\udcff')"
     line = f'PYTHONIOENCODING=latin-1 "{sys.executable}" -c "{code}" > word'
     assert shell(line) == (0, "")
@@ -109,3 +112,72 @@ def test_a_name_that_is_no_text_is_printed_by_its_bytes():
     assert Path("folder").read_bytes() == b"two\xff\n"
     readme = (Path(os.fsdecode(b"two\xff")) / "README.md").read_text()
     assert r"slam 'log\xff' -o 'two\xff'" in readme
+
+
+PLAN = """\
+format = 1
+iterations = 400
+strategies = ["fused"]
+filters = ["ekf"]
+[config.scenario]
+steps = 40
+landmarks = 8
+"""
+
+
+@pytest.mark.skipif(os.name != "posix", reason="signals are those of POSIX")
+@pytest.mark.parametrize(
+    "ending", [pytest.param(signal.SIGTERM, marks=pytest.mark.slow), signal.SIGINT]
+)
+def test_a_study_that_is_asked_to_end_ends_in_order(ending):
+    Path("long.toml").write_text(PLAN)
+    words = ["study", "long.toml", "--workers", "2", "-o", "one"]
+    study = subprocess.Popen(
+        [sys.executable, "-m", "pipistrelle", *words],
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.PIPE,
+        text=True,
+        start_new_session=True,
+    )
+    deadline = time.monotonic() + 120.0
+    while not done_worlds(Path("one")) and study.poll() is None and time.monotonic() < deadline:
+        time.sleep(0.02)
+    os.killpg(study.pid, ending)
+    _, said = study.communicate(timeout=60)
+    assert study.returncode == 128 + ending
+    lines = said.splitlines()
+    assert lines[-1] == "pipistrelle: interrupted"
+    assert "one: worlds that are done are kept; the same command goes on with the rest" in lines
+    assert "resource_tracker" not in said
+    assert 0 < len(done_worlds(Path("one"))) < 400
+
+
+def test_an_interruption_hidden_by_a_library_is_reported(obey, monkeypatch):
+    def hidden(*_, **__):
+        try:
+            signal.raise_signal(signal.SIGINT)
+        except KeyboardInterrupt:
+            raise ValueError("a validator could not be built") from None
+
+    monkeypatch.setattr("pipistrelle.verbs.missions.mission_settings", hidden)
+    assert obey("config", "show") == (130, "", "pipistrelle: interrupted\n")
+
+
+def test_signal_handlers_are_restored():
+    before = [signal.getsignal(ending) for ending in (signal.SIGINT, signal.SIGTERM)]
+    with heard_signals():
+        assert signal.getsignal(signal.SIGTERM) is not before[1]
+    assert [signal.getsignal(ending) for ending in (signal.SIGINT, signal.SIGTERM)] == before
+
+
+@pytest.mark.skipif(os.name != "posix", reason="signals are those of POSIX")
+@pytest.mark.parametrize("ending", [signal.SIGTERM, signal.SIGINT])
+def test_a_signal_after_the_work_keeps_the_status(ending):
+    """It is sent when Python takes itself down, in a function that is called at the end."""
+    code = (
+        "import atexit, signal, sys; from pipistrelle.__main__ import main; "
+        f"atexit.register(signal.raise_signal, {int(ending)}); "
+        "sys.argv = ['pipistrelle', 'config', 'show']; sys.exit(main())"
+    )
+    ended = subprocess.run([sys.executable, "-c", code], capture_output=True, check=False)
+    assert (ended.returncode, ended.stderr) == (0, b"")

@@ -53,7 +53,7 @@ def failing(monkeypatch):
 
 
 @pytest.mark.parametrize(("words", "said"), [((), 1), (("--quiet",), 0)])
-def test_compiling_is_told_of_when_kernels_are_compiled(capsys, monkeypatch, words, said):
+def test_compilation_is_announced(capsys, monkeypatch, words, said):
     monkeypatch.setattr(kernel_clock._CLOCK, "said", False)  # as in a new process
     monkeypatch.setattr(compiling, "run_mission", lambda *_: numba.njit(lambda x: x + 1)(1.0))
     line = ("study", "small.toml", "--iterations", "1", "--workers", "1", "-o", "one")
@@ -61,7 +61,7 @@ def test_compiling_is_told_of_when_kernels_are_compiled(capsys, monkeypatch, wor
     assert capsys.readouterr().err.count(COMPILING) == said
 
 
-def test_a_study_tells_how_far_it_is_what_came_of_it_and_last_its_folder(obey):
+def test_a_study_prints_progress_results_and_folder(obey):
     status, printed, said = obey("small.toml", "-o", "one")
     assert (status, printed) == (0, "3 worlds, 30 trials, 0 failed\none\n")
     first, last = said.splitlines()
@@ -86,7 +86,7 @@ def test_the_same_command_again_goes_on_and_repeats_nothing(obey, monkeypatch):
     assert worlds == [2]
 
 
-def test_a_quiet_study_prints_its_folder_alone(obey):
+def test_a_quiet_study_prints_only_its_folder(obey):
     assert obey("small.toml", "--iterations", "1", "--quiet", "-o", "one") == (0, "one\n", "")
 
 
@@ -111,13 +111,13 @@ def test_as_many_workers_as_asked_for_do_the_study(obey, monkeypatch):
 
 
 @pytest.mark.slow
-def test_two_workers_find_what_one_finds(obey):
+def test_results_do_not_depend_on_the_number_of_workers(obey):
     obey("small.toml", "--quiet", "-o", "one")
     assert obey("small.toml", "--quiet", "--workers", "2", "-o", "two") == (0, "two\n", "")
     assert_same(results("one"), results("two"))
 
 
-def test_settings_are_laid_over_the_plan_and_kept_in_the_folder(obey, monkeypatch):
+def test_settings_override_the_plan_and_are_kept(obey, monkeypatch):
     monkeypatch.setenv("PIPISTRELLE_RAYS__POWER", "4")
     words = ("--iterations", "1", "--seed", "9", "--filter.gate", "0.99", "--quiet")
     assert obey("small.toml", *words, "-o", "one")[0] == 0
@@ -129,7 +129,7 @@ def test_settings_are_laid_over_the_plan_and_kept_in_the_folder(obey, monkeypatc
     assert_same(results("one"), results("two"))
 
 
-def test_failed_trials_are_counted_told_and_make_the_status_one(obey, failing):
+def test_failed_trials_are_counted_and_make_the_status_one(obey, failing):
     status, printed, said = obey("small.toml", "-o", "one")
     assert (status, printed) == (1, "3 worlds, 30 trials, 3 failed\none\n")
     assert "passive 6/6 (3 failed)" in said
@@ -157,7 +157,7 @@ def test_on_a_terminal_bars_move(obey, monkeypatch):
     assert "3/3, " in said
 
 
-def test_lines_are_seconds_apart_but_for_the_first_and_the_last(capsys, monkeypatch):
+def test_lines_of_progress_are_limited_except_first_and_last(capsys, monkeypatch):
     now = [0.0]
     monkeypatch.setattr(verb, "perf_counter", lambda: now[0])
     show = verb._lines()
@@ -179,7 +179,7 @@ def so_far(done, worlds):
     )
 
 
-def test_speed_and_time_left_are_those_since_the_study_went_on(monkeypatch):
+def test_speed_and_remaining_time_count_from_the_continuation(monkeypatch):
     now = [50.0]
     monkeypatch.setattr(verb, "perf_counter", lambda: now[0])
     pace = verb._pace()
@@ -230,7 +230,7 @@ def test_a_length_of_time_is_worded_in_the_unit_that_fits(seconds, words):
         ("small.toml -o .", "holds small.toml and no plan.toml"),
     ],
 )
-def test_mistakes_are_said_in_a_line(obey, words, said):
+def test_mistakes_are_explained_in_a_line(obey, words, said):
     status, printed, told = obey(*words.split())
     assert (status, printed) == (2, "")
     assert told.startswith("pipistrelle: error: ")
@@ -256,7 +256,7 @@ def test_no_job_script_is_written_for_a_plan_that_every_job_would_refuse(obey):
     assert "emitter.frequency: found 3 Hz" in said
 
 
-def test_a_speed_of_sound_that_is_given_as_it_is_makes_no_other_plan(obey):
+def test_giving_the_default_speed_of_sound_keeps_the_plan(obey):
     words = ("small.toml", "--iterations", "1", "--quiet", "-o", "one")
     assert obey(*words)[0] == 0
     assert obey(*words, "--air.speed-of-sound", "343")[0] == 0
@@ -273,7 +273,7 @@ def test_a_grid_of_thousands_of_values_is_read_at_once(obey):
     )
 
 
-def test_what_a_receiver_confuses_is_said_once_for_all_cases(obey):
+def test_ambiguous_bearings_are_reported_once_for_all_cases(obey):
     words = ("--iterations", "1", "--receiver.spacing", "0.007", "-o", "one", "--quiet")
     status, printed, said = obey("small.toml", *words)
     assert (status, printed) == (0, "one\n")
@@ -298,7 +298,7 @@ def test_another_plan_is_refused_with_a_line_for_each_difference(obey):
 # Interrupts
 
 
-def test_an_interrupt_ends_with_130_and_keeps_what_is_done(obey, monkeypatch):
+def test_an_interrupt_ends_with_130_and_keeps_finished_worlds(obey, monkeypatch):
     run_world = study.run_world
 
     def interrupted(plan, iteration):
@@ -352,7 +352,7 @@ def test_the_tasks_of_a_job_script_together_do_the_study(obey, monkeypatch):
     assert_same(results("my study"), results("whole"))
 
 
-def test_a_job_script_of_the_papers_study_has_sixteen_tasks_unless_told_otherwise(obey):
+def test_the_job_script_of_the_paper_has_sixteen_tasks_by_default(obey):
     printed = obey("--emit", "slurm")[1]
     assert "#SBATCH --array=0-15\n" in printed
     assert "exec pipistrelle study paper --iterations 115 " in printed

@@ -1,8 +1,9 @@
-"""`pipistrelle view`: a page beside the results, and what stands in its way."""
+"""`pipistrelle view` and `pipistrelle array`: their pages and pictures, and refused places."""
 
 import json
 import shutil
 import sys
+import tomllib
 from hashlib import sha256
 from pathlib import Path
 
@@ -43,7 +44,7 @@ def is_page(path):
     return text.startswith("<!doctype html>") and "Mission of seed" in text
 
 
-def test_the_page_stands_beside_the_results_as_one_of_them(obey, folder):
+def test_the_page_is_added_to_the_result_folder(obey, folder):
     status, printed, said = obey("view", folder)
     assert (status, printed) == (0, "one/view.html\n")
     stages = [line[:17].strip() for line in said.splitlines() if "frames/s" in line]
@@ -62,7 +63,7 @@ def test_a_new_mission_in_the_folder_takes_the_old_page_away(obey, folder, undra
     assert not (folder / "view.html").exists()
 
 
-def test_the_page_goes_where_it_is_told_and_leaves_the_folder_as_it_was(obey, folder):
+def test_the_page_is_written_elsewhere_without_changing_the_folder(obey, folder):
     before = sorted(path.name for path in folder.iterdir())
     for place in ("page.html", "a new [folder]/p q.HTML"):
         assert obey("view", folder, "--quiet", "-o", place) == (0, f"{place}\n", "")
@@ -75,7 +76,7 @@ def test_a_page_in_the_folder_by_another_name_is_one_of_its_files_too(obey, fold
     assert "again.html" in sums(folder)
 
 
-def test_what_is_not_ours_in_the_folder_is_never_replaced(obey, folder, refused):
+def test_foreign_files_in_the_folder_are_never_replaced(obey, folder, refused):
     page = folder / "view.html"
     page.write_text("mine")
     for more in ((), ("--overwrite",)):
@@ -90,7 +91,7 @@ def test_what_is_not_ours_in_the_folder_is_never_replaced(obey, folder, refused)
     assert "was changed since Pipistrelle wrote it" in refused("view", folder, "--overwrite")
 
 
-def test_what_stands_elsewhere_is_replaced_when_that_is_asked_for(obey, folder, refused):
+def test_files_elsewhere_are_replaced_only_on_request(obey, folder, refused):
     Path("page.html").write_text("mine")
     said = refused("view", folder, "-o", "page.html")
     assert said == (
@@ -185,7 +186,7 @@ def test_a_folder_that_cannot_be_written_is_refused_by_name(folder, refused, mon
     )
 
 
-def test_a_disk_that_is_full_leaves_what_was_there(obey, folder, refused, monkeypatch):
+def test_a_full_disk_keeps_the_earlier_page(obey, folder, refused, monkeypatch):
     Path("page.html").write_text("mine")
 
     def full(*_):
@@ -206,7 +207,7 @@ def test_a_disk_that_is_full_leaves_what_was_there(obey, folder, refused, monkey
         (lambda: Path("none").mkdir(), "none: found no summary.json"),
     ],
 )
-def test_what_is_no_folder_of_results_is_refused(refused, make, said):
+def test_view_rejects_folders_without_results(refused, make, said):
     make()
     assert said in refused("view", "none")
 
@@ -221,7 +222,7 @@ def test_a_study_is_refused_with_what_to_do_instead(obey, refused, undrawn):
     assert main(["view", "one", "--quiet"]) == 0
 
 
-def test_tracks_that_are_others_are_said_in_a_line_and_the_page_is_made(obey, folder):
+def test_different_tracks_are_reported_and_the_page_is_written(obey, folder):
     path = folder / "track_fused_ekf.tum"
     path.write_text(path.read_text().replace("0.5", "0.6"))
     status, printed, said = obey("view", folder, "--quiet")
@@ -252,7 +253,7 @@ def test_a_log_that_was_solved_is_played_too_and_may_be_moved(obey, refused, und
     assert "option --log: found moved, expected none" in refused("view", "one", "--log", "moved")
 
 
-def test_an_estimator_from_outside_is_played_under_its_own_title(obey, undrawn):
+def test_a_users_estimator_is_played_under_its_title(obey, undrawn):
     Path("mine.py").write_text(
         "from typing import ClassVar\n"
         "from pipistrelle.estimation.ekf.filter import EkfSlam\n"
@@ -264,3 +265,91 @@ def test_an_estimator_from_outside_is_played_under_its_own_title(obey, undrawn):
     assert obey("view", "one", *words[:2], "--quiet") == (0, "one/view.html\n", "")
     page = Path("one/view.html").read_text()
     assert "fused \\u00b7 \\u003ci>Mine\\u003c/i>" in page
+
+
+CIRCLE = Path(__file__).resolve().parents[2] / "examples" / "arrays" / "circle.csv"
+LINE = "channel,x,y\n1,0,-0.0049\n2,0,0\n3,0,0.0049\n"
+
+
+def test_properties_of_an_array_are_printed(obey):
+    status, printed, said = obey("array", str(CIRCLE))
+    assert (status, said) == (0, "")
+    rows = dict(line.rsplit("  ", 1) for line in printed.splitlines()[1:])
+    told = {name.strip(): value.strip() for name, value in rows.items()}
+    assert told["microphones"] == "8"
+    assert told["hears"] == "all around"
+    assert float(told["aperture [m]"]) == pytest.approx(0.024, abs=1e-4)
+    assert told["bearings with a double"] == "0%"
+
+
+def test_every_bearing_of_a_line_array_is_ambiguous(obey):
+    Path("line.csv").write_text(LINE)
+    _, printed, _ = obey("array", "line.csv", "--frequency", "30e3")
+    assert "% of the bearings have a double" in printed
+
+
+def test_the_picture_is_written_where_it_is_asked_for_and_nothing_is_replaced(obey):
+    assert obey("array", "square", "-o", "new/square.png", "--quiet") == (
+        0,
+        "new/square.png\n",
+        "",
+    )
+    picture = Path("new/square.png").read_bytes()
+    assert picture.startswith(b"\x89PNG")
+    status, _, said = obey("array", str(CIRCLE), "-o", "new/square.png")
+    assert status == 2
+    assert "is there already" in said
+    assert obey("array", str(CIRCLE), "-o", "new/square.png", "--overwrite", "--quiet")[0] == 0
+    assert Path("new/square.png").read_bytes() != picture
+
+
+def test_a_file_with_dollars_in_its_name_is_drawn(obey):
+    Path("$x^{$.csv").write_text(LINE)
+    status, _, said = obey("array", "$x^{$.csv", "-o", "line.png", "--quiet")
+    assert (status, said) == (0, "")
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (("array", "no.csv"), "no.csv: found no such file"),
+        (("array", "."), ".: found a folder"),
+        (("array", "square", "--frequency", "nan"), "--frequency: found nan"),
+        (("array", "square", "-o", "square.jpg"), "a name that ends in .png"),
+        (("run", "--receiver.array", "no.csv"), "--receiver.array: no.csv: found no such file"),
+        (("run", "--receiver.array", "[[1, 2]]"), "--receiver.array: found [[1, 2]], expected"),
+        (("run", "--receiver.array", "3"), "--receiver.array: found 3, expected"),
+    ],
+    ids=lambda words: " ".join(words) if isinstance(words, tuple) else None,
+)
+def test_mistakes_of_array_are_explained_in_a_line(refused, words, said):
+    assert said in refused(*words)
+
+
+def test_a_run_by_a_file_keeps_its_microphones_and_is_repeated_without_it(obey, undrawn):
+    Path("mine").mkdir()
+    Path("mine/array.csv").write_text(CIRCLE.read_text())
+    Path("mine/my.toml").write_text('receiver.array = "array.csv"\n')
+    words = ("run", *SHORT, "--strategy", "fused", "--quiet")
+    assert obey(*words, "--config", "mine/my.toml", "-o", "one")[0] == 0
+    kept = tomllib.loads(Path("one/config.toml").read_text())["receiver"]["array"]
+    assert len(kept) == 8
+    assert kept[0] == [0.012, 0.0, 0.0, 0.0, ""]
+    Path("mine/array.csv").unlink()
+    words = ("run", "--strategy", "fused", "--quiet", "--config", "one/config.toml", "-o", "two")
+    assert obey(*words)[0] == 0
+    again = [Path(name, "track_fused_ekf.tum").read_bytes() for name in ("one", "two")]
+    assert again[0] == again[1]
+
+
+def test_a_run_by_a_file_does_without_labels(obey, undrawn):
+    words = ("run", *SHORT, "--strategy", "fused", "--association.method", "marginal")
+    asked = ("--receiver.array", str(CIRCLE), "--listening.timing", "true", "-o", "one", "--quiet")
+    assert obey(*words, *asked)[0] == 0
+
+
+def test_a_run_by_a_line_is_warned_of(obey, undrawn):
+    Path("line.csv").write_text(LINE)
+    _, _, said = obey("run", *SHORT, "--receiver.array", "line.csv", "-o", "one", "--quiet")
+    assert "receiver.array" in said
+    assert "% of the bearings" in said

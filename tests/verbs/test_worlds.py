@@ -72,7 +72,7 @@ def test_a_saved_world_is_heard_again_to_the_bit(obey, here):
     assert found("three") == found("one")
 
 
-def test_ones_own_world_is_heard_as_its_files_say(obey, here):
+def test_a_users_world_is_simulated_from_its_files(obey, here):
     words = ("--settings", "paper", "--strategy", "fused")
     status, printed, _ = obey("run", "--world", here / "posts [1]", *words)
     assert status == 0
@@ -86,7 +86,7 @@ def test_ones_own_world_is_heard_as_its_files_say(obey, here):
     assert "temperature_c = 10.0 " in printed
 
 
-def test_flags_stand_over_a_world_and_the_file_between(obey, here):
+def test_flags_override_a_file_that_overrides_a_world(obey, here):
     Path("cold.toml").write_text('scenario.world = "here/posts [1]"\nair.temperature_c = 1.0\n')
     _, printed, _ = obey("config", "show", "--config", "cold.toml")
     assert "temperature_c = 1.0 " in printed
@@ -96,7 +96,7 @@ def test_flags_stand_over_a_world_and_the_file_between(obey, here):
     assert "steps = 32 " in printed
 
 
-def test_a_world_that_a_file_names_lies_where_the_file_does(obey, here):
+def test_a_world_named_in_a_file_is_relative_to_the_file(obey, here):
     (here / "mine.toml").write_text('scenario.world = "drawn"\n')
     words = ("--settings", "paper", "--settings", "here/mine.toml")
     assert obey("run", *words, "-o", "two")[0] == 0
@@ -120,13 +120,13 @@ def test_a_world_that_a_file_names_lies_where_the_file_does(obey, here):
         (("--save-world", "one", "--overwrite"), "one: holds results of Pipistrelle, which a wor"),
     ],
 )
-def test_what_cannot_be_is_refused(refused, here, words, said):
+def test_invalid_worlds_are_rejected(refused, here, words, said):
     before = contents_of_files("here/posts [1]")
     assert said in refused("run", *words)
     assert contents_of_files("here/posts [1]") == before
 
 
-def test_a_saved_world_is_replaced_as_long_as_nobody_changed_it(obey, refused, here):
+def test_a_saved_world_is_replaced_unless_it_was_changed(obey, refused, here):
     again = ("run", *SHORT, "--seed", "8", "--save-world", here / "drawn", "--overwrite")
     assert obey(*again, "-o", "two")[0] == 0
     path = here / "drawn" / "landmarks.csv"
@@ -163,7 +163,7 @@ def test_a_study_may_name_worlds_and_keeps_them(capsys):
 
 
 @pytest.mark.usefixtures("here")
-def test_a_study_whose_worlds_have_changed_does_not_go_on(capsys):
+def test_a_study_with_changed_worlds_does_not_continue(capsys):
     Path("worlds.toml").write_text(PLAN)
     assert study(capsys, "worlds.toml", "-o", "s")[0] == 0
     path = Path("here/posts [1]/landmarks.csv")
@@ -203,7 +203,7 @@ def test_a_grid_of_worlds_is_refused_where_it_is_wrong(capsys, grid, said):
 
 
 @pytest.mark.usefixtures("here")
-def test_a_study_in_one_world_differs_by_noise_alone(capsys):
+def test_trials_of_a_study_in_one_world_differ_only_by_noise(capsys):
     Path("one.toml").write_text(
         PLAN.partition("[grid]")[0] + '[config]\nscenario.world = "here/posts [1]"\n'
     )

@@ -1,8 +1,8 @@
-"""The Python interface: `run`, `hear`, `slam`, `study`, `load`, and the results that they return.
+"""The Python interface: `run`, `hear`, `slam`, `study`, `load`, and their results.
 
-`arguments` reads settings and names, `log_settings` is what a log decides of them, `missions` runs
-them, `hearing` takes sound to a log, `results` and `studies` are what is returned. The command line
-(`verbs`) calls the same.
+The command line (`verbs`) takes its options and their help from these functions. `arguments`
+resolves settings and names, `missions` conducts missions, `log_warnings` checks logs, `live` is a
+vehicle that drives now and `saved_state` its file.
 """
 
 from lazy_loader import attach
@@ -11,8 +11,7 @@ __getattr__, __dir__, __all__ = attach(
     __name__,
     submod_attrs={
         "hearing": ["Heard", "hear"],
-        "loading": ["load"],
-        "results": ["Results", "run", "slam"],
+        "results": ["Results", "load", "run", "slam"],
         "studies": ["StudyResults", "study"],
     },
 )

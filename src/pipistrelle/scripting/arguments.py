@@ -1,17 +1,28 @@
-"""Arguments of Python and the command line: settings, strategies and estimators by name.
-
-Words come from a command line or from Python; where each was given is said in its refusal.
-"""
+"""Arguments of Python and the command line: settings, strategies, estimators, settings of logs."""
 
 import sys
-from collections.abc import Iterable, Mapping, Sequence
+import warnings
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from contextlib import AbstractContextManager, nullcontext
+from dataclasses import dataclass
+from itertools import chain
 from math import isfinite, radians
 from numbers import Real
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, get_args
 
-from pipistrelle.config import STRATEGIES, Config, InputError, Strategy
-from pipistrelle.estimation.catalogue import CATALOGUE, PAPERS, check_distinct, check_name, entry
+from pydantic import create_model
+
+from pipistrelle.config import STRATEGIES, BagConfig, Config, InputError, Section, Strategy
+from pipistrelle.detection.logs.readers import reader_of
+from pipistrelle.estimation.catalogue import (
+    CATALOGUE,
+    PAPERS,
+    SECTIONS,
+    check_distinct,
+    check_name,
+    entry,
+)
 from pipistrelle.experiments.named_settings import check_own, laid, over_named, settings_of
 from pipistrelle.refusals import meant, refusal, shown
 from pipistrelle.settings import (
@@ -30,23 +41,66 @@ from pipistrelle.settings import (
 )
 
 if TYPE_CHECKING:
+    from pipistrelle.detection.logs.recording import Log
     from pipistrelle.experiments.hearing.scenario import World
 
 Base = Config | Mapping[str, Any] | str | Path | None
-"""Settings to start from: as they were resolved, as a table, by name, or the file that holds it."""
+"""Settings to start from: resolved, as a table, or the name or path of a file."""
+Progress = Callable[[str, int, int], None]
+"""Receives the stage, the number of frames done, and their total."""
 Filters = str | type | Sequence[str | type]
-"""Estimators: by name, or classes of the user."""
+"""Estimators by name or class."""
 GROUPS = {"both": PAPERS, "all": tuple(CATALOGUE)}
-"""Names that stand for several estimators."""
+"""Names of groups of estimators."""
 RUN_NAMES = "best"
-"""Named settings of `run`, where no others are named."""
+"""Default named settings of `run`."""
 SLAM_TAKES = "smoother"
-"""Estimator of `slam`, where neither it nor settings are named."""
+"""Default estimator of `slam`, unless named settings give another."""
 STEPS: Key = ("scenario", "steps")
+GATE_KEY: Key = ("filter", "gate")
+OWN: dict[Key, str] = {
+    GATE_KEY: "auto",
+    ("rays", "spacing"): "auto",
+    ("filter", "noise"): "measured",
+    ("fastslam", "estimate"): "mixture",
+}
+"""Defaults for recorded logs, where they differ from simulated missions."""
+TIMING: Key = ("listening", "timing")
+"""Setting that is on for logs with excess paths or a moving caller."""
+SHORT: dict[str, Key] = {
+    "world": WORLD_KEY,
+    "landmarks": ("scenario", "landmarks"),
+    "engine": ("receiver", "engine"),
+    "particles": ("fastslam", "particles"),
+    "gate": GATE_KEY,
+    "truth": ("bag", "truth"),
+}
+"""Parameters that set a setting under a short name."""
+PACKAGE = "pipistrelle."
+LOGGED = frozenset(
+    {
+        ("filter", "range_std"),
+        ("filter", "bearing_std"),
+        ("filter", "initial_pose_std"),
+        ("rays", "range_bounds"),
+    }
+)
+"""Settings that the log decides."""
+OF_WORLDS = frozenset({("filter", "first_pose")})
+"""Settings of the filter that apply only to simulated truth."""
+
+_REPLAYED: dict[str, Any] = {
+    name: (Config.model_fields[name].annotation, ...)
+    for name in ("seed", "settings", "own", *SECTIONS)
+}
+SlamConfig = create_model("SlamConfig", __base__=Section, **_REPLAYED)
+"""The settings that affect the solution of a log; the ``config.toml`` of its results."""
+BagSlamConfig = create_model("BagSlamConfig", __base__=SlamConfig, bag=(BagConfig, ...))
+"""`SlamConfig` with the settings of the reader of ROS bags."""
 
 
 def base_layer(base: Base) -> Layer:
-    """Return the settings to start from, by their keys.
+    """Convert the settings to start from to a layer.
 
     >>> base_layer({"rays.power": 3.0})["rays", "power"]
     Given(value=3.0, where='config: rays.power')
@@ -64,16 +118,14 @@ def base_layer(base: Base) -> Layer:
 
 
 def folder_named(place: object, name: str) -> Path:
-    """Return the folder that an argument of some name gives; refuse what is no path."""
+    """Convert an argument to a path, or raise."""
     if not isinstance(place, (str, Path)):
         raise refusal(name, shown(place), "the path of a folder", "name one")
     return Path(place)
 
 
 def short_names(short: Layer, flags: Layer) -> Layer:
-    """Return the settings that were given by short names (their value is not None).
-
-    A setting that was given by its own name too, in `flags`, is refused.
+    """Select the short options with a value; raise if `flags` give the same setting.
 
     >>> short_names({("seed",): Given(3, "-s")}, {("seed",): Given(4, "--seed")})
     Traceback (most recent call last):
@@ -86,28 +138,98 @@ def short_names(short: Layer, flags: Layer) -> Layer:
     return short
 
 
-def mission_settings(
-    beneath: Layer,
-    flags: Layer,
-    short: Layer,
-    *,
-    beamwidth: Given,
-    duration: Given,
-    default: str = RUN_NAMES,
-) -> tuple[Config, "World | None", tuple[str, ...]]:
-    """Resolve the settings of a mission: defaults < named < world < beneath < flags.
+def keyword(name: str, value: str = "") -> str:
+    """Format a parameter, perhaps with a value, as a call from Python has it."""
+    return f"{name}={value}" if value else name
 
-    The beamwidth is the half-power width of the vehicle's call [deg], the duration in seconds;
-    either may be None. `default` is the name of the settings where no other is given. The world and
-    the estimators that the settings name are returned, too.
 
-    >>> nothing = Given(None, "")
-    >>> minute = Given(60.0, "duration")
-    >>> config, _, estimators = mission_settings({}, {}, {}, beamwidth=nothing, duration=minute)
+def warn_caller(*lines: str) -> None:
+    """Issue warnings at the line that called the package."""
+    frame, level = sys._getframe(1), 2
+    while (caller := frame.f_back) and caller.f_globals.get("__name__", "").startswith(PACKAGE):
+        frame, level = caller, level + 1
+    for line in lines:
+        warnings.warn(line, stacklevel=level + 1)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Door:
+    """A call of a function, from Python or from the command line.
+
+    The defaults are for Python; the command line spells options as flags and prints messages.
+    """
+
+    asked: Mapping[str, Any]
+    """Arguments by the names of the function's parameters."""
+    beneath: Layer
+    """Settings to start from."""
+    flags: Layer
+    """Settings that override them."""
+    command: str
+    """The call, as the result folder quotes it."""
+    default: str = RUN_NAMES
+    """Name of the settings where no other is given."""
+    option: Callable[..., str] = keyword
+    """Formats a parameter, perhaps with a value."""
+    warn: Callable[..., object] = warn_caller
+    """Receives warnings, as several lines."""
+    note: Callable[[str], object] = lambda _: None
+    """Receives messages on the work."""
+    drawing: Callable[[str], AbstractContextManager[object]] = nullcontext
+    """Receives a message on work that may take long, which is the body of the context."""
+    makes_folder: bool = False
+    """Whether results go to a new folder if none is given."""
+    working: Callable[..., AbstractContextManager[Any]] = nullcontext
+    """Yields the function that receives progress, given the settings and the estimators."""
+
+    def given(self, name: str) -> Given:
+        """Return an argument, None by default, with its name for messages."""
+        return Given(self.asked.get(name), self.option(name))
+
+    def short(self) -> Layer:
+        """Select the settings given by short options; raise if `flags` give the same setting."""
+        given = {key: self.given(name) for name, key in SHORT.items()}
+        if isinstance(path := given[WORLD_KEY].value, Path):
+            given[WORLD_KEY] = Given(str(path), given[WORLD_KEY].where)
+        return short_names(given, self.flags)
+
+    def folder(self, name: str) -> Path | None:
+        """Return the folder that an argument names, if it is given."""
+        value = self.asked.get(name)
+        return None if value is None else folder_named(value, self.option(name))
+
+    def ways_out(self, name: str) -> tuple[str, str]:
+        """Return how to name another folder, and how to allow that its files are replaced."""
+        return self.option(name, "DIR"), self.option("overwrite", "True")
+
+    def estimators(self, usual: str | Sequence[str]) -> tuple[str, ...]:
+        """Return the chosen estimators, else the usual; raise for `particles` without FastSLAM."""
+        chosen, particles = self.asked["filters"], self.asked.get("particles")
+        names = named_filters(usual if chosen is None else chosen, self.option("filters"))
+        if particles is not None and not any("fastslam" in entry(n).sections for n in names):
+            able = [known.name for known in CATALOGUE.values() if "fastslam" in known.sections]
+            others = " or ".join(self.option("filters", name) for name in (*able, *GROUPS))
+            raise InputError(
+                f"{self.option('particles')}: found {particles}, but {self.option('filters')} is "
+                f"{','.join(names)}, which has none; add {others}"
+            )
+        return names
+
+
+def mission_settings(door: Door) -> tuple[Config, "World | None", tuple[str, ...]]:
+    """Resolve the settings of a simulated mission; return them, their world and estimators.
+
+    Later layers win: defaults, named settings, the world's settings, `Door.beneath`, and
+    `Door.flags` with the short options. The beamwidth is the half-power width of the vehicle's
+    call [deg], the duration in seconds.
+
+    >>> minute = Door(asked={"duration": 60.0}, beneath={}, flags={}, command="")
+    >>> config, _, estimators = mission_settings(minute)
     >>> config.scenario.steps, config.settings, estimators
     (480, 'best', ('smoother',))
     """
-    layer = laid(beneath, flags, short_names(short, flags))
+    flags, beamwidth, duration = door.flags, door.given("beamwidth"), door.given("duration")
+    layer = laid(door.beneath, flags, door.short())
     check_own(layer)
     world = None
     if CALLERS in layer:
@@ -127,7 +249,7 @@ def mission_settings(
 
         world = named_world(layer)
         layer = layer if world is None else settled(world, layer)
-    layer, estimators = over_named(layer, default=default)
+    layer, estimators = over_named(layer, default=door.default)
     base, more = resolve(layer), {}
     if duration.value is not None:
         more[STEPS] = Given(_steps(duration, base), f"{duration.where} {duration.value:g}")
@@ -137,7 +259,7 @@ def mission_settings(
 
 
 def number(given: Given) -> float:
-    """Return a value that is a number; refuse anything else, even text that spells one.
+    """Convert a value to float; raise if it is not a number, even for text such as "60".
 
     >>> number(Given("60", "duration"))
     Traceback (most recent call last):
@@ -149,7 +271,7 @@ def number(given: Given) -> float:
 
 
 def frames_named(text: str | None, count: int, where: str) -> range:
-    """Return the frames that a slice names, A:B, of so many; all of None.
+    """Parse a slice A:B of `count` frames; None is all of them.
 
     >>> frames_named("2:4", 10, "--frames"), frames_named(":3", 10, "--frames")
     (range(2, 4), range(0, 3))
@@ -168,7 +290,7 @@ def frames_named(text: str | None, count: int, where: str) -> range:
 
 
 def named_strategies(chosen: str | Sequence[str]) -> tuple[Strategy, ...]:
-    """Return the strategies of a choice, in their usual order.
+    """Return the strategies of a choice, in the order of `STRATEGIES`.
 
     >>> named_strategies("all"), named_strategies(["fused"])
     (('active', 'fused', 'passive'), ('fused',))
@@ -189,9 +311,9 @@ _EXPECTED = "expected an estimator's name or its class"
 
 
 def named_filters(chosen: Filters, where: str = "filters") -> tuple[str, ...]:
-    """Return the names of the estimators of a choice; of a class, ``module:Class``.
+    """Return the names of the chosen estimators; ``module:Class`` for a class.
 
-    Text may hold several names, separated by commas. The groups are "both", the paper's two, and
+    Text may list several names, separated by commas. The groups are "both", the paper's two, and
     "all".
 
     >>> named_filters("both"), named_filters("ekf,iekf"), named_filters(["ekf", "iekf"])
@@ -206,8 +328,8 @@ def named_filters(chosen: Filters, where: str = "filters") -> tuple[str, ...]:
         chosen = (chosen,)
     elif getattr(chosen, "ndim", 1) == 0:  # an array that Python takes for iterable
         raise InputError(f"{where}: found {shown(chosen)}, {_EXPECTED}")
-    parted = (each for choice in chosen for each in _parted(choice))
-    names = tuple(dict.fromkeys(_name_of(choice, where) for choice in parted))
+    listed = (each.split(",") if isinstance(each, str) else (each,) for each in chosen)
+    names = tuple(dict.fromkeys(_name_of(each, where) for each in chain.from_iterable(listed)))
     if not names:
         raise InputError(f"{where}: found none, {_EXPECTED}")
     for name in names:
@@ -219,15 +341,10 @@ def named_filters(chosen: Filters, where: str = "filters") -> tuple[str, ...]:
     return names
 
 
-def _parted(chosen: str | type) -> Sequence[str | type]:
-    """Split names at commas; a class is one."""
-    return [name.strip() for name in chosen.split(",")] if isinstance(chosen, str) else (chosen,)
-
-
 def _name_of(kind: str | type, where: str) -> str:
-    """Return the name by which workers and folders find an estimator: of a class, module:Class."""
+    """Return the import name of an estimator, for workers."""
     if isinstance(kind, str):
-        return kind
+        return kind.strip()
     if not isinstance(kind, type):
         raise InputError(f"{where}: found {shown(kind)}, {_EXPECTED}")
     module, name = kind.__module__, kind.__qualname__
@@ -240,7 +357,7 @@ def _name_of(kind: str | type, where: str) -> str:
 
 
 def _steps(duration: Given, config: Config) -> int:
-    """Count the control steps of a drive; at least one frame."""
+    """Convert a duration to control steps; raise if it is shorter than a frame."""
     scenario = config.scenario
     frame = scenario.step * scenario.steps_per_frame
     if not frame <= number(duration) or not isfinite(duration.value / scenario.step):
@@ -252,7 +369,7 @@ def _steps(duration: Given, config: Config) -> int:
 
 
 def _radius(beamwidth: float, config: Config) -> float:
-    """Find the piston that makes a beamwidth [deg]."""
+    """Return the radius of the piston with a beamwidth [deg]."""
     from pipistrelle.acoustics.emitter import piston_radius
 
     return float(
@@ -262,3 +379,65 @@ def _radius(beamwidth: float, config: Config) -> float:
             speed_of_sound=config.medium.sound_speed,
         )
     )
+
+
+def replayed(config: Config) -> Section:
+    """Select the settings that affect the solution of a log."""
+    kind = SlamConfig if config.bag == BagConfig() else BagSlamConfig
+    return kind(**{name: getattr(config, name) for name in kind.model_fields})
+
+
+def is_open(key: Key) -> bool:
+    """Return whether a setting may be given for a log: used, and not decided by it.
+
+    >>> is_open(("rays", "power")), is_open(("filter", "range_std")), is_open(("air", "spreading"))
+    (True, False, False)
+    """
+    return key[0] in BagSlamConfig.model_fields and key not in LOGGED | OF_WORLDS
+
+
+def check_open(flags: Layer) -> None:
+    """Raise if a setting is decided by the log or unused.
+
+    >>> check_open({("filter", "range_std"): Given(0.1, "filter__range_std")})
+    Traceback (most recent call last):
+    pipistrelle.config.InputError: filter__range_std: the log decides this; leave it out
+    """
+    for key, given in flags.items():
+        if not is_open(key):
+            why = "the log decides this" if key in LOGGED else "means nothing to a recorded log"
+            raise InputError(f"{given.where}: {why}; leave it out")
+
+
+def check_bag(flags: Layer, log: Path) -> None:
+    """Raise if a setting of ROS bags is given for another kind of log."""
+    given = [given for key, given in flags.items() if key[0] == "bag"]
+    reader = reader_of(log)
+    if given and reader.recognises(log) and not reader.configured:
+        raise InputError(f"{given[0].where}: means nothing to {reader.title}; leave it out")
+
+
+def with_log(layer: Layer, recorded: "Log", log: Path) -> tuple[Config, list[str]]:
+    """Resolve settings with the values that a log decides; return notes on overruled ones."""
+    decided: Layer = {key: Given(getattr(recorded, key[1]), f"{log}: {key[1]}") for key in LOGGED}
+    own = {key: Given(value, "slam") for key, value in OWN.items()}
+    for name, value in recorded.association.items():
+        own["association", name] = Given(value, f"{log}: association.{name}")
+    if recorded.gate is not None:
+        own[GATE_KEY] = Given(recorded.gate, str(log))
+    moves = any(caller.moves for caller in recorded.callers)
+    excess = any((scan.excess_path == scan.excess_path).any() for scan in recorded.scans)
+    own[TIMING] = Given(moves or excess, str(log))
+    if recorded.excess_path_std is not None:
+        own["filter", "excess_path_std"] = Given(
+            recorded.excess_path_std, f"{log}: excess_path_std"
+        )
+    if ("rays", "likelihood") in layer:  # it is a reading of the paper's rays
+        del own["rays", "spacing"]
+    wished, settled, notes = resolve(layer), resolve(laid(own, layer, decided)), []
+    for section, name in sorted(LOGGED & layer.keys()):
+        value = getattr(getattr(settled, section), name)
+        if getattr(getattr(wished, section), name) != value:
+            where = layer[section, name].where
+            notes.append(f"{where}: the log decides this, and says {value}")
+    return settled, notes

@@ -1,6 +1,5 @@
-"""Sound recordings for Python: heard into a log, and drawn."""
+"""`hear`: the echoes of a sound recording, as a log and as a figure."""
 
-import warnings
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from os.path import lexists
@@ -13,7 +12,6 @@ from pipistrelle.detection.sounds.check import Overview
 from pipistrelle.detection.sounds.description import FILE as ABOUT
 from pipistrelle.detection.sounds.description import Description, read_description
 from pipistrelle.detection.sounds.hearing import Frame, hear_recording, log_callers
-from pipistrelle.experiments.hearing.listening import Progress
 from pipistrelle.experiments.runs.truth_files import read_truth
 from pipistrelle.files import (
     LOG,
@@ -26,7 +24,13 @@ from pipistrelle.files import (
     remove_empty,
 )
 from pipistrelle.refusals import refusal
-from pipistrelle.scripting.arguments import folder_named, frames_named
+from pipistrelle.scripting.arguments import (
+    Progress,
+    folder_named,
+    frames_named,
+    keyword,
+    warn_caller,
+)
 from pipistrelle.settings import Key, Layer, from_keywords, resolve
 
 if TYPE_CHECKING:
@@ -34,12 +38,12 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 SECTIONS = ("detection", "matching")
-"""Settings that count where a recording is heard; the speed of sound that is assumed does, too."""
+"""Sections of settings that `hear` uses, besides ``assumed.speed_of_sound``."""
 TRUTH, MEASURED = ("truth.csv", "landmarks.csv"), "measurements.csv"
 
 
 def is_heard(key: Key) -> bool:
-    """Tell whether a setting counts where a recording is heard.
+    """Return whether `hear` uses a setting.
 
     >>> is_heard(("detection", "false_alarm")), is_heard(("rays", "power"))
     (True, False)
@@ -48,7 +52,7 @@ def is_heard(key: Key) -> bool:
 
 
 def heard_settings(layer: Layer) -> Config:
-    """Return settings with which a recording is heard; refuse those that mean nothing to it."""
+    """Resolve the settings of `hear`; raise for a setting that it does not use."""
     for key, given in layer.items():
         if not is_heard(key):
             raise InputError(f"{given.where}: means nothing to a sound recording; leave it out")
@@ -57,22 +61,22 @@ def heard_settings(layer: Layer) -> Config:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Heard:
-    """What `hear` returns: the echoes of a recording, and a figure of them."""
+    """Result of `hear`: the echoes of a recording, and their figure."""
 
     overview: Overview
-    """Of the first calls, for the figure."""
+    """Matched-filter output of the first calls, for the figure."""
     log: RowsHeard
-    """How many rows there are; what else a log of them says."""
+    """Number of rows, and the other contents of the log."""
     text: str | None
-    """The rows, where they are not kept in a folder."""
+    """The rows, unless they are kept in a folder."""
     odd: tuple[str, ...] = ()
-    """Why the echoes may be wrong, a line each."""
+    """Warnings, a line each."""
     folder: Path | None = None
-    """Where the log is kept, if anywhere."""
+    """Folder of the log, if it is kept."""
 
     @property
     def measurements(self) -> "pl.DataFrame":
-        """The rows of the log: time, caller, bearing, range or excess path, deviations, level."""
+        """Rows of the log: time, caller, bearing, range, excess path, their stds, level."""
         from io import StringIO
 
         import polars as pl
@@ -84,14 +88,14 @@ class Heard:
         return pl.read_csv(StringIO(text), infer_schema_length=None)
 
     def figure(self) -> "Figure":
-        """Draw the matched filter's output over the first calls, and what was taken for echoes."""
+        """Draw the matched-filter output of the first calls, with the detected echoes."""
         from pipistrelle.figures.sound import draw_hearing
 
         return draw_hearing(self.overview)
 
 
 def hear(
-    folder: Path | str,
+    recording: Path | str,
     /,
     *,
     frames: str | None = None,
@@ -100,21 +104,21 @@ def hear(
     progress: Progress | None = None,
     **settings: Any,
 ) -> Heard:
-    """Hear a sound recording into a log that `slam` solves, as `pipistrelle hear` does.
+    """Detect the echoes in a sound recording, as a log for `slam`, as `pipistrelle hear` does.
 
     Parameters
     ----------
-    folder : Path
-        Sound files, ``recording.toml``, ``array.csv`` and ``odometry.csv``, perhaps ``calls.csv``.
+    recording : Path
+        Folder with sound files, recording.toml, array.csv, odometry.csv, and perhaps calls.csv.
     frames : str, optional
-        "A:B": the calls from number A, counted from 0, to before B; all by default.
+        Calls of the vehicle: A:B is from number A, counted from 0, to before B.
     output : Path, optional
-        The log's folder; nothing is written without it.
+        Folder of the log.
     overwrite : bool
-        Whether an earlier log there may be replaced.
+        Replace an earlier log in it.
     progress : callable, optional
-        Called with what is done, how many calls of it are, and of how many.
-    settings
+        Called with the stage, the number of calls done, and their total.
+    **settings
         Of the sections detection and matching, and ``assumed__speed_of_sound``.
 
     Returns
@@ -124,8 +128,8 @@ def hear(
     Raises
     ------
     InputError
-        For what is no recording, with the file and the key, the line or the channel; where the
-        output cannot be had; for settings that mean nothing here.
+        For an error in the recording, with its file and key, line or channel; for an unusable
+        output or setting.
 
     Examples
     --------
@@ -135,18 +139,17 @@ def hear(
     pipistrelle.config.InputError: nowhere: found no such folder, expected a sound recording's;
     check the path
     """
-    place = folder_named(folder, "hear")
+    place = folder_named(recording, "hear")
     config = heard_settings(from_keywords(settings))
-    asked = place, config, frames, "frames", progress
     if output is None:
         parts: list[str] = []
-        heard = heard_of(*asked, parts.append, lambda: "".join(parts))
+        heard = _heard(place, config, frames, keyword, progress, parts.append)
+        heard = replace(heard, text="".join(parts))
     else:
         flags = ("output=", "overwrite=True")
         own = claim(folder_named(output, "output"), LOG, overwrite=overwrite, flags=flags)
-        heard = heard_into(own, *asked)
-    for line in heard.odd:
-        warnings.warn(f"{place}: {line}", stacklevel=2)
+        heard = heard_into(own, place, config, frames, keyword, progress)
+    warn_caller(*(f"{place}: {line}" for line in heard.odd))
     return heard
 
 
@@ -155,20 +158,20 @@ def heard_into(
     folder: Path,
     config: Config,
     frames: str | None,
-    where: str,
+    option: Callable[[str], str],
     progress: Progress | None,
 ) -> Heard:
-    """Hear a recording into a log's folder, row by row; write the figure, and truth that is there.
+    """Write the echoes of a recording, its figure and its truth into the folder of a log.
 
-    `where` its frames were given is said in refusals.
+    Rows are written one call at a time; `option` formats the name of an option for messages.
     """
     from pipistrelle.figures.style import save_figure
 
     made = make_folder(own.folder)
     rows = PiecesFile(own.folder / MEASURED)
     try:
-        heard = heard_of(
-            folder, config, frames, where, progress, lambda text: rows.write(text.encode())
+        heard = _heard(
+            folder, config, frames, option, progress, lambda text: rows.write(text.encode())
         )
         rows.close()
         figure = heard.figure()
@@ -185,42 +188,42 @@ def heard_into(
     return replace(heard, folder=own.folder)
 
 
-def heard_of(
+def _heard(
     folder: Path,
     config: Config,
     frames: str | None,
-    where: str,
+    option: Callable[[str], str],
     progress: Progress | None,
-    write: Callable[[str], None],
-    text: Callable[[], str | None] = lambda: None,
+    write: Callable[[str], object],
 ) -> Heard:
-    """Hear a recording; `write` is given the rows as text, and `text` returns them all."""
+    """Detect the echoes of a recording, and pass the rows of each call to `write` as text."""
     about = described(folder)
     overview = Overview(names=("vehicle", *(one.name for one in about.callers)))
     log = RowsHeard(folder, about.log, log_callers(about))
-    read_truth(folder, log.time)  # refuses odd truth, which is kept beside the log
+    read_truth(folder, log.time)  # raises for bad truth, which is copied to the log
     write(",".join(log.columns) + "\n")
 
     def look(frame: Frame) -> None:
         overview.look(frame)
         write(log.text(frame.scan))
 
-    odd = hear_recording(
-        folder, about, config, lambda count: frames_named(frames, count, where), look, progress
-    )
-    log.files()  # refuses a log without rows
-    return Heard(overview=overview, log=log, text=text(), odd=tuple(odd))
+    def chosen(count: int) -> range:
+        return frames_named(frames, count, option("frames"))
+
+    odd = hear_recording(folder, about, config, chosen, look, progress)
+    log.files()  # raises for a log without rows
+    return Heard(overview=overview, log=log, text=None, odd=tuple(odd))
 
 
 def faults_of(folder: Path, config: Config) -> list[str]:
-    """Return what is odd about a recording, a line each."""
+    """Return the faults of a recording, a line each."""
     from pipistrelle.detection.sounds.check import check_recording
 
     return check_recording(folder, described(folder), config)
 
 
 def described(folder: Path) -> Description:
-    """Return what a recording says of itself; refuse what is no folder."""
+    """Read the description of a recording; raise if it is not a folder of a recording."""
     if not folder.is_dir():
         found = "a file" if folder.exists() else "no such folder"
         raise refusal(folder, found, "a sound recording's", "check the path")

@@ -1,8 +1,9 @@
-"""A vehicle that drives now: a step and a scan at a time, as the robot has them."""
+"""`Slam`: online SLAM of a vehicle that drives now, by single steps and scans."""
 
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
+from math import inf, nan
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple, Self, TypeVar
 
@@ -11,10 +12,19 @@ from jaxtyping import Float, Int
 
 from pipistrelle.arithmetic.random_stream import stream_key
 from pipistrelle.config import Config, InputError
-from pipistrelle.detection.logs.recording import Log, scan_at
+from pipistrelle.detection.logs.recording import (
+    CALLER,
+    MAX_TIME,
+    STATED,
+    Log,
+    LogCaller,
+    scan_at,
+)
+from pipistrelle.detection.logs.text_tables import Table
 from pipistrelle.detection.logs.vehicle import ODOMETRY, read_vehicle, vehicle_of
 from pipistrelle.detection.logs.vehicle import Vehicle as VehicleKeys
 from pipistrelle.detection.noise import noise_of
+from pipistrelle.detection.scans import OWN
 from pipistrelle.estimation.association import KNOWN
 from pipistrelle.estimation.beliefs import Gaussian, Landmarks, answer, no_landmarks
 from pipistrelle.estimation.catalogue import ASSOCIATION, ESTIMATOR, class_of, entry, names_class
@@ -26,6 +36,7 @@ from pipistrelle.experiments.drives import NO_TRUTH, at_sensor, carried, vehicle
 from pipistrelle.experiments.named_settings import check_own, laid, over_named, own_config
 from pipistrelle.experiments.results.tables import landmark_table, path_table
 from pipistrelle.experiments.runs.replay import (
+    LABELS,
     check_calibrated,
     drive_of,
     with_noise,
@@ -33,20 +44,24 @@ from pipistrelle.experiments.runs.replay import (
 )
 from pipistrelle.experiments.runs.trial import with_moving
 from pipistrelle.experiments.runs.validate import check_filters
-from pipistrelle.refusals import refusal, shown
-from pipistrelle.scripting.arguments import Base, base_layer, folder_named, named_filters
-from pipistrelle.scripting.live_rows import (
-    check_clock,
-    check_now,
-    finite,
-    keys_of,
-    numbers,
-    table_of,
-    times_of,
+from pipistrelle.refusals import meant, refusal, shown
+from pipistrelle.scripting.arguments import (
+    TIMING,
+    Base,
+    base_layer,
+    check_open,
+    folder_named,
+    named_filters,
+    with_log,
 )
-from pipistrelle.scripting.log_settings import TIMING, check_open, with_log
-from pipistrelle.scripting.saved_records import check_going_on
-from pipistrelle.scripting.saved_state import DriveState, Named, not_saved, read_state, write_state
+from pipistrelle.scripting.saved_state import (
+    DriveState,
+    Named,
+    check_going_on,
+    not_saved,
+    read_state,
+    write_state,
+)
 from pipistrelle.settings import Given, from_keywords
 
 if TYPE_CHECKING:
@@ -55,18 +70,26 @@ if TYPE_CHECKING:
 Vehicle = Path | str | Mapping[str, Any]
 """A ``log.toml``, or its keys."""
 OF_ITSELF = {"format": 1, "initial_pose": [0.0, 0.0, 0.0], "initial_pose_std": [0.0, 0.0, 0.0]}
-"""Keys that a table need not have: the frame begins where the vehicle stands."""
+"""Defaults of keys that a table may omit: the frame begins at the vehicle."""
 KEPT = 100_000
-"""Of how many of the last steps the poses are kept."""
+"""Number of last steps with kept poses."""
 ROUNDING = float(np.finfo(float).eps) ** 0.5
 """Half of the digits of a number."""
 OWN_WORDS = ("filter", "config", "time", "kept")
-"""Keywords that are no settings."""
+"""Keywords that are not settings."""
+SAME_TIME = 1e-6
+"""Largest difference between the times of a scan and of the vehicle [s]."""
+COLUMNS = ("landmark", "bearing", "range", CALLER, *STATED)
+"""Columns of a scan."""
+_NO_NUMBERS = (str, bytes, bool, np.bool_, complex, np.complexfloating)
+"""Types that NumPy converts to numbers, but that are errors here."""
+Times = tuple[Float[np.ndarray, " k"], Float[np.ndarray, " k"]]
+"""Ends of steps, and their lengths [s]."""
 R = TypeVar("R")
 
 
 class Pose(NamedTuple):
-    """Where the vehicle is."""
+    """Pose of the vehicle at a time."""
 
     time: float
     """[s]."""
@@ -77,36 +100,36 @@ class Pose(NamedTuple):
     heading: float
     """From the x axis, counter-clockwise [rad]."""
     covariance: Float[np.ndarray, "3 3"]
-    """Of x, y and heading [m, m, rad]."""
+    """Covariance of x, y and heading [m, m, rad]."""
 
 
 class Slam:
-    """Position and map of a vehicle that drives now.
+    """Pose and map of a vehicle that drives now.
 
-    What is refused changes nothing, and what `pipistrelle slam` would find of the same steps and
-    rows is found to the bit: both conduct a `Session`.
+    The results are bit-identical to `pipistrelle slam` with the same steps and rows. A call that
+    raises an error changes nothing.
 
     Parameters
     ----------
     vehicle : Path or mapping
-        How it moves and how surely it measures: a ``log.toml``, or a table of its keys, of which
-        ``format``, ``initial_pose`` and ``initial_pose_std`` may be left out.
+        Motion and measurement noise: a ``log.toml``, or a table of its keys, in which ``format``,
+        ``initial_pose`` and ``initial_pose_std`` are optional.
     filter : str or class
-        An estimator by its name, ``module:Class`` or its class. The EKFs need bounded time and
-        memory; the smoother's history grows with the drive unless ``filter__window`` bounds it.
+        Estimator by name, ``module:Class`` or class. Time and memory of the EKFs are bounded; the
+        history of the smoother grows unless ``filter__window`` bounds it.
     config : Config, mapping, name, or path of a TOML file, optional
         Settings to start from.
     time : float [s]
-        Of the start.
+        Time of the start.
     kept : int
-        Of how many of the last steps the poses are kept, for `path`.
+        Number of last steps in `path`.
     **settings
-        As of `pipistrelle.slam`.
+        As in `pipistrelle.slam`.
 
     Raises
     ------
     InputError
-        For a vehicle, an estimator or a setting that cannot be had.
+        For a bad vehicle, estimator or setting.
 
     Examples
     --------
@@ -129,7 +152,7 @@ class Slam:
         vehicle: Vehicle,
         /,
         *,
-        filter: str | type = "iekf",  # noqa: A002 - as the command line has it
+        filter: str | type = "iekf",  # noqa: A002 - the name of the option
         config: Base = None,
         time: float = 0.0,
         kept: int = KEPT,
@@ -151,7 +174,7 @@ class Slam:
         self._begin(log, told, own_config(resolved, names[0]), names[0], kept)
 
     def _begin(self, log: Log, told: VehicleKeys, config: Config, name: str, kept: int) -> None:
-        """Build the estimator, at the start."""
+        """Build the estimator at the start of the drive."""
         self._log, self._vehicle, self._config = log, told, config
         self._name, self._kept = name, kept
         drive = drive_of(log, NO_TRUTH)
@@ -175,12 +198,12 @@ class Slam:
 
     @property
     def time(self) -> float:
-        """Where the last step ended [s]."""
+        """Time at the end of the last step [s]."""
         return self._time
 
     @property
     def pose(self) -> Pose:
-        """Where the vehicle is, as it is believed now."""
+        """Estimated pose of the vehicle, now."""
         pose = self._at_vehicle(self._session.belief.pose())
         values, axes = np.linalg.eigh(pose.covariance)
         covariance = pose.covariance if values[0] >= 0.0 else (axes * values.clip(0.0)) @ axes.T
@@ -189,27 +212,27 @@ class Slam:
 
     @property
     def map(self) -> "pl.DataFrame":
-        """The landmarks, a row for each hypothesis, as ``landmarks.parquet`` has them."""
+        """Landmarks, a row for each hypothesis, with the columns of ``landmarks.parquet``."""
         return _map_table(self._session.landmarks())
 
     @property
     def moving(self) -> "pl.DataFrame":
-        """The callers that move, as `map` has landmarks."""
+        """Moving callers, with the columns of `map`."""
         return _map_table(answer(self._session.belief, "moving") or no_landmarks())
 
     @property
     def path(self) -> "pl.DataFrame":
-        """The start and the end of each step: time, pose and standard deviations.
+        """Time, pose and standard deviations at the start and after each step.
 
-        As the estimator believes them now, of one that revises its path; else as they were believed
-        at their time, the last of them that are kept.
+        The smoothed trajectory, if the estimator revises it; else the kept estimates.
         """
         time, online = self._online()
         revised = answer(self._session.belief, "path")
         if revised is None:
             return path_table(time, online)
-        whole, kept = self._at_vehicle(revised), slice(-time.size, None)
-        return path_table(time, Gaussian(mean=whole.mean[kept], covariance=whole.covariance[kept]))
+        smoothed, kept = self._at_vehicle(revised), slice(-time.size, None)
+        poses = Gaussian(mean=smoothed.mean[kept], covariance=smoothed.covariance[kept])
+        return path_table(time, poses)
 
     def move(
         self,
@@ -218,28 +241,28 @@ class Slam:
         *,
         time: float | Sequence[float] | None = None,
     ) -> None:
-        """Take in one step, or k of them.
+        """Predict by one step of odometry, or by k steps.
 
         Parameters
         ----------
         controls : (c) or (k, c)
-            Velocity [m/s] and angular rate [rad/s], speed and steering angle [rad], or the motion
-            ahead, to the left [m] and turned [rad], as the vehicle's motion model has them.
+            By the motion model of the vehicle: velocity [m/s] and angular rate [rad/s]; speed and
+            steering angle [rad]; or displacement ahead, to the left [m] and rotation [rad].
         dt : float or (k) [s], optional
-            How long each took.
+            Length of each step.
         time : float or (k) [s], optional
-            When each ended, in place of `dt`.
+            End of each step, in place of `dt`.
 
         Raises
         ------
         InputError
-            For controls or times that cannot be; nothing has changed then.
+            For bad controls or times; nothing has changed then.
         """
         ends, lengths = times_of(dt, time, self._time)
         steps = np.atleast_2d(numbers(controls, "controls"))
         try:
             steps, lengths = usable_controls(self._drive.motion, steps, lengths)
-        except InputError as error:  # it names the estimator's method
+        except InputError as error:  # names the method of the estimator
             raise InputError(str(error).replace("predict:", "move:", 1)) from None
         if not lengths.size:
             return
@@ -256,32 +279,32 @@ class Slam:
         self._time, self._heard = float(ends[-1]), set()
 
     def hear(self, *, time: float | None = None, **columns: Any) -> Int[np.ndarray, " m"]:
-        """Take in the rows of a scan, heard where the vehicle is now.
+        """Update with the rows of a scan, measured at the present pose.
 
         Parameters
         ----------
         time : float [s], optional
-            Checked: that of the vehicle.
+            Time of the scan, which must be that of the vehicle.
         bearing : (m) [rad]
-            From the heading, counter-clockwise; NaN or None where a row is an excess path alone.
+            From the heading, counter-clockwise; NaN or None in rows with only an excess path.
         landmark : (m), optional
-            Labels; without them an association decides (``association__method``).
+            Labels; without them they are associated by ``association__method``.
         range, excess_path : (m) [m], optional
-            NaN or None where there is none.
+            NaN or None in rows without.
         caller : (m) of str, optional
-            Whose call it was, by the vehicle's callers; None of its own.
+            Name of the caller; None for the vehicle itself.
         bearing_std, range_std, excess_path_std : (m) [rad], [m], [m], optional
-            In place of the vehicle's.
+            Standard deviations, in place of the general ones of the vehicle.
 
         Returns
         -------
         (m)
-            The label of each row, as known or decided; -1 where it is of none.
+            The known or associated label of each row; -1 for clutter.
 
         Raises
         ------
         InputError
-            For rows that cannot be, or were heard already; nothing has changed then.
+            For bad rows, or rows used before; nothing has changed then.
         """
         check_now(time, self._time)
         known = self._config.association.method == KNOWN
@@ -307,9 +330,9 @@ class Slam:
         return labels
 
     def save(self, file: Path | str) -> Path:
-        """Write all that is known into a file, for `load`.
+        """Write the vehicle, the settings and the estimates into a file for `load`.
 
-        A file in its place is replaced where `save` wrote it, and refused where it did not.
+        An existing file is replaced only if `save` wrote it.
         """
         path = folder_named(file, "file")
         times, online = self._online()
@@ -334,24 +357,23 @@ class Slam:
         cls,
         file: Path | str,
         *,
-        filter: str | type | None = None,  # noqa: A002 - as `Slam` has it
+        filter: str | type | None = None,  # noqa: A002 - the name of the option
         association__method: str | None = None,
     ) -> Self:
-        """Go on from what `save` wrote, to the bit.
+        """Restore a drive from a file of `save`; it continues with the same bits.
 
         Parameters
         ----------
         file : Path
         filter : str or class, optional
-            The estimator that it was saved with, where that is one of your own: no module is
-            imported because a file names it.
+            The estimator of the file, if it is one of your own: a file alone imports no module.
         association__method : str, optional
-            The association, ``module:Class``, where that is one of your own.
+            The association of the file, ``module:Class``, if it is one of your own.
 
         Raises
         ------
         InputError
-            For a file that `save` of this version did not write, or that has changed since.
+            For a file of another version or program, or a changed file.
         """
         path = folder_named(file, "file")
         named = None if filter is None else named_filters(filter, "filter")[0]
@@ -365,12 +387,12 @@ class Slam:
             slam._go_on_from(names, state)
         except InputError:
             raise
-        except Exception as error:  # of a file that somebody made, and summed
+        except Exception as error:  # a forged file with a right checksum
             raise not_saved(path, error) from None
         return slam
 
     def _go_on_from(self, named: Named, state: DriveState) -> None:
-        """Know what a file of `save` holds."""
+        """Restore the contents of a file of `save`."""
         config = Config.model_validate(state.settings)
         belief, method = state.session.belief, config.association.method
         particles = isinstance(belief, FastSlamBelief) and belief.log_weight.size
@@ -387,12 +409,12 @@ class Slam:
         check_clock(state.times)
         now = self._session.belief.pose()
         variances = np.diagonal(state.covariances, axis1=1, axis2=2)
-        for known in (now.mean, now.covariance, state.means, state.covariances, np.sqrt(variances)):
-            if not np.isfinite(known).all():
+        for array in (now.mean, now.covariance, state.means, state.covariances, np.sqrt(variances)):
+            if not np.isfinite(array).all():
                 raise ValueError("a pose that is no number")
 
     def copy(self) -> Self:
-        """Return another that goes on from here by itself, to the same bits."""
+        """Return an independent copy, which continues with the same bits."""
         other = type(self).__new__(type(self))
         other._begin(self._log, self._vehicle, self._config, self._name, self._kept)
         other._session.go_on_from(self._session.state())
@@ -400,7 +422,7 @@ class Slam:
         return other
 
     def __repr__(self) -> str:
-        """Say where the vehicle is."""
+        """Format the estimator, the pose and the number of landmarks."""
         pose, landmarks = self.pose, self._session.landmarks().landmark
         return (
             f"Slam by {self._name} at {pose.time:g} s: x {pose.x:.3f} m, y {pose.y:.3f} m, heading "
@@ -408,14 +430,14 @@ class Slam:
         )
 
     def _online(self) -> tuple[Float[np.ndarray, " k"], Gaussian]:
-        """Return the times that are kept, and the poses as they were believed at their time."""
+        """Return the kept times, and the pose estimate of each time."""
         times, poses = zip(*self._poses, strict=True)
         mean = np.array([pose.mean for pose in poses])
         covariance = np.array([pose.covariance for pose in poses])
         return np.array(times), Gaussian(mean=mean, covariance=covariance)
 
     def _change(self, act: Callable[[], R]) -> R:
-        """Let the session do something; where that fails, it is as it was."""
+        """Call a function that changes the session; restore the session if it raises."""
         before = self._session.state()
         try:
             result = act()
@@ -428,27 +450,27 @@ class Slam:
             raise
 
     def _at_vehicle(self, pose: Gaussian) -> Gaussian:
-        """Return where the vehicle is, by where its sensor is."""
+        """Convert a pose of the sensor to the pose of the vehicle."""
         sensor = self._drive.sensor
         return carried(pose, vehicle_in(sensor)) if any(sensor) else pose
 
     def _at_sensor(
         self, steps: Float[np.ndarray, "k c"], ends: Float[np.ndarray, " k"]
     ) -> Float[np.ndarray, "k c"]:
-        """Return the steps of the sensor, by those of its vehicle."""
+        """Convert steps of the vehicle to steps of its sensor."""
         time = np.array([self._time, *ends])
         return at_sensor(replace(self._drive, time=time, controls=steps)).controls
 
 
 def _fault(pose: Gaussian) -> tuple[str, str] | None:
-    """Return how a pose is wrong, and what is expected; None where it is sound.
+    """Return the fault of a pose and the expected state; None for a valid pose.
 
-    Rounding makes an eigenvalue of 0 slightly negative; half of the digits are more than rounding.
+    Rounding makes an eigenvalue of 0 slightly negative, by less than half of the digits.
     """
     if not (np.isfinite(pose.mean).all() and np.isfinite(pose.covariance).all()):
         return "a pose that is no number", "a finite one"
     with suppress(np.linalg.LinAlgError):
-        np.linalg.cholesky(pose.covariance)  # sooner than the eigenvalues
+        np.linalg.cholesky(pose.covariance)  # faster than the eigenvalues
         return None
     least, *_, largest = np.linalg.eigvalsh(pose.covariance).tolist()
     if least < -ROUNDING * largest:
@@ -457,7 +479,7 @@ def _fault(pose: Gaussian) -> tuple[str, str] | None:
 
 
 def _log_of(vehicle: Vehicle, time: float) -> tuple[Log, Path, VehicleKeys]:
-    """Return a log of a vehicle that has not moved, where its keys are from, and the keys."""
+    """Return an empty log of a vehicle, the place of its keys, and the keys."""
     if isinstance(vehicle, Mapping):
         where, former = Path("vehicle"), ()
         told = vehicle_of(OF_ITSELF | dict(vehicle), where)
@@ -474,5 +496,113 @@ def _log_of(vehicle: Vehicle, time: float) -> tuple[Log, Path, VehicleKeys]:
 
 
 def _map_table(landmarks: Landmarks) -> "pl.DataFrame":
-    """Lay out a map without its truth."""
+    """Return the table of a map without true positions."""
     return landmark_table(landmarks, None).drop("true_x_m", "true_y_m", "error_m", "true_landmark")
+
+
+def numbers(values: object, where: str) -> Float[np.ndarray, "*n"]:
+    """Convert values to an array of numbers, None and masked values to NaN; else raise.
+
+    >>> numbers([1, None], "range")
+    array([ 1., nan])
+    """
+    try:
+        given = np.asarray(values)
+        if isinstance(values, np.ma.MaskedArray):
+            given = given.astype(object)
+            given[np.ma.getmaskarray(values)] = None
+        if given.dtype.kind not in "iuf":
+            if given.dtype.kind != "O" or any(isinstance(v, _NO_NUMBERS) for v in given.flat):
+                raise TypeError
+            given = np.array(given, dtype=float)
+    except (TypeError, ValueError, OverflowError):
+        raise refusal(where, shown(values), "numbers", "correct it") from None
+    return given.astype(float)
+
+
+def finite(value: object, where: str) -> float:
+    """Convert a value to a finite number, or raise."""
+    number = numbers(value, where)
+    if number.shape != () or not np.isfinite(number):
+        raise refusal(where, shown(value), "a finite number", "correct it")
+    return float(number)
+
+
+def times_of(dt: object, time: object, now: float) -> Times:
+    """Return the ends and lengths of steps, given either."""
+    if (dt is None) == (time is None):
+        found = "neither dt nor time" if dt is None else "both dt and time"
+        fix = "say how long the step took, or when it ended"
+        raise refusal("move", found, "one of them", fix)
+    if time is None:
+        lengths = np.atleast_1d(numbers(dt, "dt"))
+        return now + np.cumsum(lengths), lengths
+    ends = np.atleast_1d(numbers(time, "time"))
+    if ends.ndim > 1:
+        raise refusal("move", f"times of the shape {ends.shape}", "one for each step", "correct it")
+    lengths = np.diff(ends, prepend=now)
+    late = np.flatnonzero(~(lengths > 0.0))
+    if late.size:
+        k = int(late[0])
+        before = f"{ends[k - 1].item()} s" if k else f"{now} s, where the vehicle is"
+        found = f"the time {ends[k].item()} s"
+        raise refusal("move", found, f"one after {before}", "leave out steps that come late")
+    return ends, lengths
+
+
+def check_clock(ends: Float[np.ndarray, " k"], now: float = -inf) -> None:
+    """Raise for times beyond `MAX_TIME`, or too close for floats after `now` [s]."""
+    if (far := np.abs(ends) > MAX_TIME).any():
+        found = f"the time {ends[far][0].item()} s"
+        raise refusal("time", found, f"seconds, up to {MAX_TIME:g}", "take another zero or unit")
+    if not (np.diff(ends, prepend=now) > 0.0).all():
+        found, expected = f"a step too short for a clock at {now} s", "a later time at its end"
+        raise refusal("move", found, expected, "join it with the next, or take another zero")
+
+
+def check_now(time: object, now: float) -> None:
+    """Raise if a scan is not at the time of the vehicle."""
+    if time is None or abs((stamp := finite(time, "time")) - now) <= SAME_TIME:
+        return
+    late = "the vehicle has moved on: leave out scans that come late"
+    fix = "move to it first, by a part of a step if need be" if stamp > now else late
+    raise refusal("hear", f"the time {stamp} s", f"{now} s, where the vehicle is", fix)
+
+
+def table_of(columns: Mapping[str, Any], callers: Sequence[LogCaller], *, labelled: bool) -> Table:
+    """Convert the columns of a scan to a table of a log; raise for missing labels if needed."""
+    if unknown := sorted(columns.keys() - {*COLUMNS}):
+        near = meant(unknown[0], COLUMNS)
+        fix = f"did you mean {near!r}?" if near else "leave it out"
+        raise refusal("hear", repr(unknown[0]), f"some of {', '.join(COLUMNS)}", fix)
+    given = {name: values for name, values in columns.items() if values is not None}
+    if labelled and "landmark" not in given:
+        raise refusal("hear", "no landmark", LABELS, 'give association__method="marginal"')
+    if CALLER in given:
+        given[CALLER] = _numbers_of(given[CALLER], [caller.name for caller in callers])
+    column = {name: np.atleast_1d(numbers(values, name)) for name, values in given.items()}
+    shapes = {name: values.shape for name, values in column.items()}
+    if len({*shapes.values()}) > 1 or any(len(shape) > 1 for shape in shapes.values()):
+        raise refusal("hear", f"columns of the shapes {shapes}", "one row each", "correct them")
+    (size,) = next(iter(shapes.values()), (0,))
+    column = {name: column.get(name, np.full(size, nan)) for name in COLUMNS}
+    return Table(path="hear", line=np.arange(1, size + 1), unit="row", column=column)
+
+
+def keys_of(table: Table) -> set[tuple[float, ...]]:
+    """Return the identities of simultaneous rows: label and caller, or all measured numbers."""
+    names = ("landmark", CALLER, "bearing", "range", "excess_path")
+    columns = (np.nan_to_num(table.column[name], nan=-1.0).tolist() for name in names)
+    return {row[:2] if row[0] >= 0 else row for row in zip(*columns, strict=True)}
+
+
+def _numbers_of(names: Any, known: Sequence[str]) -> list[float]:
+    """Convert the names of callers to numbers, None (the vehicle) to NaN."""
+    whole = [names] if names is None or isinstance(names, str) else names
+    places = {None: nan, "": nan} | {name: float(n) for n, name in enumerate(known, start=OWN + 1)}
+    try:
+        return [places[name] for name in whole]
+    except (KeyError, TypeError):
+        found = shown(names)
+        expected = " or ".join([*map(repr, known), "None, the vehicle itself"])
+        raise refusal("hear, caller", found, expected, "say the vehicle's callers") from None

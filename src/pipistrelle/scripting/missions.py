@@ -1,39 +1,62 @@
-"""Missions as they were asked for: simulated or solved from a log, then drawn, filmed, kept."""
+"""Missions: simulated or solved from a log; drawn, filmed, kept, and written as logs or sound."""
 
+import tomllib
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from functools import partial
 from math import inf, radians
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
+from pipistrelle.acoustics.paths import moves
 from pipistrelle.config import Config, InputError, Strategy
+from pipistrelle.detection.logs.folder import log_files
 from pipistrelle.detection.logs.readers import Robot
+from pipistrelle.detection.logs.recording import Log, LogCaller
+from pipistrelle.detection.noise import unstated
+from pipistrelle.detection.scans import Scan
+from pipistrelle.estimation.association import KNOWN
 from pipistrelle.estimation.catalogue import short_name
+from pipistrelle.experiments.drives import split_at
 from pipistrelle.experiments.hearing.listening import Keep, Progress
-from pipistrelle.experiments.hearing.scenario import ALL_DRAWN, World
-from pipistrelle.experiments.hearing.world_folder import kept_world
-from pipistrelle.experiments.named_settings import check_own, laid, of_estimators
+from pipistrelle.experiments.hearing.scenario import ALL_DRAWN, World, caller_labels
+from pipistrelle.experiments.hearing.sound_recorder import SoundRecorder
+from pipistrelle.experiments.hearing.world_folder import kept_world, world_files
+from pipistrelle.experiments.machine import check_memory
+from pipistrelle.experiments.named_settings import (
+    check_own,
+    each_its_own,
+    laid,
+    of_estimators,
+    own_config,
+)
 from pipistrelle.experiments.results.scores import TrialResult, is_placed
 from pipistrelle.experiments.results.writing import write_results
 from pipistrelle.experiments.runs.heard_world import Mission
 from pipistrelle.experiments.runs.replay import load, replay
 from pipistrelle.experiments.runs.rerun import log_entry
 from pipistrelle.experiments.runs.trial import Watch, run_mission
-from pipistrelle.experiments.runs.validate import warnings_of
-from pipistrelle.files import OwnFiles
-from pipistrelle.scripting.arguments import number, short_names
-from pipistrelle.scripting.log_settings import (
+from pipistrelle.experiments.runs.truth_files import truth_files
+from pipistrelle.experiments.runs.validate import checked_scenario, warnings_of
+from pipistrelle.files import LOG, SOUND, WORLD, Kind, OwnFiles, claim, without_links
+from pipistrelle.scripting.arguments import (
+    Door,
     check_bag,
     check_open,
-    check_room,
-    fit_warnings,
-    log_warnings,
-    nis_warning,
+    frames_named,
+    number,
     replayed,
     with_log,
 )
-from pipistrelle.settings import Given, Layer, resolve
+from pipistrelle.scripting.log_warnings import (
+    fit_warnings,
+    labels_of,
+    log_warnings,
+    nis_warning,
+)
+from pipistrelle.settings import Layer, resolve
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -42,11 +65,11 @@ if TYPE_CHECKING:
 
 
 MAX_TIMES_BOUND = 4.0
-"""Ratio of position error to bound above which a warning is given."""
+"""Largest ratio of position error to bound without a warning."""
 ROUNDING = 1e-9
-"""Position error that comes of arithmetic and gives no warning where the bound is 0 [m]."""
+"""Position error by rounding, which gives no warning where the bound is 0 [m]."""
 Conduct = Callable[..., Mission]
-"""Does a mission, given `progress` and `watch`; the same settings give the same bits."""
+"""Conducts a mission, given `progress` and `watch`; repeated calls give the same bits."""
 
 
 def simulated(
@@ -59,7 +82,7 @@ def simulated(
     progress: Progress | None = None,
     watch: Watch | None = None,
 ) -> Mission:
-    """Drive through a world by sound and map it, with notes on what looks odd (`run_mission`)."""
+    """Simulate a drive and map it by `run_mission`; add warnings to the mission."""
     config = of_estimators(config, filters)
     mission = run_mission(
         config,
@@ -82,7 +105,7 @@ def simulated(
 
 
 def _far_off(trials: Sequence[TrialResult]) -> list[str]:
-    """Warn of estimates whose position error is many times the bound."""
+    """Return a warning for each estimate with a position error of many times the bound."""
     pairs = [
         (trial, trial.scores.position_rmse_m, trial.scores.position_bound_m) for trial in trials
     ]
@@ -99,35 +122,33 @@ def _far_off(trials: Sequence[TrialResult]) -> list[str]:
 
 def prepare_slam(
     place: Path,
-    layers: tuple[Layer, Layer, Layer],
+    layer: Layer,
+    given: Layer,
     robot: Robot | None,
     strategies: Sequence[Strategy],
     filters: Sequence[str],
-    beamwidth: Given,
+    door: Door,
 ) -> tuple[Conduct, list[str], list[str]]:
-    """Read a recorded log and settle what it decides.
+    """Read a recorded log and resolve its settings, `layer` overridden by `given`.
 
-    Returns what solves it, lines on what its reader chose, and warnings.
-
-    The layers are the settings beneath, those by their own names, and those by short names; ranges
-    outside the beamwidth [deg] about the heading are hidden, where it is not None.
+    Returns the function that solves it, notes of its reader, and warnings. Ranges outside the
+    `beamwidth` [deg] of the door about the heading are hidden.
     """
-    beneath, flags, short = layers
-    check_open(flags)
-    given = flags | short_names(short, flags)
-    layer = laid(beneath, given)
+    check_open(door.flags)
+    layer = laid(layer, given)
     check_own(layer)
-    asked = resolve(layer)
-    if beamwidth.value is not None and not 0 < number(beamwidth) <= 360:
+    bag, width = resolve(layer).bag, door.given("beamwidth")
+    if width.value is not None and not 0 < number(width) <= 360:
         raise InputError(
-            f"{beamwidth.where}: found {beamwidth.value:g}, expected above 0 and up to 360 [deg]"
+            f"{width.where}: found {width.value:g}, expected above 0 and up to 360 [deg]"
         )
     check_bag(given, place)
-    recorded, truth = load(place, robot, bag=asked.bag)
+    recorded, truth = load(place, robot, bag=bag)
     config, overruled = with_log(layer, recorded, place)
     config = of_estimators(config, filters)
-    check_room(recorded, filters, config)
-    beam = None if beamwidth.value is None else radians(beamwidth.value)
+    for own, names in each_its_own(config, filters):
+        check_memory(names, len(labels_of(recorded)), own, passive=True)
+    beam = None if width.value is None else radians(width.value)
 
     def conduct(*, progress: Progress | None = None, watch: Watch | None = None) -> Mission:
         asked = (strategies, filters, beam, config)
@@ -140,7 +161,7 @@ def prepare_slam(
 
 
 def failures(mission: Mission) -> list[str]:
-    """Return a line for each estimate that failed, or whose path is not finite."""
+    """Return a line for each estimate that failed or has a path that is not finite."""
     return [
         f"{trial.strategy} {trial.filter} failed: {trial.error or 'its path is not finite'}"
         for trial in mission.trials
@@ -149,7 +170,7 @@ def failures(mission: Mission) -> list[str]:
 
 
 def strategy_names(mission: Mission) -> dict[str, str]:
-    """Return headings for strategies: a log that is solved by fused sensing only gives all rows."""
+    """Return headings for strategies: "all rows" if a log is solved only by fused sensing."""
     alone = mission.log is not None and {trial.strategy for trial in mission.trials} == {"fused"}
     return {"fused": "all rows"} if alone else {}
 
@@ -168,7 +189,7 @@ def drawn(mission: Mission) -> "Figure":
 
 
 def filmed(mission: Mission, watch: "MissionRecorder", path: Path) -> None:
-    """Film a mission that a recorder has watched into a .gif or .mp4 file."""
+    """Animate the recorded snapshots of a mission in a .gif or .mp4 file."""
     from pipistrelle.figures.film import animate_mission
 
     animate_mission(
@@ -181,17 +202,22 @@ def filmed(mission: Mission, watch: "MissionRecorder", path: Path) -> None:
 
 
 def caller_names(mission: Mission) -> tuple[str, ...]:
-    """Return the names of the callers besides the vehicle, as measurements name them."""
+    """Return the names of the callers other than the vehicle."""
     callers = mission.callers if mission.log is None else mission.log.callers
     return tuple(caller.name for caller in callers)
 
 
 def keep(
-    mission: Mission, own: OwnFiles, command: str, more: Callable[[Path], None] = lambda _: None
+    mission: Mission,
+    own: OwnFiles,
+    command: str,
+    *,
+    film: Callable[[Path], None] = lambda _: None,
+    save_bag: bool = False,
 ) -> None:
     """Write a mission into its folder, in place of earlier results.
 
-    The command is for the reader; `more` is given a folder to put other pictures into.
+    `command` is recorded for the reader; `film` may write into the folder that it is given.
     """
     from pipistrelle.figures.style import save_figure
 
@@ -205,7 +231,11 @@ def keep(
 
     def draw(room: Path) -> None:
         save_figure(figure, room, "mission")
-        more(room)
+        film(room)
+        if save_bag:
+            from pipistrelle.experiments.results.ros import BAG, told_of, write_bag
+
+            write_bag(room / BAG, [*told_of(mission.trials)])
 
     write_results(
         own,
@@ -220,4 +250,141 @@ def keep(
         beside=files,
         log=mission.source,
         draw=draw,
+    )
+
+
+class Recordings:
+    """Writer of the log, the world and the sound of a simulated mission into folders.
+
+    The folders are claimed, and the size of the sound is checked, before the mission begins.
+    """
+
+    def __init__(self, config: Config, world: World | None, door: Door) -> None:
+        self._config, self._world = config, world
+        self._check_apart(door)
+        self._log = self._claimed("save_log", LOG, door)
+        self._drawn = self._claimed("save_world", WORLD, door)
+        self.sound: SoundRecorder | None = None
+        frames, own = door.asked["frames"], self._claimed("save_sound", SOUND, door)
+        if own is None:
+            if frames is not None:
+                sound = door.option("save_sound")
+                raise InputError(
+                    f"{door.option('frames')}: found {frames}, which is of {sound}; add it"
+                )
+            return
+        count = config.scenario.steps // config.scenario.steps_per_frame
+        chosen = frames_named(frames, count, door.option("frames"))
+        bits = int(door.asked["sound_bits"])
+        self.sound = SoundRecorder(own=own, config=config, frames=chosen, bits=bits)
+        self.sound.check_room()
+        door.note(
+            f"{own.folder}: {len(chosen)} frames of {self.sound.channels} channels, "
+            f"{self.sound.size / 1e9:.3g} GB"
+        )
+
+    @staticmethod
+    def _check_apart(door: Door) -> None:
+        """Raise if two options name the same folder."""
+        seen: dict[Path, str] = {}
+        for name in ("output", "save_log", "save_world", "save_sound"):
+            folder, option = door.folder(name), door.option(name)
+            if folder and (other := seen.setdefault(without_links(folder), option)) != option:
+                raise InputError(f"{option}: {folder} is that of {other}; name another")
+
+    @staticmethod
+    def _claimed(name: str, kind: Kind, door: Door) -> OwnFiles | None:
+        """Claim the folder of an option, if it is given."""
+        folder = door.folder(name)
+        if folder is None:
+            return None
+        return claim(folder, kind, overwrite=door.asked["overwrite"], flags=door.ways_out(name))
+
+    def conduct(self, mission_of: Conduct, **watched: Any) -> Mission:
+        """Conduct a mission and write its sound meanwhile."""
+        if (sound := self.sound) is None:
+            return mission_of(**watched)
+        sound.begin(checked_scenario(self._config, world=self._world or ALL_DRAWN))
+        mission = mission_of(keep=sound.keep, **watched)
+        return replace(mission, notes=lambda: (*mission.notes(), *sound.notes()))
+
+    def write(self, mission: Mission) -> None:
+        """Write the folders of a mission that has ended."""
+        if self._drawn is not None:
+            assert mission.scenario is not None
+            self._drawn.replace(world_files(mission.scenario, self._config))
+        if self._log is not None:
+            self._log.replace(files_of_log(mission))
+        if self.sound is not None:
+            self.sound.own.replace(_sound_files(mission, self.sound))
+
+    def close(self) -> None:
+        """Discard the sound that is not yet written as a whole."""
+        if self.sound is not None:
+            self.sound.discard()
+
+
+def files_of_log(mission: Mission) -> dict[str, str]:
+    """Return the measurements of a simulated mission as a log, with the truth.
+
+    They are the fused ones, if that strategy was sensed. If the settings of the filters differ, a
+    filter with known labels, excess paths and standard deviations per row is preferred, since
+    `slam` can discard each of these; the first name decides among equals.
+    """
+
+    def rank(trial: TrialResult) -> tuple[bool, bool, bool, str]:
+        own = own_config(mission.config, trial.filter)
+        unlabelled = own.association.method != KNOWN
+        return unlabelled, not own.listening.timing, own.filter.noise == "constant", trial.filter
+
+    strategies = [trial.strategy for trial in mission.trials]
+    chosen = "fused" if "fused" in strategies else strategies[-1]
+    trial = min((t for t in mission.trials if t.strategy == chosen), key=rank)
+    return truth_files(mission.drive.truth) | log_files(_log(mission, trial, trial.heard))
+
+
+def _sound_files(mission: Mission, sound: SoundRecorder) -> dict[str, Any]:
+    """Return the files of a recording: the sound, its description, odometry and truth."""
+    log = log_files(_log(mission, mission.trials[-1], ()))
+    about = tomllib.loads(log["log.toml"])
+    kept = {name: value for name, value in about.items() if name not in ("format", "callers")}
+    assert mission.scenario is not None
+    files = sound.files(mission.scenario, kept)
+    last = {"recording.toml": files.pop("recording.toml")}
+    return truth_files(mission.drive.truth) | {"odometry.csv": log["odometry.csv"]} | files | last
+
+
+def _log(mission: Mission, trial: TrialResult, scans: Sequence[Scan]) -> Log:
+    """Return a simulated mission as a recorded log, by the settings of a trial's filter."""
+    config = own_config(mission.config, trial.filter)
+    drive, _ = split_at(mission.drive, [scan.time for scan in scans])
+    timing = config.listening.timing
+    if config.filter.noise == "constant":  # log.toml has the standard deviations
+        scans = list(map(unstated, scans))
+    world = mission.scenario
+    assert world is not None
+    labelled = zip(world.callers[1:], caller_labels(world)[1:].tolist(), strict=True)
+    callers = tuple(
+        LogCaller(name=caller.name, landmark=label, moves=moves(caller))
+        for caller, label in labelled
+    )
+    x, y, heading = drive.start.mean.tolist()
+    return Log(
+        name=f"run-{config.seed}",
+        time=drive.time,
+        controls=drive.controls,
+        dt=np.diff(drive.time),
+        scans=tuple(scans),
+        motion=drive.motion.model,
+        wheelbase=drive.motion.wheelbase,
+        control_std=drive.motion.control_std,
+        initial_pose=(x, y, heading),
+        initial_pose_std=config.filter.initial_pose_std,
+        range_std=config.filter.range_std,
+        bearing_std=config.filter.bearing_std,
+        excess_path_std=config.filter.excess_path_std if timing else None,
+        callers=callers if timing else (),
+        range_bounds=config.rays.range_bounds,
+        gate=None if config.filter.gate == "auto" else config.filter.gate,
+        ignored_rows={},
     )

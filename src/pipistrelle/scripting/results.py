@@ -1,8 +1,9 @@
-"""The results of a mission for Python: data frames, figures, films."""
+"""`run`, `slam` and `load`, and the results of a mission: data frames, figures, films."""
 
 import json
 import warnings
 from collections.abc import Callable, Iterable, Sequence
+from contextlib import AbstractContextManager, nullcontext
 from functools import cached_property, partial
 from io import BytesIO
 from pathlib import Path
@@ -11,55 +12,43 @@ from typing import TYPE_CHECKING, Any, Literal
 from pipistrelle.config import Config, InputError
 from pipistrelle.detection.logs.readers import Robot
 from pipistrelle.evaluation.scores import shown_in
-from pipistrelle.experiments.hearing.listening import Progress
-from pipistrelle.experiments.machine import keep_freed_memory
 from pipistrelle.experiments.named_settings import over_named
-from pipistrelle.experiments.results.writing import run_entry, tables_of
-from pipistrelle.experiments.runs.heard_world import Mission
-from pipistrelle.experiments.runs.trial import Watch
-from pipistrelle.files import RESULTS, claim, read_file
-from pipistrelle.kernel_clock import announce
+from pipistrelle.experiments.results.writing import result_folder
+from pipistrelle.files import RESULTS, OwnFiles, claim, read_file
 from pipistrelle.refusals import refusal, shown
 from pipistrelle.scripting.arguments import (
     RUN_NAMES,
     SLAM_TAKES,
-    WORLD_KEY,
     Base,
+    Door,
     Filters,
+    Progress,
     base_layer,
     folder_named,
     mission_settings,
     named_filters,
     named_strategies,
 )
-from pipistrelle.scripting.missions import (
-    Conduct,
-    caller_names,
-    drawn,
-    failures,
-    filmed,
-    keep,
-    prepare_slam,
-    simulated,
-)
-from pipistrelle.settings import Given, Layer, from_keywords
+from pipistrelle.settings import Layer, from_keywords
 
 if TYPE_CHECKING:
     import polars as pl
     from matplotlib.figure import Figure
 
-Redo = Callable[[Watch | None], Mission]
-"""Does a mission again, watched; the same settings give the same bits."""
-ALLOW = "overwrite=True"
+    from pipistrelle.experiments.runs.heard_world import Mission
+    from pipistrelle.experiments.runs.trial import Watch
+    from pipistrelle.scripting.missions import Recordings
+    from pipistrelle.scripting.studies import StudyResults
+
 TABLES = ("steps", "landmarks", "measurements")
 """Tables of a result folder, each a Parquet file."""
 
 
 class Results:
-    """What `run`, `slam` and `load` return: the scores, tracks, maps and measurements of a mission.
+    """Results of `run`, `slam` and `load`: scores, tracks, maps and measurements of a mission.
 
-    Frames are polars' (`to_pandas` turns one into pandas'), with units in the names of columns;
-    where there are several strategies or filters, each row says of which it is.
+    Tables are polars data frames (`to_pandas` converts them) with units in the column names; each
+    row has its strategy and its filter.
 
     Examples
     --------
@@ -73,31 +62,33 @@ class Results:
 
     def __init__(
         self,
-        redo: Redo,
-        mission: Mission | None = None,
+        redo: "Callable[[Watch | None], Mission]",
+        mission: "Mission | None" = None,
         folder: Path | None = None,
         command: str = "pipistrelle",
     ) -> None:
         self.folder = folder
-        """Where the results are kept, if anywhere."""
+        """Folder of the results, if they are kept."""
         self._redo, self._command = redo, command
         if mission is not None:
-            self._mission = mission
+            self.mission = mission
 
     @cached_property
-    def _mission(self) -> Mission:
-        """The mission itself, done once more where only its folder is known."""
+    def mission(self) -> "Mission":
+        """The mission, conducted again if only its folder is given."""
         return self._redo(None)
 
     @cached_property
     def summary(self) -> "pl.DataFrame":
-        """The scores, a row for each strategy and filter, as ``summary.json`` names them."""
+        """Scores of each strategy and filter, with the names of ``summary.json``."""
         import polars as pl
 
         if self.folder is not None:
             rows = json.loads(read_file(self.folder / "summary.json"))["runs"]
         else:
-            mission = self._mission
+            from pipistrelle.experiments.results.writing import run_entry
+
+            mission = self.mission
             ignored = {} if mission.log is None else mission.log.ignored_rows
             rows = [run_entry(trial, ignored) for trial in mission.trials]
         nested = ("ignored_rows", "online")
@@ -111,21 +102,24 @@ class Results:
 
     @property
     def landmarks(self) -> "pl.DataFrame":
-        """A row for each hypothesis of each landmark, with the true place beside it."""
+        """A row for each hypothesis of each landmark, with the true position."""
         return self._tables["landmarks"]
 
     @property
     def measurements(self) -> "pl.DataFrame":
-        """A row for each measurement of each strategy; null is what was not measured."""
+        """A row for each measurement of each strategy; null for a missing number."""
         return self._tables["measurements"]
 
     @cached_property
     def _tables(self) -> "dict[str, pl.DataFrame]":
-        """The tables, from the folder where there is one."""
+        """The tables by name, read from the folder if it exists."""
         import polars as pl
 
         if self.folder is None:
-            mission = self._mission
+            from pipistrelle.experiments.results.writing import tables_of
+            from pipistrelle.scripting.missions import caller_names
+
+            mission = self.mission
             return tables_of(mission.trials, mission.drive.truth, caller_names(mission))
         paths = {name: self.folder / f"{name}.parquet" for name in TABLES}
         tables = {}
@@ -133,16 +127,18 @@ class Results:
             try:
                 tables[name] = pl.read_parquet(read_file(path))
             except (OSError, pl.exceptions.PolarsError):
-                found, fix = "no table that is whole", "do the mission anew"
-                raise refusal(path, found, "what was written there", fix) from None
+                found, fix = "no table that is whole", "run the mission again"
+                raise refusal(path, found, "the table of the mission", fix) from None
         return tables
 
     def figure(self) -> "Figure":
-        """Draw maps and errors side by side, as ``mission.png`` has them."""
-        return drawn(self._mission)
+        """Draw the maps and errors, as in ``mission.png``."""
+        from pipistrelle.scripting.missions import drawn
+
+        return drawn(self.mission)
 
     def animate(self, path: Path | str = "mission.gif") -> Path:
-        """Film the mission, which is done once more for it.
+        """Film the mission, which is conducted again for it.
 
         Parameters
         ----------
@@ -156,25 +152,28 @@ class Results:
         Raises
         ------
         InputError
-            With another ending, or where the film cannot be made.
+            For another ending, or without ffmpeg.
         """
         from pipistrelle.figures.film import film_writer
         from pipistrelle.figures.recorder import MissionRecorder
+        from pipistrelle.scripting.missions import filmed
 
         film_writer(Path(path))
         watch = MissionRecorder()
         filmed(self._redo(watch), watch, Path(path))
         return Path(path)
 
-    def save(self, folder: Path | str, *, overwrite: bool = False) -> Path:
-        """Write the results as the command line does.
+    def save(self, folder: Path | str, *, overwrite: bool = False, save_bag: bool = False) -> Path:
+        """Write a result folder as the command line does.
 
         Parameters
         ----------
         folder : Path
-            A new one, or an empty one.
+            A new or empty folder.
         overwrite : bool
-            Whether earlier results in it may be replaced.
+            Replace earlier results in it.
+        save_bag : bool
+            Write tracks and maps also as a ROS bag, mission.mcap.
 
         Returns
         -------
@@ -183,10 +182,16 @@ class Results:
         Raises
         ------
         InputError
-            Where the folder cannot be had.
+            If the folder cannot be used.
         """
-        own = claim(Path(folder), RESULTS, overwrite=overwrite, flags=("save(DIR)", ALLOW))
-        keep(self._mission, own, self._command)
+        from pipistrelle.detection.logs.bag import need_rosbags
+        from pipistrelle.scripting.missions import keep
+
+        if save_bag:
+            need_rosbags("save_bag")
+        flags = ("save(DIR)", "overwrite=True")
+        own = claim(folder_named(folder, "save"), RESULTS, overwrite=overwrite, flags=flags)
+        keep(self.mission, own, self._command, save_bag=save_bag)
         return own.folder
 
     def to_xarray(self) -> Any:
@@ -195,10 +200,10 @@ class Results:
         Raises
         ------
         InputError
-            Where xarray or pandas is not installed.
+            If xarray or pandas is not installed.
         """
         try:
-            import pandas  # noqa: F401 - these three are asked for by polars, and by each other
+            import pandas  # noqa: F401 - polars and xarray need them
             import pyarrow  # noqa: F401
             import xarray  # noqa: F401
         except ImportError as missing:
@@ -208,15 +213,15 @@ class Results:
         return self.tracks.to_pandas().set_index(["strategy", "filter", "time_s"]).to_xarray()
 
     def _scores_shown(self) -> "pl.DataFrame":
-        """Return the scores that a notebook shows."""
+        """Select the scores that a notebook shows."""
         return self.summary.select("strategy", "filter", *shown_in("notebook"))
 
     def __repr__(self) -> str:
-        """Show the scores as a table."""
+        """Format the scores as a table."""
         return f"Results of a mission\n{self._scores_shown()}"
 
     def _repr_html_(self) -> str:
-        """Show the figure, and the scores beneath it."""
+        """Format the figure and a table of the scores as HTML."""
         from base64 import b64encode
 
         room = BytesIO()
@@ -232,44 +237,74 @@ def run(
     *,
     strategies: str | Sequence[str] = "all",
     filters: Filters | None = None,
-    world: Path | str | None = None,
     beamwidth: float | None = None,
     landmarks: int | None = None,
     duration: float | None = None,
+    engine: Literal["auto", "block", "dense"] | None = None,
+    particles: int | None = None,
+    world: Path | str | None = None,
     output: Path | str | None = None,
     overwrite: bool = False,
+    animate: Literal["gif", "mp4"] | None = None,
+    save_bag: bool = False,
+    save_log: Path | str | None = None,
+    save_world: Path | str | None = None,
+    save_sound: Path | str | None = None,
+    frames: str | None = None,
+    sound_bits: Literal[32, 16] = 32,
     progress: Progress | None = None,
     **settings: Any,
 ) -> Results:
-    """Drive through one world and map it, as `pipistrelle run` does.
+    """Simulate a drive through a world and map it, as `pipistrelle run` does.
 
-    Settings are keywords: ``seed=3``, ``rays__power=8.0``, or a section of them at a time,
-    ``air={"temperature_c": 5.0}``; `pipistrelle config show` lists them. Variables of the
-    environment count for the command line alone.
+    Settings are keywords: ``seed=3``, ``rays__power=8.0``, or sections,
+    ``air={"temperature_c": 5.0}``; `pipistrelle config show` lists them. Environment variables
+    apply only on the command line.
 
     Parameters
     ----------
     config : Config, mapping, name, or path of a TOML file, optional
-        Settings to start from. What they leave open is what serves the estimator best,
-        ``settings="best"``, unless they name other settings; a `Config` leaves nothing open.
+        Settings to start from. The rest is ``settings="best"``, unless they name other settings; a
+        `Config` is complete.
     strategies : "active", "fused", "passive", several of them, or "all"
+        Measurements to use: ranges, all, or only bearings.
     filters : str or class, optional
-        The name of an estimator or its class, several of them, "both", the paper's two, or "all";
-        by default that of the named settings: the smoother of "best", the EKF of "paper".
-    world : Path, optional
-        Folder of a world of one's own.
-    beamwidth : [deg], optional
-        Half-power beamwidth of the vehicle's call.
+        Estimators, separated by commas; "both" are the paper's two.
+    beamwidth : float, optional
+        Half-power beamwidth of the vehicle's call [deg], up to 180; sets emitter.radius.
     landmarks : int, optional
-        Number of landmarks.
-    duration : [s], optional
+        Number of landmarks; sets scenario.landmarks.
+    duration : float, optional
+        Length of the drive [s]; sets scenario.steps.
+    engine : "auto", "block" or "dense", optional
+        Computation of samples: block (exact sums over blocks, fast), dense (every sample, slow) or
+        auto (block where it applies); sets receiver.engine.
+    particles : int, optional
+        Particles of FastSLAM; sets fastslam.particles.
+    world : Path, optional
+        A world of your own: landmarks.csv, path.csv, world.toml; sets scenario.world.
     output : Path, optional
-        Where to keep the results; nothing is written without it.
+        Folder of the results.
     overwrite : bool
-        Whether earlier results there may be replaced.
+        Replace earlier files of the same kind in the named folders.
+    animate : "gif" or "mp4", optional
+        Film the mission into the result folder.
+    save_bag : bool
+        Write tracks and maps also as a ROS bag, mission.mcap, into the result folder.
+    save_log : Path, optional
+        Write the measurements (fused, if sensed) as a log for `slam` into this folder.
+    save_world : Path, optional
+        Write the simulated world into this folder, for `world`.
+    save_sound : Path, optional
+        Write the sound at the microphones into this folder, as a recording for `hear`.
+    frames : str, optional
+        Frames of the sound: A:B is from number A, counted from 0, to before B.
+    sound_bits : 32 or 16
+        Samples of the sound: floats of 32 bits or integers of 16.
     progress : callable, optional
-        Called with what is done, how many frames of it are, and of how many.
+        Called with the stage, the number of frames done, and their total.
     **settings
+        Any other setting.
 
     Returns
     -------
@@ -278,7 +313,7 @@ def run(
     Raises
     ------
     InputError
-        An unknown setting or a refused value; a world, an estimator or a folder that cannot be had.
+        For an unknown setting, a bad value, or an unusable world, estimator or folder.
 
     Examples
     --------
@@ -289,25 +324,34 @@ def run(
     Traceback (most recent call last):
     pipistrelle.config.InputError: rays__powr: no such setting; did you mean rays__power?
     """
+    asked = {**locals()}
     if isinstance(landmarks, Iterable) and not isinstance(landmarks, str):
         fix = "places of your own are a world's: write them into one, and name it by world="
         raise refusal("landmarks", shown(landmarks), "the number of landmarks", fix)
-    short: Layer = {
-        WORLD_KEY: Given(None if world is None else str(world), "world"),
-        ("scenario", "landmarks"): Given(landmarks, "landmarks"),
-    }
-    resolved, own_world, usual = mission_settings(
-        base_layer(config),
-        from_keywords(settings, run.__kwdefaults__ or ()),
-        short,
-        beamwidth=Given(beamwidth, "beamwidth"),
-        duration=Given(duration, "duration"),
+    door = Door(
+        asked=asked,
+        beneath=base_layer(config),
+        flags=from_keywords(settings, run.__kwdefaults__ or ()),
         default="paper" if isinstance(config, Config) else RUN_NAMES,
+        command="pipistrelle.run(...)",
+        working=lambda *_: nullcontext(progress),
     )
-    chosen = named_strategies(strategies)
-    ways = named_filters(usual if filters is None else filters)
-    conduct = partial(simulated, resolved, chosen, ways, own_world)
-    return _finished(conduct, progress, output, overwrite, "pipistrelle.run(...)")
+    return _announced(run_by, door)
+
+
+def run_by(door: Door) -> Results:
+    """Simulate a mission as `run`, called by a door."""
+    config, world, usual = mission_settings(door)
+    strategies = named_strategies(door.asked["strategies"])
+    names = door.estimators(usual)
+    from pipistrelle.scripting.missions import Recordings, simulated
+
+    mission_of = partial(simulated, config, strategies, names, world)
+    recordings = Recordings(config, world, door)
+    try:
+        return _conducted(mission_of, door, "run", door.working(config, names), recordings)
+    finally:
+        recordings.close()
 
 
 def slam(
@@ -318,37 +362,54 @@ def slam(
     robot: Robot | None = None,
     strategies: str | Sequence[str] = "fused",
     filters: Filters | None = None,
+    particles: int | None = None,
     beamwidth: float | None = None,
     gate: float | Literal["auto"] | None = None,
+    truth: str | None = None,
     output: Path | str | None = None,
     overwrite: bool = False,
+    animate: Literal["gif", "mp4"] | None = None,
+    save_bag: bool = False,
     progress: Progress | None = None,
     **settings: Any,
 ) -> Results:
     """Solve a recorded log, as `pipistrelle slam` does.
 
-    What looks odd in it is a warning.
+    Doubtful values in the log are warnings; settings that the log decides are refused.
 
     Parameters
     ----------
     log : Path
-        Its folder, or a ROS bag; ``bag={"odometry": "/odom", "truth": "/pose"}`` names topics.
+        A log folder or a ROS bag; ``bag={"odometry": "/odom", "truth": "/pose"}`` names topics.
     config : Config, mapping, name, or path of a TOML file, optional
         Settings to start from.
     robot : int or str, optional
-        Whose log, where there are several.
+        The robot, by number or name, if there are several.
     strategies : "active", "fused", "passive", several of them, or "all"
-        What is kept: only what has a range, all as it is, or only bearings.
+        Rows to use: with a range, all, or only their bearings.
     filters : str or class, optional
-        The name of an estimator or its class, several of them, "both", the paper's two, or "all";
-        by default that of the settings that are named, else the smoother.
-    beamwidth : [deg], optional
-        Ranges outside a beam of this width about the heading are hidden.
+        Estimators, separated by commas; "both" are the paper's two.
+    particles : int, optional
+        Particles of FastSLAM; sets fastslam.particles.
+    beamwidth : float, optional
+        Discard ranges outside a beam of this width [deg] about the heading.
     gate : float or "auto", optional
-        Measurements outside this share of their predicted distribution are dropped; "auto", as
-        suits the estimator, unless the log says its own.
-    output, overwrite, progress, **settings
-        As of `run`; what the log decides is refused.
+        Probability of the gate: measurements outside this share of their predicted distribution
+        are rejected; sets filter.gate.
+    truth : str, optional
+        Topic of a ROS bag with the true pose of the vehicle; sets bag.truth.
+    output : Path, optional
+        Folder of the results.
+    overwrite : bool
+        Replace earlier results in it.
+    animate : "gif" or "mp4", optional
+        Film the mission into the result folder.
+    save_bag : bool
+        Write tracks and maps also as a ROS bag, mission.mcap, into the result folder.
+    progress : callable, optional
+        Called with the stage, the number of frames done, and their total.
+    **settings
+        Any other setting.
 
     Returns
     -------
@@ -357,36 +418,156 @@ def slam(
     Raises
     ------
     InputError
-        What is wrong in the log, by line or key; as `run`.
+        For an error in the log, with its line or key; else as `run`.
     """
-    place, flags = folder_named(log, "log"), from_keywords(settings, slam.__kwdefaults__ or ())
-    short: Layer = {("filter", "gate"): Given(gate, "gate")}
-    beneath, usual = over_named(base_layer(config), flags)
-    layers, chosen = (beneath, flags, short), named_strategies(strategies)
-    ways = named_filters((usual or SLAM_TAKES) if filters is None else filters)
-    width = Given(beamwidth, "beamwidth")
-    conduct, _, odd = prepare_slam(place, layers, robot, chosen, ways, width)
-    for line in odd:
-        warnings.warn(line, stacklevel=2)
-    return _finished(conduct, progress, output, overwrite, f"pipistrelle.slam({str(log)!r}, ...)")
+    asked = {**locals()}
+    door = Door(
+        asked=asked,
+        beneath=base_layer(config),
+        flags=from_keywords(settings, slam.__kwdefaults__ or ()),
+        command=f"pipistrelle.slam({str(log)!r}, ...)",
+        working=lambda *_: nullcontext(progress),
+    )
+    return _announced(slam_by, door)
 
 
-def _finished(
-    conduct: Conduct,
-    progress: Progress | None,
-    output: Path | str | None,
-    overwrite: bool,
-    command: str,
+def slam_by(door: Door) -> Results:
+    """Solve a log as `slam`, called by a door."""
+    asked, place = door.asked, folder_named(door.asked["log"], "log")
+    layer, usual = over_named(door.beneath, door.flags)
+    strategies = named_strategies(asked["strategies"])
+    names = door.estimators(usual or SLAM_TAKES)
+    from pipistrelle.scripting.missions import prepare_slam
+
+    given: Layer = door.flags | door.short()
+    mission_of, notes, doubts = prepare_slam(
+        place, layer, given, asked["robot"], strategies, names, door
+    )
+    for note in notes:
+        door.note(f"pipistrelle: {note}")
+    door.warn(*doubts)
+    return _conducted(mission_of, door, "slam", door.working())
+
+
+def _conducted(
+    mission_of: "Callable[..., Mission]",
+    door: Door,
+    name: str,
+    working: AbstractContextManager[Any],
+    recordings: "Recordings | None" = None,
 ) -> Results:
-    """Do a mission, and keep it where that is asked for."""
-    keep_freed_memory()
+    """Conduct a mission, write its results, and warn; `working` yields the progress function."""
+    from pipistrelle.experiments.machine import keep_freed_memory
+    from pipistrelle.scripting.missions import filmed, keep
+
+    animate, save_bag, watch = door.asked["animate"], door.asked["save_bag"], None
+    if animate:
+        from pipistrelle.figures.film import film_writer
+        from pipistrelle.figures.recorder import MissionRecorder
+
+        film_writer(Path(f"mission.{animate}"))
+        watch = MissionRecorder()
+    if save_bag:
+        from pipistrelle.detection.logs.bag import need_rosbags
+
+        need_rosbags(door.option("save_bag"))
+    with _folder(door, name) as own:
+        keep_freed_memory()
+        with working as progress:
+            asked = {"progress": progress, "watch": watch}
+            mission = recordings.conduct(mission_of, **asked) if recordings else mission_of(**asked)
+
+        def film(room: Path) -> None:
+            if watch is not None and watch.snapshots:
+                with door.drawing(f"Drawing mission.{animate} ..."):
+                    filmed(mission, watch, room / f"mission.{animate}")
+
+        if own is not None:
+            keep(mission, own, door.command, film=film, save_bag=save_bag)
+        if recordings is not None:
+            recordings.write(mission)
+        door.warn(*mission.notes())
+    return Results(
+        lambda watch: mission_of(progress=progress, watch=watch),
+        mission,
+        None if own is None else own.folder,
+        door.command,
+    )
+
+
+def _folder(door: Door, name: str) -> AbstractContextManager[OwnFiles | None]:
+    """Return a context that yields the claimed result folder, None if nothing is to be kept."""
+    path, flags = door.folder("output"), door.ways_out("output")
+    if path is None and not door.makes_folder:
+        for option in ("animate", "save_bag"):
+            if value := door.asked[option]:
+                fix = f"name one by {flags[0]}"
+                raise refusal(option, shown(value), "a result folder for it", fix)
+        return nullcontext()
+    return result_folder(path, name, overwrite=door.asked["overwrite"], flags=flags)
+
+
+def _announced(conduct_by: Callable[[Door], Results], door: Door) -> Results:
+    """Conduct a mission from Python: announce the compilation, warn of failed estimates."""
+    from pipistrelle.kernel_clock import announce
+    from pipistrelle.scripting.missions import failures
+
     announce()
-    place = None if output is None else Path(output)
-    flags = ("output=DIR", ALLOW)
-    own = None if place is None else claim(place, RESULTS, overwrite=overwrite, flags=flags)
-    mission = conduct(progress=progress)
-    if own is not None:
-        keep(mission, own, command)
-    for line in (*mission.notes(), *failures(mission)):
-        warnings.warn(line, stacklevel=3)
-    return Results(lambda watch: conduct(progress=progress, watch=watch), mission, place, command)
+    results = conduct_by(door)
+    door.warn(*failures(results.mission))
+    return results
+
+
+def load(
+    folder: Path | str, /, *, filters: Filters = (), association: str = ""
+) -> "Results | StudyResults":
+    """Open a folder of results or of a study; figures of a mission conduct it again.
+
+    Parameters
+    ----------
+    folder : Path
+        A folder written by `pipistrelle run`, `slam` or `study`.
+    filters : str or class, or several of them, optional
+        Estimators of your own, by name or class, that the mission was conducted with. Code that a
+        folder names runs only if you name it here.
+    association : str, optional
+        An association of your own, ``module:Class``, under the same condition.
+
+    Returns
+    -------
+    Results or StudyResults
+
+    Raises
+    ------
+    InputError
+        For a folder without results; when a mission is conducted again, for an estimator or
+        association that is neither Pipistrelle's nor named here.
+
+    Examples
+    --------
+    >>> from tempfile import TemporaryDirectory
+    >>> import pipistrelle
+    >>> with TemporaryDirectory() as place:
+    ...     done = pipistrelle.run(strategies="fused", duration=4.0, output=f"{place}/one")
+    ...     same = pipistrelle.load(f"{place}/one")
+    ...     same.tracks.equals(done.tracks)
+    True
+    """
+    from pipistrelle.experiments.results.reading import read_summary
+    from pipistrelle.experiments.runs.rerun import rerun
+
+    place = folder_named(folder, "load")
+    if (place / "plan.toml").is_file():
+        from pipistrelle.scripting.studies import StudyResults
+
+        return StudyResults(place)
+    read_summary(place)
+    trusted = (*(named_filters(filters) if filters else ()), association)
+
+    def redo(watch: "Watch | None") -> "Mission":
+        mission = rerun(place, trusted=trusted, watch=watch)
+        if mission.difference:
+            warnings.warn(mission.difference, stacklevel=3)
+        return mission
+
+    return Results(redo, folder=place)

@@ -1,13 +1,14 @@
-"""The file of a `Slam`: the vehicle, the settings and all that was estimated, guarded by a sum.
+"""The file of a `Slam`: vehicle, settings and estimates, with a checksum.
 
-A file is a head line, the sum of what follows, a line of JSON and the bytes of arrays. The JSON has
-a list of nodes: an array, a container or a record each. A node refers to earlier nodes only, so the
-file is read in one pass, whatever it holds, and a value that two records share is shared again.
+A file is a head line, the SHA-256 of the rest, a line of JSON and the bytes of arrays. The JSON has
+a list of nodes: arrays, containers and records. A node refers only to earlier nodes, so any file is
+read in one pass, and a value that two records share is shared again.
 
-A file may come from anybody. It names records of a closed table (`saved_records.RECORDS`), or
-records of the module of an estimator or an association that the caller of `Slam.load` names; it
-chooses no other module, class or function. Every value of a record is checked against the
-annotation of its field, and arrays claim no more bytes than the file has.
+A file may be forged. It can only name records of the closed table `RECORDS`, or records of the
+module of an estimator or association that the caller of `Slam.load` names; it cannot choose another
+module, class or function. Every field of a record is checked against its annotation, and arrays
+cannot claim more bytes than the file has. Since kernels index arrays by the stored numbers without
+checks of bounds, `LAWS` checks the numbers of each record against each other.
 """
 
 import json
@@ -24,27 +25,46 @@ from typing import Any, Literal, NamedTuple, TypeVar, Union, get_args, get_origi
 import numpy as np
 from jaxtyping import Float, jaxtyped
 
-from pipistrelle.config import InputError, Section
+from pipistrelle.config import InputError, RayConfig, Section
+from pipistrelle.detection.scans import Scan
 from pipistrelle.estimation.association import KNOWN
+from pipistrelle.estimation.beliefs import Gaussian, Innovations, JointGaussian, Landmarks
 from pipistrelle.estimation.catalogue import CATALOGUE, names_class
+from pipistrelle.estimation.data_association.existence import Known
+from pipistrelle.estimation.data_association.rows import (
+    Caller,
+    CallerPlace,
+    EarlyScan,
+    Memory,
+    ScanRows,
+)
 from pipistrelle.estimation.data_association.sequential import METHODS
-from pipistrelle.estimation.session import SessionState
+from pipistrelle.estimation.data_association.tracks import Tracks
+from pipistrelle.estimation.ekf.filter import EkfBelief
+from pipistrelle.estimation.ekf.gaussian import INVARIANT, LINEAR
+from pipistrelle.estimation.fastslam.block import LANES
+from pipistrelle.estimation.fastslam.filter import FastSlamBelief
+from pipistrelle.estimation.session import MOST_STEPS, SessionState, _Heard
+from pipistrelle.estimation.smoother.belief import SmootherBelief
+from pipistrelle.estimation.smoother.history import NEVER, STRETCH, History
+from pipistrelle.estimation.smoother.preintegration import Calibration, Odometry
+from pipistrelle.estimation.smoother.records import CALLER, POSE, Stack
+from pipistrelle.estimation.smoother.sweep import Points, Solution, Stretch
 from pipistrelle.files import printable, read_file, read_named, write_whole
 from pipistrelle.refusals import refusal, shown
-from pipistrelle.scripting.saved_records import LAWS, RECORDS
 from pipistrelle.version import find_version
 
 HEAD = b"# Of Pipistrelle: a drive to go on from\n"
-"""First line of the file; the second is the sum of all that follows it."""
+"""First line of the file; the second is the checksum of the rest."""
 FORM = 2
-"""Number of the form of the file; 1 was a pickle."""
+"""Version of the file format; 1 was a pickle."""
 OWN = ":"
-"""Begins the name of a record of a module from outside."""
+"""Prefix of the name of a record from a module of the user."""
 DEEPEST = 32
-"""Most nodes within each other: a belief in a session's memory has about ten."""
+"""Largest nesting of nodes; a belief in the memory of a session has about ten."""
 MOST_SHARED = 1_000_000
-"""Parts that a file may save by sharing: a node that names another several times, and is named so
-itself, and so on, has as many parts as could never be walked through."""
+"""Largest number of parts that a file may save by sharing. Nodes that repeatedly name each other
+could otherwise have exponentially many parts."""
 _SCALARS = (type(None), bool, int, str)
 _CONTAINERS: dict[str, Callable[..., Any]] = {
     one.__name__: one for one in (tuple, list, set, frozenset)
@@ -53,49 +73,60 @@ _DTYPES = {
     np.dtype(name).name: np.dtype(name).newbyteorder("<")
     for name in ("?", *np.typecodes["AllInteger"], "e", "f", "d", "F", "D")
 }
-"""Of numbers and truth values, by name; objects have none."""
+"""Little-endian types of arrays by name, without objects."""
 _OURS = {name: _DTYPES[name] for name in ("float64", "int64", "bool", "uint8")}
-"""Of all that an estimator and an association of this package keep."""
+"""Types of the arrays of this package's estimators and associations."""
 _MANY = (Sequence, Collection, list, set, frozenset)
+LARGEST = np.sqrt(np.finfo(np.float64).max)
+"""Largest number with a finite square."""
+RECORDS: dict[str, Any] = {
+    kind.__name__: kind
+    for kind in (
+        Caller, CallerPlace, Calibration, EarlyScan, EkfBelief, FastSlamBelief, Gaussian, History,
+        Innovations, JointGaussian, Known, Landmarks, Memory, Odometry, Points, RayConfig, Scan,
+        ScanRows, SessionState, SmootherBelief, Solution, Stack, Stretch, Tracks, _Heard,
+    )
+}  # fmt: skip
+"""The records that a file may name."""
 
 
 class DriveState(NamedTuple):
-    """All that a file holds."""
+    """Contents of a file."""
 
     name: str
-    """Of the log that a `Slam` makes of its vehicle."""
+    """Name of the vehicle in messages."""
     start: float
     """Time of the start [s]."""
     former: tuple[str, ...]
-    """Keys that the vehicle called by former names."""
+    """Keys of the vehicle under former names."""
     vehicle: dict[str, Any]
     """Keys of ``log.toml``."""
     settings: dict[str, Any]
     kept: int
     session: SessionState
     heard: frozenset[tuple[float, ...]]
-    """Rows that were heard at the present time."""
+    """Identities of the rows at the present time."""
     times: Float[np.ndarray, " k"]
-    """[s]."""
+    """Kept times [s]."""
     means: Float[np.ndarray, "k 3"]
-    """Poses of the vehicle as they were believed at their time."""
+    """Pose estimates of the vehicle at these times."""
     covariances: Float[np.ndarray, "k 3 3"]
 
 
 class Named(NamedTuple):
-    """The estimator and the association of a drive."""
+    """Names of the estimator and the association of a drive."""
 
     filter: str
     association: str
 
     @property
     def modules(self) -> set[str]:
-        """Names of the modules of those from outside."""
+        """Modules of a user's estimator and association."""
         return {name.partition(":")[0] for name in self if names_class(name)}
 
 
 def write_state(path: Path, named: Named, state: DriveState) -> None:
-    """Write the file, in place of one that was written here before."""
+    """Write the file; replace only a file of `Slam.save`."""
     try:
         nodes = _Nodes(named.modules)
         nodes.add(state)
@@ -124,9 +155,9 @@ def write_state(path: Path, named: Named, state: DriveState) -> None:
 
 
 def read_state(path: Path, own: Mapping[str, str | None]) -> tuple[Named, DriveState]:
-    """Return what the file holds, and of which estimator and association.
+    """Read the file; return its estimator and association, and its contents.
 
-    ``own``: the names that the caller gives, by the fields of `Named`; their modules are imported.
+    ``own``: estimator and association that the caller trusts, by the names of the options.
     """
     data = read_named(path, "a file of Slam.save")
     found = "a file that Slam.save did not write"
@@ -139,13 +170,13 @@ def read_state(path: Path, own: Mapping[str, str | None]) -> tuple[Named, DriveS
 
 
 def not_saved(path: Path, error: Exception) -> InputError:
-    """Return the refusal of a file whose sum is right and whose content is not."""
+    """Return the error for a file with a right checksum and wrong contents."""
     found = f"what Slam.save did not write ({type(error).__name__})"
     return refusal(path, found, "one of Slam.save, as it was written", "name another")
 
 
 def _content(path: Path, body: bytes, own: Mapping[str, str | None]) -> tuple[Named, DriveState]:
-    """Return what follows the sum; bytes that have a sum may still be anybody's."""
+    """Parse the body of the file, which may be forged."""
     line, _, data = body.partition(b"\n")
     try:
         header = json.loads(line, parse_constant=_no_number)
@@ -161,11 +192,11 @@ def _content(path: Path, body: bytes, own: Mapping[str, str | None]) -> tuple[Na
 
 
 def _checked_header(path: Path, header: Any, own: Mapping[str, str | None]) -> Named:
-    """Refuse what another version wrote, and a class from outside that the caller does not name."""
-    here, there = find_version(), header["version"]
-    if there != here or header.get("form", 1) != FORM:
-        found = f"a drive of Pipistrelle {there if isinstance(there, str) else shown(there)}"
-        found += " in an earlier form" if there == here else ""
+    """Raise for a file of another version, or of a user's class that the caller does not name."""
+    here, written = find_version(), header["version"]
+    if written != here or header.get("form", 1) != FORM:
+        found = f"a drive of Pipistrelle {written if isinstance(written, str) else shown(written)}"
+        found += " in an earlier form" if written == here else ""
         fix = "load it with the Pipistrelle that wrote it, or drive on from a new start"
         raise refusal(path, shown(found)[1:-1], f"one of {here}", fix)
     named = Named(header["filter"], header["association"])
@@ -181,26 +212,26 @@ def _checked_header(path: Path, header: Any, own: Mapping[str, str | None]) -> N
 
 
 def _no_number(word: str) -> None:
-    """Refuse NaN and Infinity, which are no JSON."""
+    """Raise for NaN and Infinity, which are not JSON."""
     raise ValueError(word)
 
 
 class _UnfitError(TypeError):
-    """A value of a kind that no file holds."""
+    """A value that a file cannot hold."""
 
 
 class _Nodes:
-    """The nodes of a file that is written, and the bytes of its arrays."""
+    """Writer of nodes and of the bytes of arrays."""
 
     def __init__(self, modules: Collection[str]) -> None:
         self.nodes: list[Any] = []
         self.data: list[bytes] = []
         self._modules, self._dtypes = modules, _DTYPES if modules else _OURS
         self._known: dict[int, tuple[Any, int]] = {}
-        """By identity: the value, which stays alive, and the number of its node."""
+        """The value (kept alive) and the number of its node, by identity."""
 
     def add(self, value: Any) -> Any:
-        """Return what stands for a value: itself, or the number of its node in a list."""
+        """Return a scalar itself, else a list with the number of its node, which is added."""
         if type(value) in _SCALARS:
             return value
         if type(value) is float and np.isfinite(value):
@@ -212,7 +243,7 @@ class _Nodes:
         return [self._known[id(value)][1]]
 
     def _node(self, value: Any) -> list[Any]:
-        """Return the node of a value; add those that it refers to."""
+        """Return the node of a value; add the nodes of its parts."""
         kind = type(value)
         if kind is float:
             return ["float", repr(value)]
@@ -232,17 +263,17 @@ class _Nodes:
         return ["record", name, *(self.add(getattr(value, part)) for part in _fields_of(kind))]
 
     def _array(self, array: np.ndarray, *, scalar: bool) -> list[Any]:
-        """Return the node of an array or of one of NumPy's scalars."""
+        """Return the node of an array or NumPy scalar; keep its bytes."""
         if array.dtype.name not in self._dtypes:
             raise _UnfitError(f"an array of {array.dtype}")
         columns = array.flags.f_contiguous and not array.flags.c_contiguous
-        order = "F" if columns and self._modules else "C"  # of whole numbers, in ours
+        order = "F" if columns and self._modules else "C"  # the package has only C order
         self.data.append(array.astype(self._dtypes[array.dtype.name], copy=False).tobytes(order))
         return ["array", array.dtype.name, list(array.shape), order, scalar]
 
 
 class _Read:
-    """The nodes of a file that is read."""
+    """Reader of nodes and of the bytes of arrays."""
 
     def __init__(self, data: bytes, modules: Collection[str]) -> None:
         self._data, self._at, self._modules = data, 0, modules
@@ -250,11 +281,11 @@ class _Read:
         self._values: list[Any] = []
         self._depths: list[int] = []
         self._sizes: list[int] = []
-        """Parts of each value, and of all within it."""
+        """Number of parts of each value, including nested ones."""
         self._parts = self._walked = 0
 
     def all(self, nodes: list[Any]) -> Any:
-        """Return the value of the last node."""
+        """Read all nodes; return the value of the last."""
         for kind, *rest in nodes:
             self._depth, before = 0, self._walked
             self._parts += 1 + len(rest)
@@ -282,7 +313,7 @@ class _Read:
         return _CONTAINERS[kind](parts)
 
     def _part(self, part: Any) -> Any:
-        """Return the value that a part of a node stands for."""
+        """Return the value of a part: a scalar, or the value of an earlier node."""
         if type(part) is not list:
             if type(part) not in (*_SCALARS, float):
                 raise TypeError(type(part).__name__)
@@ -297,7 +328,7 @@ class _Read:
         return self._values[number]
 
     def _record(self, name: str, *parts: Any) -> Any:
-        """Return a record, by its constructor."""
+        """Construct and check a record."""
         kind, values = _kind_named(name, self._modules), [self._part(part) for part in parts]
         if kind is None:
             raise TypeError(name)
@@ -308,7 +339,7 @@ class _Read:
         return record
 
     def _array(self, name: str, shape: list[int], order: Any, scalar: bool) -> Any:
-        """Return the next array, or one of NumPy's scalars."""
+        """Read the next array or NumPy scalar."""
         dtype, begin = self._dtypes[name], self._at
         if any(type(n) is not int or not 0 <= n <= len(self._data) for n in shape):
             raise ValueError("shape")
@@ -319,19 +350,19 @@ class _Read:
             or order not in ("CF" if self._modules else "C")
         ):
             raise ValueError("an array larger than the file")
-        found = np.frombuffer(self._data[begin : self._at], dtype)
-        if dtype.kind == "b" and found.view(np.uint8).max(initial=0) > 1:
+        stored = np.frombuffer(self._data[begin : self._at], dtype)
+        if dtype.kind == "b" and stored.view(np.uint8).max(initial=0) > 1:
             raise ValueError("no truth value")
-        array = found.astype(dtype.newbyteorder("=")).reshape(shape, order=order)
+        array = stored.astype(dtype.newbyteorder("=")).reshape(shape, order=order)
         if scalar and shape:
             raise ValueError("scalar")
         return array[()] if scalar else array
 
 
 def _kind_named(name: str, modules: Collection[str]) -> Any:
-    """Return the record of a name: of the closed table, or of a module from outside; or None.
+    """Return the class of a record in the closed table or in the user's modules, or None.
 
-    Of a module count the records that it defines at its top and whose constructor takes all fields.
+    In a user's module it must be defined at the top, with a constructor that takes all fields.
     """
     if not name.startswith(OWN):
         return DriveState if name == DriveState.__name__ else RECORDS.get(name)
@@ -347,7 +378,7 @@ def _kind_named(name: str, modules: Collection[str]) -> Any:
 
 @cache
 def _fields_of(kind: Any) -> tuple[str, ...]:
-    """Return the names of a record's fields, as its constructor takes them."""
+    """Return the names of the fields that the constructor of a record takes."""
     if is_dataclass(kind):
         return tuple(field.name for field in fields(kind) if field.init)
     return kind._fields
@@ -355,12 +386,12 @@ def _fields_of(kind: Any) -> tuple[str, ...]:
 
 @cache
 def _hints_of(kind: Any) -> dict[str, Any]:
-    """Return the annotations of a record's fields."""
+    """Return the annotations of the fields of a record."""
     return get_type_hints(kind)
 
 
 def _check(record: Any, name: str) -> None:
-    """Refuse a record of the table that is not as its annotations and its law have it."""
+    """Raise if a record of the table violates its annotations or its law."""
     kind = type(record)
     hints = _hints_of(kind) if not name.startswith(OWN) else {}
     with jaxtyped("context"):
@@ -372,7 +403,7 @@ def _check(record: Any, name: str) -> None:
 
 
 def _fits(value: Any, hint: Any) -> bool:
-    """Tell whether a value is as an annotation has it; shapes are those of the context."""
+    """Return whether a value fits an annotation, with the shapes of the jaxtyping context."""
     if hint is Any or isinstance(hint, TypeVar):
         return True
     origin, args = get_origin(hint), get_args(hint)
@@ -400,6 +431,284 @@ def _fits(value: Any, hint: Any) -> bool:
 
 
 def _fits_alone(value: Any, hint: Any) -> bool:
-    """Tell the same of a part of a container, whose shapes are its own."""
+    """Return whether a part of a container fits an annotation, with separate shapes."""
     with jaxtyped("context"):
         return _fits(value, hint)
+
+
+def check_going_on(start: SessionState, state: SessionState, *, own: bool) -> None:
+    """Raise for a state that a session with these settings cannot reach from its start.
+
+    ``own``: whether the estimator is a user's, which may have several types of beliefs.
+    """
+    beliefs = [state.belief, *(heard.belief for heard in state.past)]
+    beliefs += [state.open[0]] if state.open else []
+    first = start.belief
+    for belief in () if own else beliefs:
+        same = type(belief) is type(first) and getattr(first, "error", 0) == getattr(
+            belief, "error", 0
+        )
+        if isinstance(first, SmootherBelief) and same:
+            old, new = first.history.calibration, belief.history.calibration
+            same = (first.noise, first.rays, old.names) == (belief.noise, belief.rays, new.names)
+            for name in ("assumed", "unit", "stds", "odometry", "sensor"):
+                same = same and np.array_equal(getattr(old, name), getattr(new, name))
+        if not same:
+            raise ValueError("another estimator")
+    memories = [state.memory, *(heard.memory for heard in state.past)]
+    of_ours = (type(None), Memory)
+    if isinstance(start.memory, of_ours) and any(
+        type(m) is not type(start.memory) for m in memories
+    ):
+        raise ValueError("another association")
+
+
+def within(values: Any, low: Any, high: Any) -> bool:
+    """Return whether all integers are in low <= n < high.
+
+    >>> within(np.array([0, 2]), 0, 3), within([3], 0, 3)
+    (True, False)
+    """
+    array = np.asarray(values)
+    return bool(np.all((array >= low) & (array < high)))
+
+
+def _finite(*arrays: Any) -> bool:
+    """Return whether all numbers and their squares are finite."""
+    return all(bool(np.all(np.abs(array) <= LARGEST)) for array in arrays)
+
+
+def _sessions(state: SessionState) -> bool:
+    """Scans are consecutive, draws are states of a generator, and an open leg exists."""
+    numbers = [heard.number for heard in state.past]
+    end = state.first + len(state.labels)
+    if state.first < 0 or numbers != [*range(end - len(numbers), end)]:
+        return False
+    try:
+        states: list[Any] = [state.draws, *([state.open[1]] if state.open else [])]
+        for draws in states:
+            np.random.PCG64(0).state = draws
+    except (ValueError, TypeError, KeyError, OverflowError, IndexError):
+        return False
+    legs = [*state.legs, *(leg for heard in state.past for leg in heard.legs)]
+    going = (
+        len(state.open) == 2 and 0 < len(legs[len(state.legs) - 1][1]) < MOST_STEPS
+        if (state.open is not None and state.legs)
+        else state.open is None
+    )
+    return going and all(_finite(dt) for _, dt in legs)
+
+
+def _is_pose(gaussian: Gaussian) -> bool:
+    """Return whether a Gaussian is a finite pose."""
+    return gaussian.mean.shape == (POSE,) and _finite(gaussian.mean, gaussian.covariance)
+
+
+def _ekf(belief: EkfBelief) -> bool:
+    """The state has a pose and two numbers for each member, all finite."""
+    size, members = belief.mean.size, belief.landmark.size
+    numbers = belief.mean, belief.covariance, belief.weight, belief.origin
+    return (
+        size == POSE + 2 * members == belief.covariance.shape[0]
+        and belief.error in (LINEAR, INVARIANT)
+        and belief.covariance.diagonal().min() >= 0.0
+        and _finite(*numbers)
+    )
+
+
+def _fastslam(belief: FastSlamBelief) -> Any:
+    """Blocks have room for all particles, and particles for all members of landmarks."""
+    blocks, landmarks, lanes = belief.count.shape
+    room = np.diff(belief.first)
+    if {room.size, belief.landmark.size, belief.best_count.size} != {landmarks}:
+        return False
+    rows = belief.member.shape[1], len(belief.best_member)
+    return (
+        lanes == LANES
+        and blocks == -(-belief.log_weight.size // LANES) > 0
+        and (belief.poses.shape, belief.member.shape[2]) == ((blocks, 9 * LANES), 6 * LANES)
+        and belief.first[0] == 0
+        and within(room, 0, 1 + min(rows))
+        and belief.first[-1] <= min(rows)
+        and within(belief.count, 0, 1 + room[:, None])
+        and within(belief.best_count, 0, 1 + room)
+        and np.unique(belief.landmark).size == landmarks
+        and _is_pose(belief.estimate)
+        and _finite(belief.poses)
+        and not np.isnan(belief.log_weight).any()
+        and _members_are_numbers(belief, room)
+    )
+
+
+def _members_are_numbers(belief: FastSlamBelief, room: Any) -> bool:
+    """Return whether all members in use are numbers; the other rows are unwritten."""
+    blocks, c = belief.member.shape[0], int(belief.first[-1])
+    place = np.arange(c) - np.repeat(belief.first[:-1], room)
+    best = belief.best_member[:c][place < np.repeat(belief.best_count, room)]
+    used = place[:, None] < np.repeat(belief.count, room, axis=1)
+    numbers = belief.member[:, :c].reshape(blocks, c, 6, LANES)
+    return not (np.isnan(best).any() or np.any(np.isnan(numbers) & used[:, :, None]))
+
+
+def _shapes(stack: Stack, *rest: tuple[int, ...], whole: Sequence[int] = ()) -> bool:
+    """Return whether the entries of a stack have these shapes; arrays in `whole` are integers."""
+    kinds = [np.int64 if n in whole else np.float64 for n in range(len(rest))]
+    shapes = tuple(array.shape[1:] for array in stack.arrays)
+    return shapes == rest and [array.dtype for array in stack.arrays] == kinds
+
+
+def _has_shapes(arrays: Sequence[Any], *shapes: tuple[int, ...]) -> bool:
+    """Return whether arrays are finite floats with these shapes."""
+    return tuple(array.shape for array in arrays) == shapes and all(
+        array.dtype == np.float64 and _finite(array) for array in arrays
+    )
+
+
+def _history(history: History) -> Any:
+    """All indices of nodes, rows, slots, landmarks and callers are in range."""
+    q, p = history.calibration.odometry.size, history.calibration.stds.size
+    legs = _shapes(history.legs, (3,), (3, 3), (), (2,), (2,), (3, q), whole=(3, 4))
+    if not (legs and _shapes(history.steps, (3,), (3, 3), (3, q)) and p >= q):
+        return False
+    if not (_shapes(history.rows, (4,), (8,), whole=(0,)) and history.legs.size):
+        return False
+    slots, nodes, placed = len(history.slots), history.nodes, len(history.placed)
+    callers, ends = len(history.callers), history.rows.entries(0)
+    heard, led = history.legs.entries(3), history.legs.entries(4)
+    of_border, in_chain = history.index[history.index > 0], -history.index[history.index < 0]
+    lengths = {history.index.size, history.latest.size, len(history.heard), history.moves.size}
+    return (
+        lengths == {slots}
+        and [*history.slots.values()] == [*range(slots)]
+        and within(heard, 0, 1 + history.rows.size)
+        and within(led, 0, 1 + history.steps.size)
+        and not any(np.any(span[:, 0] > span[:, 1]) for span in (heard, led))
+        and within(ends[:, :3], (0, -1, 0), (slots, slots, nodes))
+        and within(ends[:, 3], -1, np.arange(len(ends)))
+        and np.all((ends[:, 3] < 0) | (ends[ends[:, 3], 0] == ends[:, 0]))
+        and np.array_equal(np.sort(of_border), 1 + np.arange(placed))
+        and np.array_equal(np.sort(in_chain), POSE + CALLER * np.arange(callers))
+        and within(history.latest, -1, history.rows.size)
+        and within(history.heard[:, 1], -1, nodes)
+        and np.all((history.heard[:, 0] == NEVER) | within_each(history.heard[:, 0], nodes))
+        and within(history.moves, 0, 2)
+        and _has_shapes(history.known, (placed, 2), (placed, 3))
+        and (history.leaves.size, history.first.size) == (placed, callers)
+        and within(history.first, 0, nodes)
+        and _finite(history.way, *map(history.legs.entries, (0, 1, 2, 5)))
+        and _finite(*map(history.steps.entries, range(3)))
+    )
+
+
+def _columns(columns: Any, first: int, width: int) -> bool:
+    """Return whether landmarks have two columns of the border each, or 0."""
+    used = columns[columns != 0]
+    return (
+        within(used, first, width - 1)
+        and np.unique(used).size == used.size
+        and not np.any((used - first) % 2)
+    )
+
+
+def _smoother(belief: SmootherBelief) -> Any:
+    """The solution has the sizes and the columns of the history."""
+    history, solution = belief.history, belief.solution
+    points, odometry = solution.points, belief.odometry
+    p, q = history.calibration.stds.size, history.calibration.odometry.size
+    nodes, d, w, n = history.nodes, history.dimension, len(solution.border), solution.beta.size
+    if solution.columns.size != len(history.placed) or len(solution.places) != 6:
+        return False
+    places = history.places(solution.columns)
+    return (
+        all(map(np.array_equal, places[:4], solution.places[:4]))
+        and all(a.dtype == b.dtype for a, b in zip(places, solution.places, strict=True))
+        and all(a.shape[1:] == b.shape[1:] for a, b in zip(places, solution.places, strict=True))
+        and all(len(array) >= nodes for array in solution.places[4:])
+        and n == max(1 + p, 2 + int(solution.columns.max(initial=-2))) <= w
+        and _has_shapes(solution.front, (d, w), (d, d), (w, w))
+        and (solution.factor.shape, solution.covariance.shape) == ((n, n), (d, d))
+        and (points.at.size, points.parameters.size) == (nodes, p)
+        and len(points.spots) == len(history.placed)
+        and _shapes(points.at, (d,))
+        and len(belief.noise) == 5
+        and odometry.slopes.shape[1:] == (3, q)
+        and _is_pose(belief.at)
+        and _is_pose(belief.ahead)
+        and _stretches(solution.stretches, nodes, (d, w), (1 + p, len(history.placed)))
+        and _finite(solution.border, solution.factor, solution.beta)
+        and _finite(points.at.entries(0), points.spots, solution.covariance, odometry.mean)
+    )  # fmt: skip
+
+
+def _stretches(
+    stretches: Sequence[Stretch], nodes: int, size: tuple[int, int], border: tuple[int, int]
+) -> bool:
+    """Return whether stretches cover all nodes, with arrays that fit the state and the border.
+
+    ``size``: of the state and of the border; ``border``: its first column of landmarks, and their
+    number.
+    """
+    (d, most), (first, placed), least = size, border, 0
+    if len(stretches) != 1 + (nodes - 1) // STRETCH:
+        return False
+    for number, one in enumerate(stretches):
+        w, (g, a), left = one.front[0].shape[-1], (one.gone.size, one.freed.size), one.left
+        wide = one.links.arrays[0].shape[-1]
+        fits = (
+            one.first == number * STRETCH
+            and one.links.size == min(STRETCH, nodes - one.first)
+            and least <= w <= wide <= most
+            and _has_shapes(one.front, (d, w), (d, d), (w, w))
+            and _shapes(one.links, (d, wide), (d, d), (d, d))
+            and one.columns.size <= placed
+            and _columns(one.columns, first, w)
+            and g == a
+            and within(one.gone, 0, placed)
+            and _columns(one.freed, first, left[0].shape[2])
+            and one.freed.all()
+            and left[0].shape[2] <= most
+            and _has_shapes(left, (g, 2, left[0].shape[2]), (g, 2, d), (g, 2, 2))
+        )
+        if not fits:
+            return False
+        least = w
+    return True
+
+
+def within_each(values: Any, high: int) -> Any:
+    """Return the mask of integers in 0 <= n < high."""
+    return (values >= 0) & (values < high)
+
+
+LAWS: dict[Any, Callable[[Any], Any]] = {
+    Calibration: lambda it: within(it.odometry, 0, POSE) and it.sensor.min() >= 0,
+    EarlyScan: lambda it: (
+        it.scan.landmark.size == it.rows.caller.size
+        and within(it.direct, -1, it.scan.landmark.size)
+        and _is_pose(it.pose)
+    ),
+    EkfBelief: _ekf,
+    FastSlamBelief: _fastslam,
+    History: _history,
+    Known: lambda it: np.unique(it.label).size == it.label.size,
+    Memory: lambda it: (
+        it.scan >= 0
+        and within(it.known.label, 0, it.labels + 1)
+        and min((caller.label for caller in it.callers.values()), default=0) >= 0
+    ),
+    Scan: lambda it: it.caller.min(initial=0) >= 0 and within(it.direct, -1, it.landmark.size),
+    SessionState: _sessions,
+    SmootherBelief: _smoother,
+    Stack: lambda it: (
+        len(room := {len(array) for array in it.arrays if array.ndim}) == len(it.written) == 1
+        and 0 <= it.size <= it.written[0] <= min(room)
+    ),
+    Tracks: lambda it: (
+        len(it.rows) == len(it.poses)
+        and all(within(rows[:, 0], 0, len(it.last)) for rows in it.rows)
+    ),
+    _Heard: lambda it: (
+        it.label.size == it.came.landmark.size == it.scan.landmark.size and it.number >= 0
+    ),
+}
+"""Checks of the numbers of a record against each other."""

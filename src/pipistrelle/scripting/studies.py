@@ -1,4 +1,4 @@
-"""The results of a study for Python: its tables as data frames, its report as a page."""
+"""`study` and its results: tables as data frames, the report as a page."""
 
 from collections.abc import Callable, Mapping
 from functools import cached_property
@@ -22,9 +22,9 @@ if TYPE_CHECKING:
 
 
 class StudyResults:
-    """What `study` and `load` return: a study's folder, as far as it is done.
+    """Results of `study` and `load`: the finished worlds of a study.
 
-    Frames are polars'; a case is one combination of the grid, a strategy and a filter.
+    Tables are polars data frames; a case is a combination of the grid, a strategy and a filter.
 
     Examples
     --------
@@ -39,32 +39,32 @@ class StudyResults:
 
     def __init__(self, folder: Path, kept_by: "TemporaryDirectory[str] | None" = None) -> None:
         self.folder = folder
-        """Where the study is; gone with this object, if no folder was named."""
+        """Folder of the study; deleted with this object if none was named."""
         self._kept_by, self._stored = kept_by, load_study(folder)
 
     @property
     def plan(self) -> Plan:
-        """What is tried."""
+        """The plan of the study."""
         return self._stored.plan
 
     @cached_property
     def trials(self) -> "pl.DataFrame":
-        """A row for each world and case: the scores."""
+        """Scores of each world and case."""
         return self._stored.trials.collect()
 
     @cached_property
     def steps(self) -> "pl.DataFrame":
-        """A row for each world, case and frame: errors and NEES."""
+        """Errors and NEES of each world, case and frame."""
         return self._stored.steps.collect()
 
     @cached_property
     def landmarks(self) -> "pl.DataFrame":
-        """A row for each world, case and landmark: is it placed, and how far off."""
+        """Status and error of each world, case and landmark."""
         return self._stored.landmarks.collect()
 
     @cached_property
     def summary(self) -> "pl.DataFrame":
-        """A row for each case: its settings, the worlds that count, mean scores over them."""
+        """Settings, number of finished worlds and mean scores of each case."""
         import polars as pl
 
         case = ["case", "strategy", "filter", *self.plan.grid, "beamwidth_deg"]
@@ -78,11 +78,11 @@ class StudyResults:
 
     @property
     def answer(self) -> list[str]:
-        """What the report answers to the study's question: a line, then sentences."""
+        """Answer to the question of the study: a line, then sentences."""
         return list(self._answered.answer)
 
     def figure(self) -> "Figure":
-        """Draw the first figure of the report: what is asked, by what is varied."""
+        """Draw the first figure of the report: the main score by the varied settings."""
         from pipistrelle.figures.chart import draw_chart
         from pipistrelle.report.charts import study_charts
 
@@ -91,29 +91,29 @@ class StudyResults:
 
     @cached_property
     def _answered(self) -> "Answered":
-        """The study, as the report reads it."""
+        """The study with the answer of its report."""
         from pipistrelle.report.page import answered
         from pipistrelle.report.study import read_study
 
         return answered(read_study(self.folder))
 
     def report(self, folder: Path | str | None = None) -> Path:
-        """Put the study on one page, with its figures.
+        """Write the report of the study, a page with figures.
 
         Parameters
         ----------
         folder : Path, optional
-            By default that of the study.
+            By default ``report`` in the folder of the study.
 
         Returns
         -------
         Path
-            Of the page.
+            The page.
 
         Raises
         ------
         InputError
-            Where it cannot be written.
+            If it cannot be written.
         """
         from pipistrelle.report.page import write_report
         from pipistrelle.report.study import read_study
@@ -123,11 +123,11 @@ class StudyResults:
         return target / "index.html"
 
     def __repr__(self) -> str:
-        """Show the mean scores as a table."""
+        """Format the mean scores as a table."""
         return f"Study {self.plan.name}\n{self.summary}"
 
     def _repr_html_(self) -> str:
-        """Show the mean scores as a table."""
+        """Format the mean scores as HTML."""
         return self.summary._repr_html_()
 
 
@@ -140,34 +140,36 @@ def study(
     shard: tuple[int, int] = (0, 1),
     scheduler: str | None = None,
     output: Path | str | None = None,
+    retry_failed: bool = False,
     progress: Callable[[StudyProgress], None] | None = None,
     **settings: Any,
 ) -> StudyResults:
-    """Try all cases of a plan in many worlds, as `pipistrelle study` does.
+    """Run all cases of a plan in many worlds, as `pipistrelle study` does.
 
     Parameters
     ----------
     plan : str or mapping
-        "paper", "physics", "beyond", "timing", "association", "callers" or "pair", the path of a
-        plan, or a table. A table holds what the file would; paths in it lead from the folder where
-        Python works.
+        "paper", "physics", "beyond", "timing", "association", "callers", "pair", or a FILE.toml
+        like the plan.toml of a study; in Python also its content as a table.
     iterations : int, optional
-        Number of worlds; the plan's by default.
+        Number of worlds.
     workers : int
-        Processes. More than one are spawned, so a script must be guarded by
+        Number of processes. A script with several must be guarded by
         ``if __name__ == "__main__"``; a notebook need not be.
-    shard : i, n
-        Only each n-th world, from world i on: of several calls that share an output, on machines
-        that share a disk, each does its part.
+    shard : int, int
+        Share (i, n): every n-th world from world i on. Calls with different shares may run at the
+        same time on one folder.
     scheduler : str, optional
-        Of a Dask cluster: "local" for one that is made here, of so many workers, and guarded alike;
-        or the address of one that is there. Needs the extra ``cluster``.
+        Dask cluster to work on: local, or the address of a scheduler (tcp://HOST:PORT). Needs the
+        extra cluster.
     output : Path, optional
-        The study's folder, which it goes on in; without one it is gone when what is returned is.
+        Folder of the study; finished worlds are kept in it, and the study continues there.
+    retry_failed : bool
+        Run worlds with failed trials again.
     progress : callable, optional
-        Given how far the study is whenever a world is done.
+        Called with the state of the study after each world.
     **settings
-        As of `run`, over the plan's own.
+        Settings that override the plan's.
 
     Returns
     -------
@@ -176,8 +178,8 @@ def study(
     Raises
     ------
     InputError
-        A plan that is refused, a folder of another study, what a world is refused for, a share
-        that is none, or a cluster that cannot be had.
+        For a bad plan, setting, world or share, the folder of another study, or an unusable
+        cluster.
 
     Examples
     --------
@@ -185,7 +187,13 @@ def study(
     >>> study(levels, iterations=1, scenario={"steps": 8, "landmarks": 5}).trials.height
     6
     """
-    share, over = _share(shard), from_keywords(settings, study.__kwdefaults__ or ())
+    match shard:
+        case (int(i), int(n)) if 0 <= i < n:
+            share = i, n
+        case _:
+            expected = "(i, n) with i from 0 to n - 1, as in (0, 4)"
+            raise InputError(f"shard: found {shown(shard)}, expected {expected}")
+    over = from_keywords(settings, study.__kwdefaults__ or ())
     if isinstance(plan, Mapping):
         tried = plan_of(_listed({"format": FORMAT, **plan}), over=over, iterations=iterations)
     else:
@@ -194,8 +202,15 @@ def study(
     if output is None:
         kept_by = TemporaryDirectory(prefix="pipistrelle-")
         output = kept_by.name
-    where = {"workers": workers, "shard": share, "scheduler": scheduler}
-    run_study(tried, Path(output), progress=progress, **where)
+    run_study(
+        tried,
+        Path(output),
+        workers=workers,
+        shard=share,
+        scheduler=scheduler,
+        retry_failed=retry_failed,
+        progress=progress,
+    )
     return StudyResults(Path(output), kept_by)
 
 
@@ -206,12 +221,3 @@ def _listed(value: Any) -> Any:
     if hasattr(value, "tolist"):
         return value.tolist()
     return [*map(_listed, value)] if isinstance(value, (list, tuple)) else value
-
-
-def _share(given: object) -> tuple[int, int]:
-    """Check the share (i, n) of the worlds."""
-    match given:
-        case (int(i), int(n)) if 0 <= i < n:
-            return i, n
-    expected = "(i, n) with i from 0 to n - 1, as in (0, 4)"
-    raise InputError(f"shard: found {shown(given)}, expected {expected}")

@@ -1,1 +1,1 @@
-"""The command line: one module per verb, imported when it is called."""
+"""The command line: its verbs are imported when they are called."""

@@ -1,4 +1,4 @@
-"""The verbs of the command line, how one is run, and how mistakes in it are reported."""
+"""The verbs of the command line, and messages for mistakes in it."""
 
 from collections.abc import Sequence
 from errno import ENOSPC
@@ -19,18 +19,18 @@ from pipistrelle.verbs.streams import flush_results, say
 from pipistrelle.version import find_version
 
 SPELLINGS = (
-    "A setting is --rays.power 3 as a flag, PIPISTRELLE_RAYS__POWER=3 in the environment and "
-    "power = 3 under [rays] in FILE.toml; flags go before the environment, that before the file, "
-    "that before settings by name."
+    "--help-all lists all settings. A setting is --rays.power 3 as a flag, "
+    "PIPISTRELLE_RAYS__POWER=3 in the environment and power = 3 under [rays] in FILE.toml; flags "
+    "override the environment, that a file, and that settings by name."
 )
 
-FILMS = ("gif", "mp4")
+FILMS, EVERYTHING = ("gif", "mp4"), "--help-all"
 SHORT = {"scenario.steps": "duration", "emitter.radius": "beamwidth"}
-"""Settings that some verbs also take by a short name of another meaning."""
+"""Settings with a short option of another meaning."""
 
 app = App(
     name="pipistrelle",
-    help="Sonar SLAM with one's own calls, someone else's, or both: from waveform to verdict.",
+    help="Sonar SLAM with the calls of a vehicle, of other emitters, or both.",
     version=find_version,
     help_format="plaintext",
     exit_on_error=False,
@@ -38,79 +38,55 @@ app = App(
     result_action="return_value",
     suppress_keyboard_interrupt=False,
 )
-app.command(
-    "pipistrelle.verbs.run:run",
-    name="run",
-    help="Drive through one random world, by sound; the three strategies side by side.",
-    help_epilogue=SPELLINGS,
-)
-app.command(
-    "pipistrelle.verbs.slam:slam",
-    name="slam",
-    help="Solve a recorded log: a log folder, or a UTIAS MRCLAM folder as it is.",
-    help_epilogue=SPELLINGS,
-)
-app.command(
-    "pipistrelle.verbs.hear:hear",
-    name="hear",
-    help="Hear a sound recording of an array of microphones into a log, for slam.",
-)
-app.command(
-    "pipistrelle.verbs.view:view",
-    name="view",
-    help="Play a mission in a browser, frame by frame: one page, which asks for nothing outside.",
-)
-app.command(
-    "pipistrelle.verbs.study:study",
-    name="study",
-    help="Run many worlds, and all that a plan varies in each; again on one folder: go on.",
-    help_epilogue=SPELLINGS,
-)
-app.command(
-    "pipistrelle.verbs.report:report",
-    name="report",
-    help="Put a study on one page: the answer to its question, its figures and its numbers; for a "
-    "plan of the paper's, its claims judged.",
-)
-app.command(
-    "pipistrelle.verbs.compare:compare",
-    name="compare",
-    help="Put results side by side: scores, paths and settings of runs, logs or studies.",
-)
-app.command(
-    "pipistrelle.verbs.array:array",
-    name="array",
-    help="Draw a microphone array, and say what it can tell of a bearing and what it cannot.",
-)
-config = App(name="config", help="Show the settings, or what a file of settings may hold.")
-config.command(
-    "pipistrelle.verbs.config:show",
-    name="show",
-    help="Print the settings of `run` as TOML: defaults < named < file < environment < flags.",
-    help_epilogue=SPELLINGS,
-)
-config.command(
-    "pipistrelle.verbs.config:schema", name="schema", help="Print the settings' JSON schema."
-)
+config = App(name="config", help="Print the settings, or their schema.")
+for parent, name, place, words in (
+    (app, "run", "missions:run", "Simulate a drive through a random world and map it."),
+    (
+        app,
+        "slam",
+        "missions:slam",
+        "Solve a recorded log: a log folder, ROS bag or MRCLAM folder.",
+    ),
+    (app, "hear", "hear:hear", "Detect the echoes in a sound recording, as a log for slam."),
+    (app, "view", "view:view", "Play a mission in a browser, on one page that needs no network."),
+    (app, "study", "study:study", "Run all cases of a plan in many worlds, or continue a study."),
+    (
+        app,
+        "report",
+        "report:report",
+        "Write a study as one page: answer, figures, claims.",
+    ),
+    (app, "compare", "compare:compare", "Compare the results of runs, logs or studies."),
+    (app, "array", "view:array", "Draw a microphone array; print its ambiguous bearings."),
+    (config, "show", "missions:show", "Print the settings of `run` as TOML."),
+    (config, "schema", "missions:schema", "Print the JSON schema of the settings."),
+    (app, "doctor", "doctor:doctor", "Check the installation, and print the fix of each problem."),
+):
+    epilogue = SPELLINGS if name in ("run", "slam", "hear", "study", "show") else None
+    parent.command(f"pipistrelle.verbs.{place}", name=name, help=words, help_epilogue=epilogue)
 app.command(config)
-app.command(
-    "pipistrelle.verbs.doctor:doctor",
-    name="doctor",
-    help="Say what is installed here, and how to fix what is missing.",
-)
 
 
 def obey(words: Sequence[str], heard: Sequence[int] = ()) -> int:
-    """Run a command line and return its exit status; report mistakes of the user in a line.
+    """Run a command line and return its exit status; explain mistakes of the user in a line.
 
-    `heard` collects the signals that ask for an end: after one, an error is no mistake of the user.
+    `heard` collects signals to end; after the first, an error is not a mistake of the user.
     """
+    if EVERYTHING in words:
+        from pipistrelle.verbs import options
+
+        words = ["--help" if word == EVERYTHING else word for word in words]
+        options.EVERYTHING.value = True
+        try:
+            return obey(words, heard)
+        finally:
+            options.EVERYTHING.value = False
     try:
         _refuse_empty(words)
         _refuse_sections(words)
         status = app(_completed(words)) or 0
         flush_results()
-    except SystemExit:  # help, whose reader has left
+    except SystemExit:  # help, if its reader has left
         return 0
     except (CycloptsError, OSError, ValueError, MemoryError) as error:
         message = _explained(error, words)
@@ -123,7 +99,7 @@ def obey(words: Sequence[str], heard: Sequence[int] = ()) -> int:
 
 
 def _refuse_empty(words: Sequence[str]) -> None:
-    """Refuse an empty argument, which as a path would be the current folder."""
+    """Raise for an empty argument, which as a path would be the current folder."""
     for before, word in pairwise(("pipistrelle", *words)):
         flag, given, value = word.partition("=")
         if not word or (flag.startswith("-") and given and not value):
@@ -136,9 +112,9 @@ def _refuse_empty(words: Sequence[str]) -> None:
 
 
 def _refuse_sections(words: Sequence[str]) -> None:
-    """Refuse a value for a whole section of settings: it would be that of its first setting."""
+    """Raise for a value of a section of settings, which would set its first setting."""
     names = [word.partition("=")[0] for word in words if word.startswith("--")]
-    if not names or {"--help", "--version"} & {*names}:  # which load no settings
+    if not names or {"--help", "--version"} & {*names}:  # these load no settings
         return
     from pipistrelle.config import InputError
 
@@ -150,18 +126,18 @@ def _refuse_sections(words: Sequence[str]) -> None:
 
 
 def _sections() -> dict[str, list[str]]:
-    """Return the settings of each section; --filter is an option, too."""
+    """Return the settings of each section except `filter`, which is also an option."""
     from pipistrelle.settings import known_settings
 
-    found: dict[str, list[str]] = {}
+    sections: dict[str, list[str]] = {}
     for section, *rest in known_settings():
         if rest and section != "filter":
-            found.setdefault(section, []).append(rest[0].replace("_", "-"))
-    return found
+            sections.setdefault(section, []).append(rest[0].replace("_", "-"))
+    return sections
 
 
 def _completed(words: Sequence[str]) -> list[str]:
-    """Give a bare ``--animate`` its format."""
+    """Add the format to a bare ``--animate``."""
     return [
         "--animate=gif" if word == "--animate" and after not in FILMS else word
         for word, after in zip_longest(words, words[1:])
@@ -169,7 +145,7 @@ def _completed(words: Sequence[str]) -> list[str]:
 
 
 def _explained(error: Exception, words: Sequence[str]) -> str | None:
-    """Return the message for a user's mistake; None for a bug."""
+    """Return the message for a mistake of the user; None for a bug."""
     from pipistrelle.config import InputError
 
     if isinstance(error, MemoryError):
@@ -179,7 +155,7 @@ def _explained(error: Exception, words: Sequence[str]) -> str | None:
         )
     if isinstance(error, OSError) and error.filename:
         return f"{error.filename}: {error.strerror}"
-    if isinstance(error, OSError) and error.errno == ENOSPC:  # a full disk behind our output
+    if isinstance(error, OSError) and error.errno == ENOSPC:  # standard output on a full disk
         return f"the output could not be written: {error.strerror}"
     if isinstance(error, UnknownOptionError):
         return _unknown(error)
@@ -197,7 +173,7 @@ def _explained(error: Exception, words: Sequence[str]) -> str | None:
 
 
 def _unknown(error: UnknownOptionError) -> str:
-    """Name the option that was probably meant: spelt alike, or ending in the same part."""
+    """Return the message for an unknown option, with a similar one."""
     from pipistrelle.refusals import meant
 
     word = (error.token.keyword or error.token.value).partition("=")[0]
@@ -209,7 +185,7 @@ def _unknown(error: UnknownOptionError) -> str:
 
 
 def _too_many(error: UnusedCliTokensError, word: str, words: Sequence[str]) -> str:
-    """Return the message for an argument that no option takes."""
+    """Return the message for an argument without an option."""
     if ("--animate", word) in pairwise(words):
         return f"--animate: found {word!r}, expected {' or '.join(FILMS)}"
     verb, kinds = " ".join(error.command_chain or ()), signature(error.target or obey).parameters

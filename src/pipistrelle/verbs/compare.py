@@ -7,9 +7,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 from cyclopts import Parameter
 
 from pipistrelle.evaluation.scores import heading, shown_in
-from pipistrelle.verbs.console import announced
+from pipistrelle.verbs.console import announced, text_table
 from pipistrelle.verbs.streams import put
-from pipistrelle.verbs.text_tables import text_table
 
 if TYPE_CHECKING:
     from pipistrelle.experiments.comparing import (
@@ -105,7 +104,7 @@ def _keep(
     from pipistrelle.figures.comparison import draw_comparison
     from pipistrelle.figures.style import save_figure
     from pipistrelle.files import COMPARISON, claim
-    from pipistrelle.verbs.delivery import command_line
+    from pipistrelle.verbs.console import command_line
 
     own = claim(output, COMPARISON, overwrite=overwrite)
 

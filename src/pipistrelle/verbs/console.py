@@ -1,5 +1,8 @@
-"""Progress and tables for the terminal; results go to standard output."""
+"""Progress and tables for the terminal."""
 
+import io
+import shlex
+import shutil
 import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -8,6 +11,7 @@ from typing import TYPE_CHECKING
 
 from pipistrelle.estimation.catalogue import short_name
 from pipistrelle.evaluation.scores import heading, shown_in
+from pipistrelle.files import spelt
 from pipistrelle.verbs.streams import say
 
 if TYPE_CHECKING:
@@ -20,12 +24,17 @@ NIS = (
     "NIS: how large innovations are, squared, beside what the filter expects; 1 where it believes "
     "rightly."
 )
-"""The sentence that stands under a table with innovations."""
+"""Note below a table with innovations."""
+
+
+def command_line() -> str:
+    """Return the command line as a line of text; escape undecodable bytes."""
+    return spelt(shlex.join(["pipistrelle", *sys.argv[1:]]))
 
 
 @contextmanager
 def announced(message: str, after: float = 3.0) -> Iterator[None]:
-    """Print a message if what follows takes longer than `after` seconds.
+    """Print a message if the body of the context takes longer than `after` seconds.
 
     >>> with announced("Drawing mission.gif ..."):
     ...     pass
@@ -41,10 +50,10 @@ def announced(message: str, after: float = 3.0) -> Iterator[None]:
 
 @contextmanager
 def progress(quiet: bool) -> "Iterator[Progress]":
-    """Show one line per stage, with its frames per second.
+    """Yield a function that shows a line per stage: its frames done, and frames per second.
 
-    Yields a function of the stage's name, the frames done and their number. On a terminal the line
-    moves; elsewhere it is printed when the stage is done.
+    It takes the stage, the frames done and their total. On a terminal the line moves; elsewhere it
+    is printed at the end of the stage.
 
     >>> with progress(quiet=True) as show:
     ...     show("fused ekf", 375, 375)
@@ -59,7 +68,7 @@ def progress(quiet: bool) -> "Iterator[Progress]":
 
 
 def _lines() -> "Progress":
-    """Print a stage when it is done."""
+    """Return a function that prints each stage at its end."""
     elapsed = _stopwatch()
 
     def show(stage: str, done: int, total: int) -> None:
@@ -72,7 +81,7 @@ def _lines() -> "Progress":
 
 @contextmanager
 def _bars() -> "Iterator[Progress]":
-    """Draw a moving bar per stage."""
+    """Yield a function that draws a moving bar per stage."""
     from rich.console import Console
     from rich.progress import BarColumn, TextColumn
     from rich.progress import Progress as Bars
@@ -91,10 +100,7 @@ def _bars() -> "Iterator[Progress]":
 
 
 def _stopwatch() -> Callable[[str], float]:
-    """Return a function that times stages [s], each from the end of the one before it.
-
-    Time in which kernels are compiled is not counted.
-    """
+    """Return a function that gives the time since a stage began [s], without compilation."""
     from pipistrelle.kernel_clock import wall_s
 
     began, latest = {}, wall_s()
@@ -109,26 +115,25 @@ def _stopwatch() -> Callable[[str], float]:
 
 
 def _rate(frames: int, elapsed: float) -> str:
-    """Return the frames done and their rate as text."""
+    """Format the number of frames done and their rate."""
     speed = f", {frames / elapsed:.0f} frames/s" if elapsed > 0 and frames else ""
     return f"{frames:>5} frames{speed}"
 
 
 def closing_table(
     trials: "Sequence[TrialResult]",
-    there: int | None = None,
+    count: int | None = None,
     driven: float | None = None,
     names: "Mapping[str, str] | None" = None,
 ) -> str:
-    """Lay out the scores of a mission, a column per estimate; rows without any number are left out.
+    """Format the scores of a mission as a table with a column per estimate, and notes below it.
 
-    Six columns fit into 100 characters.
-    Under the table stands what a bound says, and the NIS, where there is one. `driven` is the way
-    by the odometry [m]. `names` has headings for strategies that have others than their names.
+    `count` is the number of landmarks in the world, `driven` the distance by the odometry [m]. Six
+    columns fit into 100 characters. `names` overrides headings of strategies.
     """
     from pipistrelle.evaluation.bound import IN_ONE_WORLD
 
-    columns = [dict(_cells(trial, there, driven)) for trial in trials]
+    columns = [dict(_cells(trial, count, driven)) for trial in trials]
     filters = [short_name(trial.filter) for trial in trials]
     heads = [(names or {}).get(trial.strategy, trial.strategy) for trial in trials]
     lines = [("", *heads), ("", *filters)]
@@ -144,14 +149,14 @@ def closing_table(
 
 
 def _cells(
-    trial: "TrialResult", there: int | None, driven: float | None
+    trial: "TrialResult", count: int | None, driven: float | None
 ) -> Iterator[tuple[str, str]]:
-    """Return the cells of an estimate by title, without those that it lacks."""
+    """Yield the title and the text of each score of an estimate, "" for a missing one."""
     s = trial.scores
     for name, score in shown_in("mission").items():
         yield heading(score), _number(getattr(s, name), score.digits)
     yield "landmarks, placed / heard", f"{s.landmarks_full} / {s.landmarks_total}"
-    yield "landmarks in the world", "" if there is None else str(there)
+    yield "landmarks in the world", "" if count is None else str(count)
     yield "fully placed, particles' mean", _number(trial.track.full, 1)
     yield "measurements per frame", _number(s.measurements_per_frame, 2)
     yield "rejected by the gate", str(s.gated or "")
@@ -163,7 +168,7 @@ def _cells(
 
 
 def _without_truth(trial: "TrialResult", driven: float | None) -> Iterator[tuple[str, str]]:
-    """Return cells of what an estimate states of itself, if there is no truth to score it."""
+    """Yield the innovations and standard deviations of an estimate without true poses."""
     from math import sqrt
 
     from pipistrelle.experiments.results.scores import judged
@@ -179,7 +184,50 @@ def _without_truth(trial: "TrialResult", driven: float | None) -> Iterator[tuple
 
 
 def _number(value: float | None, digits: int) -> str:
-    """Print a number, a huge one in few digits; nothing of none."""
+    """Format a number, with few digits if it is huge; "" for None."""
     if value is None:
         return ""
     return f"{value:.{digits}f}" if abs(value) < 1e5 else f"{value:.3g}"
+
+
+def text_table(title: str, heads: Sequence[Sequence[str]], rows: Sequence[Sequence[str]]) -> str:
+    """Format a table: the first column to the left, all others to the right; drawn on a terminal.
+
+    >>> print(text_table("", [["", "A", "B"]], [["NEES", "2.1", "10.0"]]))
+            A     B
+    NEES  2.1  10.0
+    """
+    return _drawn(title, heads, rows) if sys.stdout.isatty() else _plain(title, heads, rows)
+
+
+def _plain(title: str, heads: Sequence[Sequence[str]], rows: Sequence[Sequence[str]]) -> str:
+    """Format columns with two spaces between them."""
+    lines = [*heads, *rows]
+    widths = [max(map(len, column)) for column in zip(*lines, strict=True)]
+    texts = (
+        "  ".join(
+            cell.rjust(width) if i else cell.ljust(width)
+            for i, (cell, width) in enumerate(zip(line, widths, strict=True))
+        ).rstrip()
+        for line in lines
+    )
+    return "\n".join([*filter(None, [title]), *texts])
+
+
+def _drawn(title: str, heads: Sequence[Sequence[str]], rows: Sequence[Sequence[str]]) -> str:
+    """Format a table for a terminal, within its width."""
+    from rich import box
+    from rich.console import Console
+    from rich.table import Table
+    from rich.text import Text
+
+    table = Table(title=Text(title) if title else None, title_justify="left", box=box.SIMPLE_HEAD)
+    for i, column in enumerate(zip(*heads, strict=True)):
+        head = Text("\n".join(column).strip("\n") if i else "\n".join(column))
+        table.add_column(head, justify="right" if i else "left", overflow="fold")
+    for row in rows:
+        table.add_row(*map(Text, row))
+    out = io.StringIO()
+    width = shutil.get_terminal_size().columns
+    Console(file=out, force_terminal=True, width=width).print(table)
+    return "\n".join(line.rstrip() for line in out.getvalue().rstrip("\n").splitlines())

@@ -1,4 +1,4 @@
-"""`pipistrelle doctor`: what is installed here, and how to fix what is missing."""
+"""`pipistrelle doctor`: the installation, with the fix of each problem."""
 
 import os
 import re
@@ -23,12 +23,13 @@ def doctor(
         Parameter(
             name="--compile",
             negative=(),
+            show_default=False,
             help="Compile the kernels of all estimators, with and without labels, so that no later "
             "run, slam or study waits for them; some minutes.",
         ),
     ] = False,
 ) -> None:
-    """Print versions, folders and tools, one line each, with the fix of each problem."""
+    """Print versions, folders and tools, a line each, with the fix of each problem."""
     for name, state in _findings():
         put(f"{name:<18}{state}")
     if compile_kernels:
@@ -43,7 +44,7 @@ def doctor(
 
 
 def _findings() -> Iterator[tuple[str, str]]:
-    """Look at each thing in turn."""
+    """Yield the name and the state of each checked part of the installation."""
     from pipistrelle.experiments.machine import cores
 
     yield "python", f"{sys.version.split()[0]} ({sys.executable})"
@@ -56,7 +57,7 @@ def _findings() -> Iterator[tuple[str, str]]:
 
 
 def _libraries() -> Iterator[tuple[str, str]]:
-    """Read the versions of what the package requires, and of what its extras bring."""
+    """Yield the versions of required packages, and of the packages of extras."""
     try:
         required = requires("pipistrelle") or []
     except PackageNotFoundError:
@@ -74,7 +75,7 @@ def _libraries() -> Iterator[tuple[str, str]]:
 
 
 def _data(place: str | None) -> str:
-    """Look for recorded logs."""
+    """Return the state of the folder of recorded logs."""
     if place is None:
         return "not set; only tests and timings on recorded logs need it"
     if not (Path(place) / "mrclam").is_dir():

@@ -1,77 +1,36 @@
-"""`pipistrelle hear`: a sound recording to a log."""
+"""`pipistrelle hear`: the echoes of a sound recording as a log."""
 
-from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
-
-from cyclopts import Parameter
+from typing import Any
 
 from pipistrelle.config import InputError
 from pipistrelle.files import LOG, claim
-from pipistrelle.scripting.hearing import described, faults_of, heard_into, heard_settings, is_heard
+from pipistrelle.scripting import hearing
 from pipistrelle.settings import from_flags
 from pipistrelle.verbs.console import progress
-from pipistrelle.verbs.options import setting_flags
-from pipistrelle.verbs.streams import put, warn
-
-if TYPE_CHECKING:
-    HearFlags = dict[str, Any]
-else:
-    HearFlags = setting_flags(is_heard)
+from pipistrelle.verbs.options import setting_flags, spell, switch, verb_of
+from pipistrelle.verbs.streams import put, say, warn
 
 
-def hear(
-    recording: Annotated[
-        Path,
-        Parameter(
-            help="A folder of sound files, recording.toml, array.csv and odometry.csv, perhaps "
-            "calls.csv."
-        ),
-    ],
-    /,
-    *,
-    output: Annotated[
-        Path | None,
-        Parameter(name=("--output", "-o"), metavar="LOG", help="The log's folder."),
-    ] = None,
-    overwrite: Annotated[bool, Parameter(negative=(), help="Replace an earlier log in LOG.")] = (
-        False
-    ),
-    frames: Annotated[
-        str | None,
-        Parameter(
-            metavar="A:B",
-            help="Only the calls from number A, counted from 0, to before B. [default: all]",
-        ),
-    ] = None,
-    check: Annotated[
-        bool,
-        Parameter(
-            negative=(),
-            help="Look for mistakes instead: dead or clipped channels, a wrong sample rate, calls "
-            "that jump, channels and faces in another order.",
-        ),
-    ] = False,
-    quiet: Annotated[bool, Parameter(negative=(), help="Print the log's folder alone.")] = False,
-    settings: Annotated[HearFlags | None, Parameter(name="*")] = None,
-) -> int:
-    """Hear a sound recording into a log that `pipistrelle slam` solves."""
-    config = heard_settings(from_flags(settings or {}))
-    if check:
-        faults = faults_of(recording, config)
+def _hear(asked: dict[str, Any]) -> int:
+    """Detect the echoes of a recording; print the number of rows and the folder of the log."""
+    recording, output, quiet = asked["recording"], asked["output"], asked["quiet"]
+    config = hearing.heard_settings(from_flags(asked["settings"] or {}))
+    if asked["check"]:
+        faults = hearing.faults_of(recording, config)
         put("\n".join(faults) or "nothing odd was found")
         if faults:
             warn(f"{recording}: found {len(faults)} fault{'s' * (len(faults) > 1)}")
         return 1 if faults else 0
-    described(recording)
+    hearing.described(recording)
     if output is None:
         raise InputError("hear: found no folder for the log; name one with -o LOG")
-    own = claim(output, LOG, overwrite=overwrite, flags=("-o LOG", "--overwrite"))
+    flags = (spell("output", "LOG"), spell("overwrite"))
+    own = claim(output, LOG, overwrite=asked["overwrite"], flags=flags)
     from pipistrelle.kernel_clock import announce
-    from pipistrelle.verbs.streams import say
 
     announce(None if quiet else say)
     with progress(quiet) as show:
-        heard = heard_into(own, recording, config, frames, "--frames", show)
+        heard = hearing.heard_into(own, recording, config, asked["frames"], spell, show)
     warn(*(f"{recording}: {line}" for line in heard.odd))
     outside = heard.log.rows - heard.log.inside
     if outside:
@@ -80,3 +39,19 @@ def hear(
         put(f"{heard.log.rows} rows")
     put(own.folder)
     return 0
+
+
+hear = verb_of(
+    hearing.hear,
+    _hear,
+    settings=setting_flags(hearing.is_heard),
+    options={"frames": ("A:B", "all"), "output": ("LOG", "")},
+    extra=[
+        switch(
+            "check",
+            "Look for faults instead: silent or clipped channels, a wrong sample rate, calls that "
+            "jump, exchanged channels and faces.",
+        ),
+        switch("quiet", "Print only the folder of the log."),
+    ],
+)

@@ -1,25 +1,34 @@
-"""Options that verbs share: every setting as a flag, and the short names of a mission."""
+"""Verbs made from Python functions: their parameters as flags, and every setting as a flag."""
 
 import os
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from inspect import Parameter as Argument
+from inspect import Signature, cleandoc, signature
 from pathlib import Path
 from types import MappingProxyType, NoneType
-from typing import TYPE_CHECKING, Annotated, Any, Literal, TypedDict, Union, get_args, get_origin
+from typing import (
+    TYPE_CHECKING,
+    Annotated,
+    Any,
+    Literal,
+    TypedDict,
+    Union,
+    get_args,
+    get_origin,
+    get_type_hints,
+)
 
 from cyclopts import Group, Parameter
 
-from pipistrelle.config import Config, InputError
-from pipistrelle.estimation.catalogue import CATALOGUE, entry
+from pipistrelle.config import Config
+from pipistrelle.estimation.catalogue import CATALOGUE
 from pipistrelle.experiments.named_settings import NAMES, laid, settings_of
-from pipistrelle.scripting.arguments import GROUPS, mission_settings, named_filters
+from pipistrelle.scripting.arguments import GROUPS, Door
 from pipistrelle.settings import (
     ARRAY_KEY,
     CALLERS,
     OWN,
     SETTINGS,
-    WORLD_KEY,
-    Given,
     Key,
     Layer,
     from_environment,
@@ -27,12 +36,19 @@ from pipistrelle.settings import (
     from_text,
     known_settings,
 )
+from pipistrelle.verbs.console import announced, command_line
+from pipistrelle.verbs.streams import say, warn
 
-Chosen = Literal["active", "fused", "passive", "all"]
+OMITTED = ("progress", "settings")
+"""Parameters of Python without a flag of their name."""
+OTHER_DEFAULTS = ("shard", "workers")
+"""Parameters without the default of Python."""
+FLAGS = {"strategies": "--strategy", "filters": "--filter"}
+"""Flags that are spelt differently from their parameters."""
 
 
 def _whole(_: Any, tokens: Sequence[Any]) -> int:
-    """Read a whole number; the command line's own reader rounds 2.5 off."""
+    """Parse a whole number; cyclopts would round 2.5."""
     try:
         return int(tokens[0].value)
     except ValueError:
@@ -43,41 +59,185 @@ Whole = Annotated[int, Parameter(converter=_whole)]
 
 
 def _as_written(_: Any, tokens: Sequence[Any]) -> Any:
-    """Read a value as a file has it, on one line."""
+    """Parse a TOML value on one line."""
     return from_text(tokens[0].value)
 
 
+def _robot(_: Any, tokens: Sequence[Any]) -> int | str:
+    """Parse the number or the name of a robot."""
+    text = tokens[0].value
+    return int(text) if text.isdecimal() else text
+
+
 _METAVARS = {CALLERS: "TABLES", OWN: "TABLES", ARRAY_KEY: "FILE"}
-"""Settings that are given as a file has them, and what stands for them in the help."""
+"""Settings that are parsed as TOML, with their placeholder in the help."""
+
+
+class _Everything:
+    """A truth value: whether the help lists all settings."""
+
+    value = False
+
+    def __bool__(self) -> bool:
+        """Return the present value."""
+        return self.value
+
+    def __xor__(self, other: bool) -> bool:
+        """Compare with the wanted value, as cyclopts does to select the listed options."""
+        return self.value ^ other
+
+
+EVERYTHING: Any = _Everything()
+"""Set by ``--help-all``, read when the help is printed."""
 
 if TYPE_CHECKING:
-    from pipistrelle.experiments.hearing.scenario import World
-
     ChosenFilter = str
-else:  # the help names those that are listed
+else:  # the help lists these names
     ChosenFilter = Annotated[Literal[(*CATALOGUE, *GROUPS)] | str, Parameter(metavar="CHOICE")]
 NamedSettings = Annotated[
     list[str] | None,
     Parameter(
         name=("--settings", "--config"),
         metavar="NAME|FILE",
+        negative=(),
         help=f"Settings to start from: {', '.join(NAMES)}, or a TOML file as `pipistrelle config "
-        "show` prints it. A name lies beneath a file; give both by two --settings.",
+        "show` prints it. A file overrides a name; give both by two --settings.",
     ),
 ]
-Particles = Annotated[
-    Whole | None,
-    Parameter(metavar="N", help="Particles of FastSLAM; sets fastslam.particles. [default: 100]"),
-]
+_KINDS: dict[str, Any] = {
+    "config": NamedSettings,
+    "strategies": Literal["active", "fused", "passive", "all"],
+    "filters": ChosenFilter | None,
+    "robot": Annotated[int | str | None, Parameter(converter=_robot, n_tokens=1)],
+    "shard": str | None,
+    "workers": Whole | None,
+    "plan": str,
+}
+"""Types of parameters on the command line, where they differ from Python's."""
+_ALL_NAMES = {"filters": ("--filter", "--estimator"), "output": ("--output", "-o")}
+
+
+def verb_of(
+    function: Callable[..., Any],
+    act: Callable[[dict[str, Any]], Any],
+    *,
+    settings: Any,
+    options: Mapping[str, tuple[str, ...]],
+    extra: Sequence[Argument] = (),
+    only: Sequence[str] = (),
+) -> Callable[..., Any]:
+    """Return a verb of the command line with the parameters and the help of a Python function.
+
+    `act` receives the arguments by name. `options` gives the placeholder of parameters in the help,
+    the text of their default, and perhaps other help than Python's. `settings` is the type of the
+    flags of settings, `extra` are parameters that only the command line has, and `only` selects
+    parameters of the function.
+    """
+    hints, arguments = get_type_hints(function), []
+    for name, argument in signature(function).parameters.items():
+        if name in OMITTED or (only and name not in only):
+            continue
+        metavar, default, *words = options.get(name, ("", ""))
+        other_help: Any = {"help": words[0]} if words else {}
+        kind, positional = _kind(name, hints[name]), argument.kind is Argument.POSITIONAL_ONLY
+        if name == "config":
+            positional = False
+        else:
+            flag = Parameter(
+                name=None if positional else _ALL_NAMES.get(name, FLAGS.get(name)),
+                **other_help,
+                metavar=metavar or None,
+                negative=(),
+                show_default=default or argument.default not in (None, False),
+            )
+            kind = Annotated[kind, flag]
+        value = None if name in OTHER_DEFAULTS else argument.default
+        where = Argument.POSITIONAL_ONLY if positional else Argument.KEYWORD_ONLY
+        arguments.append(Argument(name, where, default=value, annotation=kind))
+    flags = Annotated[settings | None, Parameter(name="*")]
+    arguments += [
+        *extra,
+        Argument("settings", Argument.KEYWORD_ONLY, default=None, annotation=flags),
+    ]
+    arguments.sort(key=lambda one: one.kind)
+    bound = Signature(arguments)
+
+    def verb(*words: Any, **given: Any) -> Any:
+        values = bound.bind(*words, **given)
+        values.apply_defaults()
+        return act(values.arguments)
+
+    verb.__doc__ = _rejoined(cleandoc(function.__doc__ or ""))
+    verb.__annotations__ = {one.name: one.annotation for one in arguments}
+    verb.__dict__["__signature__"] = bound
+    return verb
+
+
+def _rejoined(text: str) -> str:
+    """Join the lines of each indented paragraph, which the help wraps again."""
+    lines: list[str] = []
+    for line in text.splitlines():
+        indented = line.startswith("    ")
+        if indented and lines and lines[-1].startswith("    "):
+            lines[-1] += f" {line.strip()}"
+        else:
+            lines.append(line)
+    return "\n".join(lines)
+
+
+def _kind(name: str, hint: Any) -> Any:
+    """Return the type of a parameter on the command line."""
+    kinds = get_args(hint)
+    if name in _KINDS:
+        return _KINDS[name]
+    if Path in kinds:
+        return Path | None if NoneType in kinds else Path
+    return Whole | None if set(kinds) == {int, NoneType} else hint
+
+
+def switch(name: str, words: str) -> Argument:
+    """Return a switch that only the command line has, with its help."""
+    kind = Annotated[bool, Parameter(help=words, negative=(), show_default=False)]
+    return Argument(name, Argument.KEYWORD_ONLY, default=False, annotation=kind)
+
+
+def spell(name: str, value: str = "") -> str:
+    """Format a parameter, perhaps with a value, as a flag.
+
+    >>> spell("save_log", "DIR"), spell("overwrite", "True")
+    ('--save-log DIR', '--overwrite')
+    """
+    flag = FLAGS.get(name, f"--{name.replace('_', '-')}")
+    if value in ("", "True"):
+        return flag
+    return f"-o {value}" if name == "output" else f"{flag} {value}"
+
+
+def door_of(asked: Mapping[str, Any], **more: Any) -> Door:
+    """Return a call from the command line; it prints messages unless it is quiet."""
+    if asked.get("quiet"):
+        more.setdefault("note", lambda _: None)
+    else:
+        more |= {"note": say, "drawing": announced}
+    return Door(
+        asked=asked,
+        beneath=layers(asked["config"], None),
+        flags=from_flags(asked["settings"] or {}),
+        command=command_line(),
+        option=spell,
+        warn=warn,
+        makes_folder=True,
+        **more,
+    )
 
 
 def setting_flags(
     shown: Callable[[Key], bool] = lambda _: True, own: Mapping[Key, Any] = MappingProxyType({})
 ) -> Any:
-    """Make the type from which the command line builds a flag for every setting.
+    """Return a type with a flag for each setting, as cyclopts parses it.
 
-    `shown` says whether the help lists a setting; its flag works either way. `own` holds defaults
-    that a verb has of its own, for the help.
+    ``--help-all`` lists the settings that are `shown`, ``--help`` only the seed; all flags work.
+    `own` holds defaults of the verb that differ, for the help.
 
     >>> sorted(setting_flags().__annotations__)[:3]
     ['air', 'association', 'assumed']
@@ -86,13 +246,14 @@ def setting_flags(
     top: dict[str, Any] = {}
     for key, field in known_settings().items():
         if key == SETTINGS:
-            continue  # an option that takes files, too
+            continue  # --settings takes files also
         value = own.get(key, field.default)
         default = value if isinstance(value, tuple) else (value,)
         texts = [str(item).lower() if isinstance(item, bool) else str(item) for item in default]
-        settled = "" if value is None else f"[default: {' '.join(texts) or 'none'}]"
+        settled = "" if value in (None, ()) else f"[default: {' '.join(texts)}]"
         words = " ".join(f"{field.description or ''} {settled}".split())
-        flag = Parameter(help=words, show=shown(key), negative=(), consume_multiple=True)
+        show = shown(key) and (key == ("seed",) or EVERYTHING)
+        flag = Parameter(help=words, show=show, negative=(), consume_multiple=True)
         kind: Any = Whole if field.annotation is int else _unbounded(field.annotation)
         if key in _METAVARS:
             metavar = _METAVARS[key]
@@ -112,7 +273,7 @@ def setting_flags(
 
 
 def _unbounded(kind: Any) -> Any:
-    """Return a type without its bounds and without None: `resolve` refuses, in the same words."""
+    """Return a type without bounds and None, which `resolve` checks."""
     parts = [_unbounded(part) for part in get_args(kind) if part is not NoneType]
     either: Any = Union
     if get_origin(kind) is Union and len(parts) > 1:
@@ -124,7 +285,7 @@ def _unbounded(kind: Any) -> Any:
 
 
 def _section_group(section: str) -> Group:
-    """Return the heading of a section of settings in the help, in the order of `Config`."""
+    """Return the help panel of a section of settings, in the order of `Config`."""
     order = list(Config.model_fields).index(section)
     meaning = type(getattr(Config(), section)).__doc__ or ""
     return Group(f"Settings: {section}", help=" ".join(meaning.split()), sort_key=order)
@@ -136,100 +297,8 @@ else:
     SettingFlags = setting_flags()
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class OutputOptions:
-    """Options for the output of a mission."""
-
-    output: Annotated[
-        Path | None,
-        Parameter(
-            name=("--output", "-o"),
-            metavar="DIR",
-            help="The result folder itself. [default: runs/TIME-NAME]",
-        ),
-    ] = None
-    overwrite: Annotated[bool, Parameter(negative=(), help="Replace earlier results in DIR.")] = (
-        False
-    )
-    animate: Annotated[
-        Literal["gif", "mp4"] | None,
-        Parameter(help="Film the mission; --animate without a value makes a gif. [default: no]"),
-    ] = None
-    save_bag: Annotated[
-        bool, Parameter(negative=(), help="Write tracks and maps as a ROS bag, too: mission.mcap.")
-    ] = False
-    quiet: Annotated[bool, Parameter(negative=(), help="Print the result folder alone.")] = False
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class MissionOptions:
-    """Options for the world of a simulated mission."""
-
-    named: NamedSettings = None
-    beamwidth: Annotated[
-        float | None,
-        Parameter(
-            metavar="DEG",
-            help="Half-power beamwidth of the vehicle's call [deg], up to 180; sets "
-            "emitter.radius. [default: 33.3]",
-        ),
-    ] = None
-    landmarks: Annotated[
-        Whole | None,
-        Parameter(metavar="N", help="Number of landmarks; sets scenario.landmarks. [default: 50]"),
-    ] = None
-    duration: Annotated[
-        float | None,
-        Parameter(
-            metavar="SECONDS",
-            help="Length of the drive [s]; sets scenario.steps. [default: 187.5]",
-        ),
-    ] = None
-    engine: Annotated[
-        Literal["auto", "block", "dense"] | None,
-        Parameter(
-            help="How samples are computed: block (exact sums over blocks, fast), dense (every "
-            "sample, slow) or auto (block where it applies); sets receiver.engine. [default: auto]"
-        ),
-    ] = None
-    particles: Particles = None
-    world: Annotated[
-        Path | None,
-        Parameter(
-            metavar="DIR",
-            help="A world of your own: landmarks.csv, path.csv, world.toml; sets scenario.world. "
-            "[default: one is drawn]",
-        ),
-    ] = None
-    settings: Annotated[SettingFlags | None, Parameter(name="*")] = None
-
-
-def mission_config(options: MissionOptions) -> tuple[Config, "World | None", tuple[str, ...]]:
-    """Resolve the settings of a mission: defaults < world < named < file < environment < flags.
-
-    The estimators that the named settings are meant for are returned, too.
-
-    >>> config, _, estimators = mission_config(MissionOptions(duration=60.0))
-    >>> config.scenario.steps, config.settings, estimators
-    (480, 'best', ('smoother',))
-    """
-    short: Layer = {
-        WORLD_KEY: Given(options.world and str(options.world), "--world"),
-        ("scenario", "landmarks"): Given(options.landmarks, "--landmarks"),
-        ("receiver", "engine"): Given(options.engine, "--engine"),
-        ("fastslam", "particles"): Given(options.particles, "--particles"),
-    }
-    return mission_settings(
-        layers(options.named, None),
-        from_flags(options.settings or {}),
-        short,
-        beamwidth=Given(options.beamwidth, "--beamwidth"),
-        duration=Given(options.duration, "--duration"),
-    )
-
-
 def layers(named: Sequence[str] | None, settings: SettingFlags | None) -> Layer:
-    """Lay named settings, files, environment and flags over each other.
+    """Merge named settings, files, environment and flags.
 
     >>> layers(None, {"seed": 3})["seed",].value
     3
@@ -238,20 +307,3 @@ def layers(named: Sequence[str] | None, settings: SettingFlags | None) -> Layer:
     named_here = (layer for word, layer in given if word in NAMES)
     start, environment = (layer for _, layer in given), from_environment(os.environ)
     return laid(*start, environment, from_flags(settings or {}), *named_here)
-
-
-def filters(chosen: str | Sequence[str], particles: int | None) -> tuple[str, ...]:
-    """Return the names of the estimators of a choice; refuse particles for filters without them.
-
-    >>> filters("both", 300), filters("ekf", None)
-    (('ekf', 'fastslam'), ('ekf',))
-    """
-    names = named_filters(chosen, "--filter")
-    if particles is not None and not any("fastslam" in entry(n).sections for n in names):
-        able = [known.name for known in CATALOGUE.values() if "fastslam" in known.sections]
-        others = " or ".join(f"--filter {name}" for name in (*able, *GROUPS))
-        raise InputError(
-            f"--particles: found {particles}, but --filter is {','.join(names)}, which has none; "
-            f"add {others}"
-        )
-    return names

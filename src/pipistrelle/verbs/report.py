@@ -5,7 +5,7 @@ from typing import Annotated, Any
 
 from cyclopts import Parameter
 
-from pipistrelle.verbs.text_tables import text_table
+from pipistrelle.verbs.console import text_table
 
 
 def report(

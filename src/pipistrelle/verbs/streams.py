@@ -1,22 +1,26 @@
-"""Standard output and error, which may be closed, be full, or have no reader any more.
+"""Standard streams that may be closed, full or without a reader, and signals to end.
 
-What a person reads never decides what becomes of the work: a word that cannot be said is not said,
-and the exit status tells what was done.
+A message that cannot be written is dropped: it never stops the work, and the exit status remains.
 """
 
 import codecs
 import os
+import signal
 import sys
-from contextlib import suppress
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
 from errno import EPIPE
+from types import FrameType
 from typing import TextIO
+
+ENDING = (signal.SIGINT, signal.SIGTERM)
 
 
 def hold_streams() -> None:
-    """Open something in place of standard streams that are closed; print odd names by their bytes.
+    """Open the null device for closed standard streams; print undecodable names as bytes.
 
-    Otherwise the next file that is opened would get the number of a closed stream, and what is
-    meant for the stream would be written into it.
+    Otherwise the next opened file would get the number of a closed stream, and messages would be
+    written into it.
 
     >>> hold_streams()
     """
@@ -24,7 +28,7 @@ def hold_streams() -> None:
         try:
             os.fstat(number)
         except OSError:
-            os.open(os.devnull, os.O_RDWR)  # it gets the lowest number that is free: this one
+            os.open(os.devnull, os.O_RDWR)  # gets the lowest free number, this one
     for name in ("stdout", "stderr"):
         if getattr(sys, name) is None:
             setattr(sys, name, open(os.devnull, "w", encoding="utf-8"))  # noqa: SIM115, PTH123
@@ -34,7 +38,7 @@ def hold_streams() -> None:
 
 
 def _as_bytes(error: UnicodeError) -> tuple[str | bytes, int]:
-    """Encode a name as its bytes, and a character that the stream lacks as its number."""
+    """Encode a name as its bytes, and a character outside the encoding as its number."""
     try:
         return codecs.lookup_error("surrogateescape")(error)
     except UnicodeError:
@@ -42,7 +46,7 @@ def _as_bytes(error: UnicodeError) -> tuple[str | bytes, int]:
 
 
 def say(message: str) -> None:
-    """Write a line to standard error at once, if it is open, without control characters.
+    """Write a line to standard error if it is open; escape control characters.
 
     >>> say("Drawing mission.gif ...")
     """
@@ -55,7 +59,7 @@ def say(message: str) -> None:
 
 
 def warn(*messages: str) -> None:
-    """Print warnings about a result that was written nevertheless.
+    """Write warnings to standard error.
 
     >>> warn("the beam is wider than the world")
     """
@@ -64,7 +68,7 @@ def warn(*messages: str) -> None:
 
 
 def flush_results() -> None:
-    """Write out what standard output still holds, unless its reader has left."""
+    """Flush standard output, unless its reader has left."""
     try:
         sys.stdout.flush()
     except OSError as error:
@@ -86,7 +90,46 @@ def put(*values: object, end: str = "\n") -> None:
 
 
 def _silence(stream: TextIO) -> None:
-    """Discard what a stream still holds, and all that follows."""
+    """Redirect a stream to the null device, with its unwritten text."""
     nowhere = os.open(os.devnull, os.O_WRONLY)
     os.dup2(nowhere, stream.fileno())
     os.close(nowhere)
+
+
+class Interrupted(KeyboardInterrupt):
+    """A keyboard interrupt that is caught.
+
+    If a plain one passes through ``exec``, as in the import of some libraries, Python ends by the
+    signal even if the interrupt is caught later.
+    """
+
+
+@contextmanager
+def heard_signals(*, last: bool = False) -> Iterator[list[int]]:
+    """Raise `Interrupted` on signals to end; yield the list of received signals.
+
+    A library may replace the interruption by its own error, so check the list. If this is the
+    `last` work of the process, signals are ignored afterwards.
+
+    >>> from contextlib import suppress
+    >>> with suppress(KeyboardInterrupt), heard_signals() as heard:
+    ...     signal.raise_signal(signal.SIGTERM)
+    >>> heard
+    [15]
+    """
+    heard: list[int] = []
+
+    def interrupt(number: int, _: FrameType | None) -> None:
+        heard.append(number)
+        raise Interrupted
+
+    try:
+        before = {ending: signal.signal(ending, interrupt) for ending in ENDING}
+    except ValueError:  # only the main thread receives signals
+        yield heard
+        return
+    try:
+        yield heard
+    finally:
+        for ending, handler in before.items():
+            signal.signal(ending, signal.SIG_IGN if last else handler)

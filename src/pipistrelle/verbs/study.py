@@ -5,16 +5,18 @@ import shlex
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from inspect import Parameter as Argument
 from pathlib import Path
 from time import perf_counter
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from cyclopts import Parameter
 
 from pipistrelle.config import InputError
 from pipistrelle.experiments.named_settings import PLANS, parted
+from pipistrelle.scripting import studies
 from pipistrelle.settings import Layer
-from pipistrelle.verbs.options import NamedSettings, SettingFlags, Whole, layers
+from pipistrelle.verbs.options import NamedSettings, layers, setting_flags, switch, verb_of
 from pipistrelle.verbs.streams import put, say, warn
 
 if TYPE_CHECKING:
@@ -23,7 +25,7 @@ if TYPE_CHECKING:
 
 Show = Callable[["StudyProgress"], None]
 PROGRESS_INTERVAL = 10.0
-"""Least time between two lines of progress [s]."""
+"""Minimum time between two lines of progress [s]."""
 SHARDS = 16
 SLURM = """\
 #!/bin/sh
@@ -35,94 +37,52 @@ exec {command} --workers {workers} --shard "$SLURM_ARRAY_TASK_ID/{shards}" -o {f
 """
 
 
-def study(
-    plan: Annotated[
-        str,
-        Parameter(
-            metavar="PLAN",
-            help=f"{', '.join(PLANS)} or a FILE.toml, as a study's plan.toml.",
-        ),
-    ] = "paper",
-    /,
-    *,
-    iterations: Annotated[
-        Whole | None, Parameter(metavar="N", help="Number of worlds. [default: the plan's]")
-    ] = None,
-    workers: Annotated[
-        Whole | None, Parameter(metavar="N", help="Processes. [default: one per core]")
-    ] = None,
-    shard: Annotated[
-        str | None,
-        Parameter(metavar="I/N", help="Do only the I-th of N shares, from 0 on. [default: all]"),
-    ] = None,
-    output: Annotated[
-        Path | None,
-        Parameter(
-            name=("--output", "-o"),
-            metavar="DIR",
-            help="The study's folder; what is done in it is kept. [default: runs/NAME]",
-        ),
-    ] = None,
-    retry_failed: Annotated[
-        bool, Parameter(negative=(), help="Do worlds again that hold failed trials.")
-    ] = False,
-    scheduler: Annotated[
-        str | None,
-        Parameter(
-            metavar="ADDRESS",
-            help="Work on a Dask cluster: local, or that of a scheduler (tcp://HOST:PORT). "
-            "[default: none]",
-        ),
-    ] = None,
-    emit: Annotated[
-        Literal["slurm"] | None,
-        Parameter(help="Print a job script of shards (N of --shard, else 16) and do nothing else."),
-    ] = None,
-    quiet: Annotated[bool, Parameter(negative=(), help="Print the study's folder alone.")] = False,
-    named: NamedSettings = None,
-    settings: Annotated[SettingFlags | None, Parameter(name="*")] = None,
-) -> int:
-    """Try all cases of a plan in many worlds; continue where an earlier run stopped."""
+def _study(asked: dict[str, Any]) -> int:
+    """Run a study, or print its job script; print the numbers of worlds and its folder."""
     from pipistrelle.experiments.studies.plan import MOST_WORLDS, find_plan, read_plan
 
+    iterations, workers, quiet = asked["iterations"], asked["workers"], asked["quiet"]
+    scheduler = asked["scheduler"]
     for flag, number in (("--iterations", iterations), ("--workers", workers)):
         if number is not None and not 1 <= number <= MOST_WORLDS:
             raise InputError(f"{flag}: found {number}, expected 1 to {MOST_WORLDS}")
     if workers is not None and scheduler not in (None, "local"):
         raise InputError(f"--workers: the cluster at {scheduler} has its own; leave it out")
-    share, layer = _share(shard), layers(named, settings)
-    tried = read_plan(find_plan(plan), layer, iterations)
-    folder = output or Path("runs") / tried.name
+    share, layer = _share(asked["shard"]), layers(asked["config"], asked["settings"])
+    plan = read_plan(find_plan(asked["plan"]), layer, iterations)
+    folder = asked["output"] or Path("runs") / plan.name
     from pipistrelle.experiments.machine import cores
     from pipistrelle.experiments.studies.study import check_cases, run_study, warnings_of_plan
 
-    if emit:
-        check_cases(tried, 0)
-        warn(*warnings_of_plan(tried))
-        shards = share[1] if shard else min(SHARDS, tried.iterations)
-        command = _command(plan, tried, layer)
-        put(_slurm(tried.name, command, folder, shards, workers or 1), end="")
+    if asked["emit"]:
+        check_cases(plan, 0)
+        warn(*warnings_of_plan(plan))
+        shards = share[1] if asked["shard"] else min(SHARDS, plan.iterations)
+        script = SLURM.format(
+            name=plan.name,
+            last=shards - 1,
+            shards=shards,
+            workers=workers or 1,
+            command=_command(asked["plan"], plan, layer),
+            folder=shlex.quote(str(folder.absolute())),
+        )
+        put(script, end="")
         return 0
-    warn(*warnings_of_plan(tried))
+    warn(*warnings_of_plan(plan))
     try:
         with _progress(quiet) as show:
             so_far = run_study(
-                tried,
+                plan,
                 folder,
                 workers=workers or cores(),
                 shard=share,
                 scheduler=scheduler,
-                retry_failed=retry_failed,
-                progress=show if scheduler else _compiled_first(tried, show, quiet),
+                retry_failed=asked["retry_failed"],
+                progress=show if scheduler else _compiled_first(plan, show, quiet),
             )
     except KeyboardInterrupt:
         say(f"{folder}: worlds that are done are kept; the same command goes on with the rest")
         raise
-    return _close(so_far, folder, quiet)
-
-
-def _close(so_far: "StudyProgress", folder: Path, quiet: bool) -> int:
-    """Say how the study ended, and where it is; return the exit status."""
     ended, failed = sum(so_far.ended.values()), sum(so_far.failed.values())
     if not quiet:
         put(f"{so_far.done} worlds, {ended} trials, {failed} failed")
@@ -137,7 +97,7 @@ def _close(so_far: "StudyProgress", folder: Path, quiet: bool) -> int:
 
 
 def _share(text: str | None) -> tuple[int, int]:
-    """Read the share I/N of the worlds."""
+    """Parse the share I/N of the worlds."""
     i, slash, n = (text or "0/1").partition("/")
     if slash and i.isdecimal() and n.isdecimal() and int(i) < int(n):
         return int(i), int(n)
@@ -145,7 +105,7 @@ def _share(text: str | None) -> tuple[int, int]:
 
 
 def _command(word: str, plan: "Plan", layer: Layer) -> str:
-    """Return the command line of a plan and of the settings laid over it."""
+    """Return the command line of a study with the settings that override its plan."""
     place = word if word in PLANS else str(Path(word).absolute())
     words = ["pipistrelle", "study", place, "--iterations", str(plan.iterations)]
     common, own = parted(layer)
@@ -162,20 +122,8 @@ def _command(word: str, plan: "Plan", layer: Layer) -> str:
     return shlex.join(words)
 
 
-def _slurm(name: str, command: str, folder: Path, shards: int, workers: int) -> str:
-    """Write a job script in which each task of an array does a share."""
-    return SLURM.format(
-        name=name,
-        last=shards - 1,
-        shards=shards,
-        workers=workers,
-        command=command,
-        folder=shlex.quote(str(folder.absolute())),
-    )
-
-
 def _compiled_first(plan: "Plan", show: Show, quiet: bool) -> Show:
-    """Compile a plan's kernels before the first world, so that not every worker has to."""
+    """Return a progress function that first compiles the kernels of a plan for all workers."""
     ready = False
 
     def prepare(so_far: "StudyProgress") -> None:
@@ -196,7 +144,7 @@ def _compiled_first(plan: "Plan", show: Show, quiet: bool) -> Show:
 
 @contextmanager
 def _progress(quiet: bool) -> Iterator[Show]:
-    """Show how far the study is: bars on a terminal, elsewhere a line now and then."""
+    """Yield a function that shows progress: bars on a terminal, else lines."""
     if quiet:
         yield lambda _: None
     elif sys.stderr.isatty():
@@ -207,7 +155,7 @@ def _progress(quiet: bool) -> Iterator[Show]:
 
 
 def _lines() -> Show:
-    """Print a line first, last and every few seconds."""
+    """Return a function that prints a line first, last and every few seconds."""
     pace, due = _pace(), 0.0
 
     def show(so_far: "StudyProgress") -> None:
@@ -227,7 +175,7 @@ def _lines() -> Show:
 
 @contextmanager
 def _bars() -> Iterator[Show]:
-    """Draw a bar for the worlds and one per strategy."""
+    """Yield a function that draws a bar for the worlds and a bar per strategy."""
     from rich.console import Console
     from rich.progress import BarColumn, Progress, TextColumn
 
@@ -254,12 +202,12 @@ def _bars() -> Iterator[Show]:
 
 
 def _failures(number: int) -> str:
-    """Return the number of failed trials as text, if any failed."""
+    """Format the number of failed trials; "" for none."""
     return f" ({number} failed)" if number else ""
 
 
 def _pace() -> Callable[["StudyProgress"], str]:
-    """Return a function that words the speed since its first call, and the time left."""
+    """Return a function that formats the speed since its first call, and the remaining time."""
     began: tuple[float, int] | None = None
 
     def pace(so_far: "StudyProgress") -> str:
@@ -275,8 +223,32 @@ def _pace() -> Callable[["StudyProgress"], str]:
 
 
 def _span(seconds: float) -> str:
-    """Return a duration as text."""
+    """Format a duration."""
     minutes = round(seconds / 60.0)
     if seconds < 100.0:
         return f"{seconds:.0f} s"
     return f"{minutes} min" if minutes < 100 else f"{minutes // 60} h {minutes % 60} min"
+
+
+_EMIT = Annotated[
+    Literal["slurm"] | None,
+    Parameter(help="Print a job script of shards (N of --shard, else 16) and do nothing else."),
+]
+study = verb_of(
+    studies.study,
+    _study,
+    settings=setting_flags(),
+    options={
+        "plan": ("", "", f"{', '.join(PLANS)}, or a FILE.toml like the plan.toml of a study."),
+        "iterations": ("N", "that of the plan"),
+        "workers": ("N", "one per core", "Number of processes."),
+        "shard": ("I/N", "all", "Run only the I-th of N shares, from 0 on."),
+        "output": ("DIR", "runs/NAME"),
+        "scheduler": ("ADDRESS", ""),
+    },
+    extra=[
+        Argument("config", Argument.KEYWORD_ONLY, default=None, annotation=NamedSettings),
+        Argument("emit", Argument.KEYWORD_ONLY, default=None, annotation=_EMIT),
+        switch("quiet", "Print only the folder of the study."),
+    ],
+)

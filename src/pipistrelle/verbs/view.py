@@ -1,5 +1,7 @@
-"""`pipistrelle view`: a mission, frame by frame, on one page."""
+"""`pipistrelle view` and `array`: a mission as a page, a microphone array as a picture."""
 
+import io
+import math
 import os
 from contextlib import suppress
 from pathlib import Path
@@ -8,7 +10,8 @@ from typing import TYPE_CHECKING, Annotated
 
 from cyclopts import Parameter
 
-from pipistrelle.config import InputError
+from pipistrelle.config import SQUARE, InputError
+from pipistrelle.experiments.named_settings import over_named
 from pipistrelle.files import (
     RESULTS,
     OwnFiles,
@@ -18,14 +21,25 @@ from pipistrelle.files import (
     without_links,
     write_whole,
 )
+from pipistrelle.refusals import shown
+from pipistrelle.settings import resolve
+from pipistrelle.verbs.console import text_table
+from pipistrelle.verbs.options import NamedSettings, layers
+from pipistrelle.verbs.streams import put, say, warn
 
 if TYPE_CHECKING:
+    from pipistrelle.arrays.beamforming import Pattern
     from pipistrelle.figures.player.playback import Playback
 
 PAGE = "view.html"
 """Name of the page in a result folder."""
 FRAMES_PER_MAP = 3
-"""A smoother is asked for its map once in so many frames, as each time takes the optimum."""
+"""Frames per map of a smoother, as each map takes an optimisation."""
+
+
+def _switch(words: str) -> Parameter:
+    """Return the parameter of a switch, with its help."""
+    return Parameter(help=words, negative=(), show_default=False)
 
 
 def view(
@@ -37,24 +51,25 @@ def view(
         Parameter(
             name=("--output", "-o"),
             metavar="FILE.html",
-            help=f"Where the page goes. [default: FOLDER/{PAGE}]",
+            help=f"The page. [default: FOLDER/{PAGE}]",
         ),
     ] = None,
     log: Annotated[
         Path | None,
         Parameter(
             metavar="DIR",
-            help="Where the log is that was solved, if it was moved. [default: where it was]",
+            help="The solved log, if it was moved.",
         ),
     ] = None,
     estimator: Annotated[
         tuple[str, ...],
         Parameter(
-            name="--filter",
+            name=("--filter", "--estimator"),
             metavar="MODULE:CLASS",
             negative=(),
-            help="Run this code, an estimator of your own that the mission was done with. Code "
-            "that a folder names is not run unless you name it, too. [default: none]",
+            show_default=False,
+            help="Run this code, an estimator of your own that the mission was conducted with. "
+            "Code that a folder names runs only if you name it here.",
         ),
     ] = (),
     association: Annotated[
@@ -62,15 +77,13 @@ def view(
         Parameter(
             name="--association.method",
             metavar="MODULE:CLASS",
-            help="Run this code, an association of your own, likewise. [default: none]",
+            help="Run this code, an association of your own that the mission was conducted with.",
         ),
     ] = None,
-    overwrite: Annotated[
-        bool, Parameter(negative=(), help="Replace a FILE that is there already.")
-    ] = False,
-    quiet: Annotated[bool, Parameter(negative=(), help="Print the page's path alone.")] = False,
+    overwrite: Annotated[bool, _switch("Replace an existing FILE.")] = False,
+    quiet: Annotated[bool, _switch("Print only the path of the page.")] = False,
 ) -> None:
-    """Play a mission in a browser: do it again from its result folder, and keep every frame."""
+    """Write a page that plays a mission, which is conducted again from its result folder."""
     from pipistrelle.experiments.results.reading import read_summary
 
     read_summary(folder)
@@ -78,7 +91,6 @@ def view(
     check_place(target, folder, ".html", "-o", overwrite)
     from pipistrelle.figures.player.playback import page
     from pipistrelle.scripting.arguments import named_filters
-    from pipistrelle.verbs.streams import put
 
     trusted = (*(named_filters(estimator, "--filter") if estimator else ()), association or "")
     played = _play_again(folder, log, trusted, quiet)
@@ -89,16 +101,16 @@ def view(
 def _play_again(
     folder: Path, log: Path | None, trusted: tuple[str, ...], quiet: bool
 ) -> "Playback":
-    """Do the mission again, and lay out what was seen of it."""
+    """Conduct the mission again, and return its frames."""
+    from pipistrelle.experiments.machine import keep_freed_memory
     from pipistrelle.experiments.runs.rerun import rerun
     from pipistrelle.figures.player.playback import playback
     from pipistrelle.figures.recorder import MissionRecorder
-    from pipistrelle.verbs import delivery
+    from pipistrelle.kernel_clock import announce
     from pipistrelle.verbs.console import progress
-    from pipistrelle.verbs.options import OutputOptions
-    from pipistrelle.verbs.streams import warn
 
-    delivery.get_ready(OutputOptions(quiet=quiet))
+    keep_freed_memory()
+    announce(None if quiet else say)
     watch = MissionRecorder(rest=FRAMES_PER_MAP)
     with progress(quiet) as show:
         mission = rerun(folder, log=log, trusted=trusted, progress=show, watch=watch)
@@ -108,7 +120,7 @@ def _play_again(
 
 
 def check_place(path: Path, folder: Path | None, ending: str, option: str, overwrite: bool) -> None:
-    """Refuse a place that a file cannot have, before there is anything to write."""
+    """Raise if a file cannot be written at this path, before it is made."""
     fix = f"name another with {option} FILE{ending}"
     if path.suffix.lower() != ending:
         raise InputError(f"{option}: found {path}, expected a name that ends in {ending}")
@@ -128,22 +140,22 @@ def check_place(path: Path, folder: Path | None, ending: str, option: str, overw
         try:
             TemporaryFile(dir=path.parent).close()
             with suppress(FileNotFoundError):
-                partial_of(path).lstat()  # an error of a name that is too long
+                partial_of(path).lstat()  # raises for a name that is too long
         finally:
             remove_empty(made)
-    except FileExistsError:  # what should be the folder
+    except FileExistsError:  # a file in place of the folder
         raise InputError(f"{path}: cannot be written (Not a directory); {fix}") from None
     except OSError as error:
         raise InputError(f"{path}: cannot be written ({error.strerror}); {fix}") from None
 
 
 def _is_in(path: Path, folder: Path) -> bool:
-    """Tell whether a file's place is the result folder itself."""
+    """Return whether the path is directly in the result folder."""
     return without_links(path.parent) == without_links(folder)
 
 
 def write_file(path: Path, folder: Path | None, data: bytes, overwrite: bool) -> None:
-    """Write a file that is whole or not there; in the result folder, as one of its own."""
+    """Write a file atomically; add it to the list of files if it is in the result folder."""
     if folder is not None and _is_in(path, folder):
         OwnFiles(folder, RESULTS).add(path.name, data)
         return
@@ -153,3 +165,102 @@ def write_file(path: Path, folder: Path | None, data: bytes, overwrite: bool) ->
     except OSError as error:
         fix = "make room or name another file"
         raise InputError(f"{path}: could not be written ({error.strerror}); {fix}") from error
+
+
+def array(
+    file: Annotated[str, Parameter(help="The array: a file as of receiver.array, or square.")],
+    /,
+    *,
+    frequency: Annotated[
+        float | None,
+        Parameter(metavar="HZ", help="Frequency [Hz]. [default: that of the vehicle's call]"),
+    ] = None,
+    named: NamedSettings = None,
+    output: Annotated[
+        Path | None,
+        Parameter(
+            name=("--output", "-o"),
+            metavar="FILE.png",
+            help="The picture.",
+        ),
+    ] = None,
+    overwrite: Annotated[bool, _switch("Replace an existing FILE.png.")] = False,
+    quiet: Annotated[bool, _switch("Print only the path of the picture.")] = False,
+) -> None:
+    """Draw a microphone array; print its aperture, beam widths and ambiguous bearings."""
+    if output is not None:
+        check_place(output, None, ".png", "-o", overwrite)
+    from pipistrelle.arrays.array_file import read_array
+    from pipistrelle.arrays.beamforming import pattern_of
+    from pipistrelle.arrays.layout import scattered, square_microphones
+
+    settled = resolve(over_named(layers(named, None))[0])
+    if frequency is None:
+        frequency = settled.emitter.centre
+    elif not 1.0 <= frequency <= 1e7:
+        raise InputError(f"--frequency: found {shown(frequency)}, expected 1 to 1e+07 [Hz]")
+    square = file == SQUARE
+    microphones = square_microphones(settled.receiver) if square else read_array(Path(file))
+    layout, c = scattered(microphones), settled.medium.sound_speed
+    patterns = tuple(
+        pattern_of(layout, g, frequency=frequency, speed_of_sound=c)
+        for g in range(layout.normal.size)
+    )
+    if not quiet:
+        put(_table(layout.name, layout.normal.tolist(), patterns))
+        for line in _cannot(layout.name, patterns):
+            put(line)
+    if output is not None:
+        from pipistrelle.figures.sound import draw_array
+
+        name = file if square else Path(file).name
+        asked = {"name": name, "frequency": frequency, "speed_of_sound": c}
+        picture = io.BytesIO()
+        figure = draw_array(microphones, layout, patterns, **asked)
+        figure.savefig(picture, format="png", dpi=160, metadata={"Software": None})
+        write_file(output, None, picture.getvalue(), overwrite)
+        put(output)
+
+
+def _table(
+    names: tuple[str, ...],
+    normals: list[float],
+    patterns: "tuple[Pattern, ...]",
+) -> str:
+    """Format the properties of each group of microphones in a column."""
+    hears = [
+        "all around" if math.isnan(n) else f"around {round(math.degrees(n))}°" for n in normals
+    ]
+    rows = {
+        "microphones": [str(p.microphones) for p in patterns],
+        "hears": hears,
+        "aperture [m]": [f"{p.aperture:.4g}" for p in patterns],
+        "next microphone, at most [m]": [f"{p.nearest:.4g}" for p in patterns],
+        "waves are plane from [m]": [f"{p.far_field:.3g}" for p in patterns],
+        "beam's width [deg]": [_between(*p.width) for p in patterns],
+        "highest other lobe [dB]": [f"{p.lobe_db:.1f}" for p in patterns],
+        "bearings with a double": [f"{p.alike:.0%}" for p in patterns],
+        "least deviation at 20 dB [deg]": [_between(*p.std) for p in patterns],
+    }
+    heads = [["", *(name or "free" for name in names)]]
+    return text_table("", heads, [[key, *cells] for key, cells in rows.items()])
+
+
+def _between(least: float, most: float) -> str:
+    """Format two angles [rad] as a range in degrees."""
+    low, high = f"{math.degrees(least):.3g}", f"{math.degrees(most):.3g}"
+    return low if low == high else f"{low} to {high}"
+
+
+def _cannot(names: tuple[str, ...], patterns: "tuple[Pattern, ...]") -> list[str]:
+    """Format the ambiguous bearings of each group, a line each."""
+    lines = []
+    for name, pattern in zip(names, patterns, strict=True):
+        if pattern.alike > 0.0:
+            this, that = (f"{math.degrees(angle):.0f}°" for angle in pattern.worst)
+            whose = f"face {name}" if name else "these microphones"
+            lines.append(
+                f"{pattern.alike:.0%} of the bearings have a double, as {this} and {that}: to "
+                f"{whose} they sound nearly or quite the same; the deviations of rows say so."
+            )
+    return lines

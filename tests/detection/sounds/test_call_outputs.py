@@ -16,7 +16,8 @@ from pipistrelle.detection.sounds.description import read_description
 from pipistrelle.detection.sounds.hearing import hear_recording, log_callers
 from pipistrelle.experiments.hearing.listening import listen
 from pipistrelle.experiments.hearing.scenario import world_of
-from pipistrelle.verbs.options import MissionOptions, mission_config
+from pipistrelle.scripting.arguments import Door, mission_settings
+from pipistrelle.settings import from_flags
 from reference.sounds import UNLABELLED, record, swept
 
 LOUD = {"level_db": 65.0}  # else nothing is near enough for an echo of the vehicle's own
@@ -70,7 +71,9 @@ def scans_of_run(settings):
     """Return the rows without labels of the run that was recorded."""
     receiver = {"elements": 4} | settings.get("receiver", {})
     given = settings | {"receiver": receiver}
-    config, _, _ = mission_config(MissionOptions(duration=4.0, landmarks=20, settings=given))
+    asked = {"duration": 4.0, "landmarks": 20}
+    door = Door(asked=asked, beneath={}, flags=from_flags(given), command="")
+    config, _, _ = mission_settings(door)
     (frames,) = listen(world_of(config), config, (config.emitter.radius,), labels=False)
     return [frame.unlabelled for frame in frames]
 

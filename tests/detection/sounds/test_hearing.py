@@ -19,7 +19,8 @@ from pipistrelle.detection.sounds.description import read_description
 from pipistrelle.detection.sounds.hearing import hear_recording, log_callers
 from pipistrelle.experiments.hearing.listening import listen
 from pipistrelle.experiments.hearing.scenario import world_of
-from pipistrelle.verbs.options import MissionOptions, mission_config
+from pipistrelle.scripting.arguments import Door, base_layer, mission_settings
+from pipistrelle.settings import from_flags
 from reference.sounds import FEW, UNLABELLED, foreign, record
 
 
@@ -48,8 +49,10 @@ def own(tmp_path_factory):
 def frames_of_run(named=None, emitter=None):
     """Rows without labels of the run that was recorded, perhaps with settings of its own."""
     settings = {"receiver": {"elements": 4}, "emitter": emitter or {}}
-    options = MissionOptions(duration=4.0, landmarks=20, named=named, settings=settings)
-    config, _, _ = mission_config(options)
+    asked = {"duration": 4.0, "landmarks": 20}
+    base = base_layer(named and named[0])
+    door = Door(asked=asked, beneath=base, flags=from_flags(settings), command="")
+    config, _, _ = mission_settings(door)
     assert FEW[1] == "4"
     (frames,) = listen(world_of(config), config, (config.emitter.radius,), labels=False)
     return [frame.unlabelled for frame in frames]

@@ -20,7 +20,7 @@ from pipistrelle.experiments.results.writing import run_entry, tables_of
 from pipistrelle.experiments.runs.replay import as_heard_by, load, motion_of, replay, start_of
 from pipistrelle.experiments.runs.truth_files import read_truth, write_truth
 from pipistrelle.geometry import range_and_bearing
-from pipistrelle.scripting.log_settings import with_log
+from pipistrelle.scripting.arguments import with_log
 from pipistrelle.settings import from_flags
 from reference.missions import scan_with
 

@@ -1,0 +1,674 @@
+r"""Warnings on recorded logs: doubtful values, and the mistakes that explain why rows do not fit.
+
+Each mistake in `MISTAKES` is corrected on the rows of some scans. Every row is then compared with
+rows of earlier scans, by the motion of the odometry between them; with the right correction, rows
+of one landmark coincide. It needs no map, and uses labels only if the log has some.
+
+A row z that follows a scan with n possible partners has the density
+
+.. math:: p(z) = \tfrac12 p_0 + \tfrac1{2n} \sum_i N(z;\ \hat z_i, S_i)
+
+in the numbers of the log, so that units and columns do not matter: half the prior probability is
+that the earlier scan lacks the landmark, and :math:`p_0` is uniform over the recorded numbers.
+"""
+
+from collections.abc import Sequence
+from math import ceil, comb, floor, hypot, inf, log10, pi, radians, sqrt, tau
+from pathlib import Path
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+from pipistrelle.config import Config
+from pipistrelle.detection.scans import BEARING, NUMBERS, OWN, RANGE, UNLABELLED, WIDEST
+from pipistrelle.estimation.beliefs import placed
+from pipistrelle.estimation.catalogue import GATE, gate_of, short_name
+from pipistrelle.estimation.data_association.existence import BEFORE, WITHIN
+from pipistrelle.estimation.motion import relative_motions
+from pipistrelle.estimation.session import REMEMBERED
+from pipistrelle.experiments.drives import carried
+from pipistrelle.experiments.named_settings import own_config
+from pipistrelle.experiments.runs.replay import motion_of
+from pipistrelle.geometry import range_and_bearing, wrap
+
+if TYPE_CHECKING:
+    from pipistrelle.detection.logs.recording import Log
+    from pipistrelle.experiments.drives import Truth
+    from pipistrelle.experiments.results.scores import TrialResult
+
+MAX_IGNORED_SHARE = 0.2
+"""Largest share of rows that do not fit; above it a warning asks about the units."""
+MAX_GATED_SHARE = 0.01
+"""Largest excess of the share of rows that the gate rejects; above it a warning is given."""
+MAX_NIS = 2.0
+"""Largest NIS without a warning; below 1 a filter is cautious, as with the paper's noise."""
+MIN_EXCESS_PATH = 0.2
+"""Excess paths in metres are rarely smaller, excess paths in seconds mostly [m]."""
+UNSURE = {"bearing_std": ("bearings", "rad", WIDEST), "way_std": ("ranges", "m", inf)}
+"""Settings by which an association discards rows: the measured numbers, their unit, and the largest
+standard deviation for which a larger value is advised."""
+DEGREE = pi / 180.0
+SCANS = 32
+"""Number of scans that are compared with earlier scans, spread over the log."""
+LAGS = 2 ** np.arange(10)
+"""Distances to the earlier scans, in scans."""
+CHANCE = 0.01
+"""Probability of naming a mistake by chance."""
+REACH, QUESTIONED = 0.99, 1e-3
+"""Quantile of the rows that the sensor's field of view and range reach at least, and probability of
+questioning a correct setting by chance."""
+ROWS = 32
+"""Most rows of a scan that are compared with earlier scans."""
+Question = tuple[str, str]
+"""An observation, and the question or advice that follows."""
+
+
+def has_excess_paths(recorded: "Log") -> bool:
+    """Return whether any row of a log has an excess path."""
+    return any((scan.excess_path == scan.excess_path).any() for scan in recorded.scans)
+
+
+def distance_driven(recorded: "Log") -> float:
+    """Return the distance driven by the odometry, forwards and backwards [m]."""
+    if recorded.motion == "poses":
+        return sum(hypot(*step) for step in recorded.controls[:, :2].tolist())
+    return float(abs(recorded.controls[:, 0] * recorded.dt).sum())
+
+
+def log_warnings(recorded: "Log", truth: "Truth", log: Path) -> list[str]:
+    """Return warnings on a log before it is solved: doubtful values, ignored rows, jumps."""
+    from pipistrelle.detection.logs.text_tables import FORMER_NAMES
+
+    notes = [f"{log}: {doubt}" for doubt in recorded.doubts]
+    if recorded.ignored_rows:
+        reasons = (
+            f"{count} {reason.replace('_', ' ')}" for reason, count in recorded.ignored_rows.items()
+        )
+        notes.append(f"{log}: rows left out: {', '.join(reasons)}")
+    notes += [
+        f"{log}: {name} is read as {FORMER_NAMES[name]}, as it is called now"
+        for name in dict.fromkeys(recorded.former_names)
+    ]
+    headings = {name: getattr(recorded, name)[2] for name in ("initial_pose", "sensor_pose")}
+    notes += [
+        f"{log}: the heading of {name}, {heading:g} rad, is beyond a turn; is it in degrees? "
+        f"{heading:g} degrees are {radians(heading):.4g} rad"
+        for name, heading in headings.items()
+        if abs(heading) > tau
+    ]
+    notes += [*_jumps(recorded, log), *_unheard(recorded, log)]
+    if truth.path is not None:
+        steps = len(truth.time) - 1
+        known_steps = sum(1 for pose in truth.path[1:] if pose[0] == pose[0])
+        if known_steps < steps:
+            notes.append(
+                f"{log}: the truth covers {known_steps} of {steps} steps; only these are scored"
+            )
+    return notes
+
+
+def _jumps(recorded: "Log", log: Path) -> list[str]:
+    """Question odometry poses with steps much larger than the others (a changed frame)."""
+    if recorded.motion != "poses":
+        return []
+    from pipistrelle.detection.logs.poses import jumps
+
+    far_steps = jumps(recorded.controls, recorded.dt)
+    if not far_steps.size:
+        return []
+    step = int(far_steps[0])
+    ahead, aside, turn = recorded.controls[step, :3].tolist()
+    others = f", and {far_steps.size - 1} more such steps" * (far_steps.size > 1)
+    return [
+        f"{log}: the odometry moves by {hypot(ahead, aside):.3g} m and turns by {turn:.3g} rad "
+        f"in the {recorded.dt[step]:.3g} s from {recorded.time[step]:.15g} s on{others}; "
+        "was its frame begun anew?"
+    ]
+
+
+def _unheard(recorded: "Log", log: Path) -> list[str]:
+    """Warn of callers with excess paths but without a position or a row of their landmark."""
+    heard = labels_of(recorded)
+    if heard == {UNLABELLED}:  # the association finds the callers
+        return []
+    timed = {
+        number
+        for scan in recorded.scans
+        for number in scan.caller[scan.excess_path == scan.excess_path].tolist()
+    }
+    return [
+        f"{log}: no row measures landmark {caller.landmark}, the caller {caller.name!r}, so its "
+        "excess paths say nothing; correct its number, or say its place"
+        for number, caller in enumerate(recorded.callers, start=1)
+        if number in timed and caller.landmark not in heard and caller.place is None
+    ]
+
+
+def fit_warnings(
+    recorded: "Log", trials: "Sequence[TrialResult]", log: Path, config: Config
+) -> list[str]:
+    """Return warnings on trials of a log with many rows that do not fit.
+
+    They name the mistake in its columns that explains the misfit, else ask about units and labels.
+    """
+    beyond, odd_ranges = _beyond_a_turn(recorded), _out_of_bounds(recorded, "ranges")
+    questions, unmapped, wide = beyond + odd_ranges, [], []
+    notes = [
+        f"{log}: none of the {rows} rows of {trial.strategy} sensing is of a landmark, so it maps "
+        "nothing"
+        if (rows := sum(scan.landmark.size for scan in trial.heard))
+        else f"{log}: nothing in it is heard by {trial.strategy} sensing, so it maps nothing"
+        for trial in trials
+        if not any(len(scan.landmark) for scan in trial.scans)
+    ]
+    for trial in trials if not beyond else ():
+        questions += _rejected(trial, recorded, config)
+        unmapped += _unmapped(trial, recorded)
+        if trial.track.labels:
+            wide += wide_sight(trial, recorded, own_config(config, trial.filter))
+    if questions or unmapped:
+        mistake, fits = misreading(recorded)
+        questions += [] if fits else unmapped
+        if mistake:
+            questions = [(questions[0][0], mistake)]
+    questions += wide + _out_of_bounds(recorded, "excess paths")
+    notes += [f"{log}: {found}; {question}" for found, question in questions]
+    return notes + _unsure(trials, log, config)
+
+
+def _units(recorded: "Log") -> str:
+    """Ask about the units and the sense of the numbers of a log."""
+    metric = "ranges and excess paths" if has_excess_paths(recorded) else "ranges"
+    angles = "bearings and headings" if recorded.motion == "poses" else "bearings"
+    labels = ", and all labels right" if labels_of(recorded) != {UNLABELLED} else ""
+    return f"are {angles} in radians and counter-clockwise, {metric} in metres{labels}?"
+
+
+def _rejected(trial: "TrialResult", recorded: "Log", config: Config) -> list[Question]:
+    """Question the rows of a trial with many gated measurements or a large NIS."""
+    from pipistrelle.experiments.results.scores import is_placed, judged
+
+    heard = judged(trial.scans)
+    if not heard or not is_placed(trial):
+        return []
+    gated, who = trial.scores.gated, f"{trial.strategy} {short_name(trial.filter)}"
+    if MAX_IGNORED_SHARE * heard < gated:
+        found = f"{gated} of {heard} measurements do not fit what was expected ({who})"
+        return [(found, _units(recorded))]
+    if strayed := _strayed(trial, who):
+        return strayed
+    expected = 1.0 - gate_of(trial.filter, own_config(config, trial.filter))
+    if (MAX_GATED_SHARE + expected) * heard < gated:
+        found = (
+            f"the gate rejects {gated / heard:.1%} of the measurements ({who}), expected "
+            f"{expected:.1%}: they are less sure than they say, or something was placed wrong "
+            "before"
+        )
+        return [
+            (found, 'larger standard deviations help, or a gate of 1 with filter.robust = "huber"')
+        ]
+    found, _, advice = nis_warning(trial).partition("; ")
+    return [(found, advice)] if found else []
+
+
+def _strayed(trial: "TrialResult", who: str) -> list[Question]:
+    """Question landmarks with successive measurements far from the final map and path."""
+    from pipistrelle.evaluation.consistency import strayed_landmarks
+
+    if trial.track.labels:
+        return []
+    strayed = strayed_landmarks(trial.track, trial.scans, GATE, MAX_GATED_SHARE + 1.0 - GATE)
+    if not strayed:
+        return []
+    label, (first, last, count) = max(strayed.items(), key=lambda one: one[1][2])
+    others = f", and {len(strayed) - 1} more landmarks likewise" * (len(strayed) > 1)
+    found = (
+        f"{count} measurements of landmark {label} in a row, from {first:.15g} to {last:.15g} s, "
+        f"are far from the map and path at the end{others} ({who})"
+    )
+    return [(found, "was it moved, is its label right, or was a loop not closed?")]
+
+
+def _unmapped(trial: "TrialResult", recorded: "Log") -> list[Question]:
+    """Question an association that assigned fewer than half of the rows to the final map."""
+    if not trial.track.labels:
+        return []
+    labels = np.concatenate(trial.track.labels)
+    mapped = np.count_nonzero(np.isin(labels, trial.track.landmarks.landmark))
+    if 2 * mapped >= labels.size:
+        return []
+    found = f"{mapped} of {labels.size} rows are of landmarks of the map at the end"
+    return [(f"{found} ({trial.strategy} {short_name(trial.filter)})", _units(recorded))]
+
+
+def _beyond_a_turn(recorded: "Log") -> list[Question]:
+    """Question bearings beyond a full turn."""
+    bearings = recorded.recorded_bearings()
+    turned = int((abs(bearings) > tau).sum())
+    if not turned > MAX_IGNORED_SHARE * bearings.size:
+        return []
+    return [(f"{turned} of {bearings.size} bearings are beyond a turn", "are they in radians?")]
+
+
+def _unsure(trials: "Sequence[TrialResult]", log: Path, config: Config) -> list[str]:
+    """Warn if an association discards most rows as uncertain; advise a setting that keeps them."""
+    notes = []
+    for trial in trials:
+        settings = own_config(config, trial.filter).association
+        rows = sum(scan.landmark.size for scan in trial.heard)
+        for name, stds in trial.left_out.items():
+            if stds.size < (1.0 - MAX_IGNORED_SHARE) * rows:
+                continue
+            what, unit, most = UNSURE[name]
+            limit, taken = getattr(settings, name), stds[stds <= most]
+            spread = dict.fromkeys(f"{std:.2g}" for std in (stds.min(), stds.max()))
+            note = (
+                f"{log}: {stds.size} rows of {trial.strategy} sensing are left out: the standard "
+                f"deviation of their {what}, {' to '.join(spread)} {unit}, is above "
+                f"association.{name}, {limit:g} {unit}"
+            )
+            if taken.size:
+                digit = 10.0 ** floor(log10(taken.max()))
+                flag = f"--association.{name.replace('_', '-')}"
+                value = ceil(taken.max() / digit) * digit
+                whole = "them" if taken.size == stds.size else f"{taken.size} of them"
+                note += f"; {flag} {value:g} takes {whole}"
+            notes.append(note)
+    return [*dict.fromkeys(notes)]
+
+
+def nis_warning(trial: "TrialResult") -> str:
+    """Return a warning on innovations much larger than predicted; "" if there is none."""
+    nis = trial.scores.nis_mean
+    if nis is None or not MAX_NIS < nis < inf:
+        return ""
+    return (
+        f"{trial.strategy} {short_name(trial.filter)}: its innovations are {sqrt(nis):.1f} times "
+        f"what it expects (NIS {nis:.3g}, 1 where it believes rightly): measurements or odometry "
+        "are less sure than they say, or labels are wrong; larger standard deviations help"
+    )
+
+
+def _out_of_bounds(recorded: "Log", name: str) -> list[Question]:
+    """Question ranges or excess paths outside plausible bounds; an excess path is < 2 ranges."""
+    near, far = recorded.range_bounds
+    bounds = f"range_bounds ({near:g} to {far:g} m)"
+    column = name.replace(" ", "_").removesuffix("s")
+    values = np.concatenate([getattr(scan, column) for scan in recorded.scans])
+    values = values[~np.isnan(values)]
+    odd = {
+        "ranges": (((values < near) | (values > far), MAX_IGNORED_SHARE, f"not within {bounds}"),),
+        "excess paths": (
+            (values > 2.0 * far, MAX_IGNORED_SHARE, f"more than twice the far end of {bounds}"),
+            (values < MIN_EXCESS_PATH, 1.0 - MAX_IGNORED_SHARE, f"below {MIN_EXCESS_PATH:g} m"),
+        ),
+    }[name]
+    return [
+        (f"{np.count_nonzero(rows)} of {rows.size} {name} are {where}", f"are {name} in metres?")
+        for rows, share, where in odd
+        if np.count_nonzero(rows) > share * rows.size
+    ]
+
+
+def labels_of(recorded: "Log") -> set[int]:
+    """Return the labels of all rows."""
+    return {label for scan in recorded.scans for label in scan.landmark.tolist()}
+
+
+class Mistake(NamedTuple):
+    """A mistake in the columns of a log, and its correction."""
+
+    cause: str
+    undone: str
+    fix: str
+    turn: float = 1.0
+    """Factor of the bearing, after which it is in radians, counter-clockwise."""
+    offset: float = 0.0
+    """Added to the bearing after `turn` [rad]."""
+    from_map: bool = False
+    """Whether the heading is subtracted from the bearing."""
+    scale: float = 1.0
+    """Factor of the range, after which it is in metres."""
+    swapped: bool = False
+    """Whether the range is in the column of the bearing, and the reverse."""
+    rate: float = 1.0
+    """Factor of the angular rate or the steering angle."""
+
+
+NONE = Mistake("", "", "")
+MISTAKES = (
+    Mistake(
+        "bearings seem to be clockwise", "negated",
+        "negate the bearings (or the turns of the odometry, if these are clockwise)", turn=-1.0,
+    ),
+    Mistake(
+        "bearings seem to be in degrees", "in radians", "multiply them by pi / 180", turn=DEGREE
+    ),
+    Mistake(
+        "bearings seem to be in degrees and clockwise", "in radians and negated",
+        "multiply them by -pi / 180", turn=-DEGREE,
+    ),
+    Mistake(
+        "bearings and ranges seem to be swapped", "exchanged", "exchange the two columns",
+        swapped=True,
+    ),
+    Mistake(
+        "bearings and ranges seem to be swapped, and bearings in degrees", "exchanged, in radians",
+        "exchange the two columns, and multiply the bearings by pi / 180", turn=DEGREE,
+        swapped=True,
+    ),
+    Mistake(
+        "bearings seem to be from the rear of the vehicle", "turned by pi",
+        "add pi to them, or to the angle of sensor_pose", offset=pi,
+    ),
+    Mistake(
+        "bearings seem to be from the x axis of the map", "less the heading",
+        "subtract the vehicle's heading", from_map=True,
+    ),
+    Mistake(
+        "bearings seem to be of a compass, clockwise from the y axis", "from the heading",
+        "subtract them and the vehicle's heading from pi / 2", turn=-1.0, offset=0.5 * pi,
+        from_map=True,
+    ),
+    Mistake(
+        "bearings seem to be of a compass, in degrees from the y axis", "from the heading",
+        "subtract them and the vehicle's heading from 90 degrees, in radians", turn=-DEGREE,
+        offset=0.5 * pi, from_map=True,
+    ),
+    Mistake("ranges seem to be in millimetres", "in metres", "divide them by 1000", scale=1e-3),
+    Mistake("ranges seem to be in centimetres", "in metres", "divide them by 100", scale=1e-2),
+    Mistake("ranges seem to be in kilometres", "in metres", "multiply them by 1000", scale=1e3),
+    Mistake(
+        "the odometry seems to turn in degrees", "in radians",
+        "multiply its angles by pi / 180", rate=DEGREE,
+    ),
+)  # fmt: skip
+"""The mistakes that `misreading` tries."""
+
+
+class _Path(NamedTuple):
+    """Poses by dead reckoning, and the noise of each step."""
+
+    sensor: Float[np.ndarray, "t 3"]
+    vehicle: Float[np.ndarray, "t 3"]
+    noise: Float[np.ndarray, "t-1 3 3"]
+    """Covariance of each step's motion, in the axes of the map."""
+
+
+class _Rows(NamedTuple):
+    """Recorded rows of one scan; NaN for a missing number."""
+
+    bearing: Float[np.ndarray, " m"]
+    range: Float[np.ndarray, " m"]
+    variance: Float[np.ndarray, "2 m"]
+    """Of bearing and range."""
+    label: Int[np.ndarray, " m"]
+    step: int
+    """Index of the scan in the times of the odometry."""
+
+
+def misreading(recorded: "Log") -> tuple[str, bool]:
+    """Return the mistake that explains the rows of a log ("" for none), and whether they fit.
+
+    A mistake is named if, by a sign test over scans at the level `CHANCE`, the rows are more
+    probable with it corrected than as recorded, than with any other mistake corrected, and than
+    without landmarks. The recorded rows fit if they are more probable than without landmarks, or
+    than with any correction; with too few scans for the test they count as fitting.
+    """
+    scan, fits = _fits(recorded)
+    scans = np.unique(scan)
+    if 2.0**scans.size * CHANCE < len(MISTAKES):
+        return "", True
+    total = np.array([fits[scan == one].sum(axis=0) for one in scans])
+    best = int(np.argmax(total.sum(axis=0)))
+    rivals = np.delete(total, best, axis=1).T
+    chance = max(_sign_test(total[:, best] - rival) for rival in rivals)
+    by_chance = max(chance, _sign_test(total[:, best])) * len(MISTAKES)
+    if best == 0 or by_chance > CHANCE:
+        return "", min(_sign_test(total[:, 0]), 1.0 if best else chance) <= CHANCE
+    mistake, better = MISTAKES[best - 1], np.count_nonzero(fits[:, best] > fits[:, 0])
+    return (
+        f"{mistake.cause}: {mistake.undone}, {better} of {len(fits)} rows in {scans.size} scans "
+        f"fit earlier scans better; {mistake.fix}"
+    ), False
+
+
+def _sign_test(difference: Float[np.ndarray, " n"]) -> float:
+    """Return the probability that at least this many differences are positive by chance."""
+    positive, n = int(np.sum(difference > 0.0)), int(np.sum(difference != 0.0))
+    return sum(comb(n, k) for k in range(positive, n + 1)) / 2**n
+
+
+def _fits(recorded: "Log") -> tuple[Int[np.ndarray, " k"], Float[np.ndarray, "k h"]]:
+    """Return the scan of each compared row, and its fit: as recorded, then by each correction.
+
+    The fit is the sum over earlier scans of log p(z) / p_0.
+    """
+    rows = _recorded_rows(recorded)
+    spans = _spans(rows, recorded)
+    paths = {mistake.rate: _path(recorded, mistake.rate) for mistake in (NONE, *MISTAKES)}
+    scans, fits = [], []
+    chosen = np.linspace(1, len(rows) - 1, SCANS if len(rows) > 1 else 0)
+    for n in np.unique(chosen.round().astype(int)):
+        later = _some(rows[n], np.linspace(0, rows[n].label.size - 1, ROWS))
+        fit = np.zeros((later.label.size, 1 + len(MISTAKES)))
+        for earlier in (rows[n - lag] for lag in LAGS if lag <= n):
+            for h, mistake in enumerate((NONE, *MISTAKES)):
+                fit[:, h] += _log_ratio(earlier, later, mistake, paths[mistake.rate], spans)
+        scans.append(np.full(len(fit), n))
+        fits.append(fit)
+    scan, fit = np.concatenate([np.empty(0, int), *scans]), np.concatenate(fits) if fits else []
+    compared = np.any(fit, axis=1) if len(scan) else np.empty(0, bool)
+    return scan[compared], np.reshape(fit, (len(scan), 1 + len(MISTAKES)))[compared]
+
+
+def _recorded_rows(recorded: "Log") -> list[_Rows]:
+    """Return the rows of each scan that are not direct calls or moving callers."""
+    ends = np.cumsum([scan.landmark.size for scan in recorded.scans])
+    bearings = np.split(recorded.recorded_bearings(), ends[:-1])
+    moving = [caller.landmark for caller in recorded.callers if caller.moves]
+    rows = []
+    for scan, bearing in zip(recorded.scans, bearings, strict=True):
+        stds = np.array(
+            [
+                np.where(np.isnan(scan.bearing_std), recorded.bearing_std, scan.bearing_std),
+                np.where(np.isnan(scan.range_std), recorded.range_std, scan.range_std),
+            ]
+        )
+        step = int(np.searchsorted(recorded.time, scan.time))
+        whole = _Rows(bearing, scan.range, stds**2, scan.landmark, step)
+        usable = ~np.isnan(bearing) & ~np.isin(scan.landmark, moving)
+        usable[scan.direct[scan.direct >= 0]] = False
+        rows.append(_some(whole, np.flatnonzero(usable)))
+    return rows
+
+
+def _some(rows: _Rows, chosen: np.ndarray) -> _Rows:
+    """Select rows of a scan by their indices, which are rounded."""
+    n = np.unique(chosen.round().astype(int)) if rows.label.size else np.empty(0, int)
+    return _Rows(rows.bearing[n], rows.range[n], rows.variance[:, n], rows.label[n], rows.step)
+
+
+def _spans(rows: list[_Rows], recorded: "Log") -> tuple[float, float]:
+    """Return the spans of the recorded bearings and ranges."""
+    spans = []
+    for name, least in (("bearing", recorded.bearing_std), ("range", recorded.range_std)):
+        values = np.concatenate([getattr(one, name) for one in rows])
+        values = values[~np.isnan(values)]
+        spans.append(max(float(np.ptp(values)) if values.size else 0.0, least))
+    return spans[0], spans[1]
+
+
+def _path(recorded: "Log", rate: float) -> _Path:
+    """Dead-reckon the path with the angular rate or the steering angle multiplied by `rate`."""
+    controls = recorded.controls.copy()
+    if recorded.motion != "poses":
+        controls[:, 1] *= rate
+    steps, noise = relative_motions(motion_of(recorded), controls, recorded.dt)
+    heading = recorded.initial_pose[2] + np.concatenate([[0.0], np.cumsum(steps[:, 2])])
+    c, s = np.cos(heading), np.sin(heading)
+    ahead = np.array([[c[:-1], -s[:-1]], [s[:-1], c[:-1]]])
+    moved = np.einsum("ijt,tj->ti", ahead, steps[:, :2])
+    place = np.concatenate([np.zeros((1, 2)), np.cumsum(moved, axis=0)])
+    axes = np.zeros((len(steps), 3, 3))
+    axes[:, :2, :2], axes[:, 2, 2] = ahead.transpose(2, 0, 1), 1.0
+    x, y, turn = recorded.sensor_pose
+    sensor = place + np.column_stack((c * x - s * y, s * x + c * y))
+    return _Path(
+        sensor=np.column_stack((sensor, heading + turn)),
+        vehicle=np.column_stack((place, heading)),
+        noise=axes @ noise @ axes.transpose(0, 2, 1),
+    )
+
+
+def _reckoned(path: _Path, begin: int, end: int) -> Float[np.ndarray, "3 3"]:
+    """Return the covariance of the sensor's pose at step `end`, given its pose at `begin`."""
+    lever = path.sensor[end, :2] - path.vehicle[begin + 1 : end + 1, :2]
+    J = np.tile(np.eye(3), (len(lever), 1, 1))
+    J[:, 0, 2], J[:, 1, 2] = -lever[:, 1], lever[:, 0]
+    return np.einsum("tij,tjk,tlk->il", J, path.noise[begin:end], J)
+
+
+def _undone(
+    rows: _Rows, mistake: Mistake, heading: float
+) -> tuple[Float[np.ndarray, " m"], Float[np.ndarray, " m"]]:
+    """Return the bearings and ranges of rows after the correction of a mistake."""
+    bearing, distance = rows.bearing, rows.range
+    if mistake.swapped:
+        bearing, distance = distance, bearing
+    bearing = mistake.turn * bearing + mistake.offset - heading * mistake.from_map
+    return wrap(bearing), mistake.scale * distance
+
+
+class _Expected(NamedTuple):
+    """Predicted rows of the landmarks of an earlier scan, and the entries of their covariance."""
+
+    bearing: Float[np.ndarray, " n"]
+    range: Float[np.ndarray, " n"]
+    bb: Float[np.ndarray, " n"]
+    rb: Float[np.ndarray, " n"]
+    rr: Float[np.ndarray, " n"]
+
+
+def _expected(
+    earlier: _Rows, mistake: Mistake, path: _Path, step: int
+) -> tuple[_Expected, Int[np.ndarray, " n"]]:
+    """Predict the rows of a later step from the ranges of an earlier scan; return their labels."""
+    now, before = path.sensor[step], path.sensor[earlier.step]
+    b, r = _undone(earlier, mistake, before[2])
+    ranged = np.isfinite(b) & (r > 0.0)
+    b, r, variance = b[ranged], r[ranged], earlier.variance[:, ranged]
+    ray = np.column_stack((np.cos(before[2] + b), np.sin(before[2] + b)))
+    off = before[:2] - now[:2] + r[:, np.newaxis] * ray
+    distance = np.maximum(np.hypot(*off.T), np.finfo(float).tiny)
+    u = off / distance[:, np.newaxis]
+    normal = np.column_stack((-u[:, 1], u[:, 0]))
+    c, s = (ray * u).sum(axis=1), (ray * normal).sum(axis=1)
+    along, across = variance[1], r**2 * variance[0]
+    to_range = np.column_stack((-u, np.zeros(len(u))))
+    to_bearing = np.column_stack((-normal / distance[:, np.newaxis], -np.ones(len(u))))
+    P = _reckoned(path, earlier.step, step)
+
+    def moved(one: np.ndarray, other: np.ndarray) -> np.ndarray:
+        return np.einsum("ni,ij,nj->n", one, P, other)
+
+    expected = _Expected(
+        bearing=np.arctan2(off[:, 1], off[:, 0]) - now[2],
+        range=distance,
+        bb=(s * s * along + c * c * across) / distance**2 + moved(to_bearing, to_bearing),
+        rb=c * s * (along - across) / distance + moved(to_range, to_bearing),
+        rr=c * c * along + s * s * across + moved(to_range, to_range),
+    )
+    return expected, earlier.label[ranged]
+
+
+@np.errstate(over="ignore", under="ignore")
+def _log_ratio(
+    earlier: _Rows, later: _Rows, mistake: Mistake, path: _Path, spans: tuple[float, float]
+) -> Float[np.ndarray, " m"]:
+    """Return log p(z) / p_0 of each row given an earlier scan; 0 without a possible partner."""
+    expected, label = _expected(earlier, mistake, path, later.step)
+    bearing, distance = _undone(later, mistake, path.sensor[later.step, 2])
+    db = wrap(bearing[:, np.newaxis] - expected.bearing)
+    dr = distance[:, np.newaxis] - expected.range
+    bb, rr = (var[:, np.newaxis] for var in later.variance)
+    bb, rr, rb = bb + expected.bb, rr + expected.rr, expected.rb
+    determinant = rr * bb - rb * rb
+    squared = (bb * dr * dr - 2.0 * rb * dr * db + rr * db * db) / determinant
+    both = mistake.scale * np.exp(-0.5 * squared) / (2.0 * pi * np.sqrt(determinant))
+    angle_only = np.exp(-0.5 * db * db / bb) / np.sqrt(2.0 * pi * bb)
+    density = np.where(np.isnan(dr), angle_only, both * spans[1]) * spans[0] * abs(mistake.turn)
+    turns = abs(mistake.turn) * spans[1 if mistake.swapped else 0] / (2.0 * pi)
+    unlabelled = label.size and (label == UNLABELLED).all()
+    partner = np.full(db.shape, True) if unlabelled else later.label[:, np.newaxis] == label
+    partners = partner.sum(axis=1)
+    mean = np.where(partner, density, 0.0).sum(axis=1) / np.maximum(partners, 1)
+    comparable = (partners > 0) & ~np.isnan(bearing)
+    return np.where(comparable, np.log(0.5 + 0.5 * mean / max(turns, 1.0)), 0.0)
+
+
+def wide_sight(trial: "TrialResult", recorded: "Log", config: Config) -> list[Question]:
+    """Question a stated field of view or range of the sensor that is wider than its rows.
+
+    Landmarks expected beyond the quantile `REACH` of the rows but within the stated limit must be
+    detected with the probability ``association.detection``. The limit is questioned if the
+    binomial probability of so few detections is `QUESTIONED` at most. Only every `REMEMBERED`-th
+    scan counts, as an obstacle may hide a landmark in successive scans.
+    """
+    stated = config.association
+    if stated.max_range is None:
+        return []
+    far, bearing, heard = _expected_rows(trial, recorded)
+    own = [scan.numbers[:, (scan.caller == OWN) & np.isnan(scan.level_db)] for scan in trial.heard]
+    rows = np.concatenate([np.empty((NUMBERS, 0)), *own], axis=1)
+    rows = rows[:, ~np.isnan(rows[RANGE])]
+    if not rows.size:
+        return []
+    half, farthest = 0.5 * stated.field_of_view - BEFORE, WITHIN * stated.max_range
+    wide, long = np.quantile(np.abs(rows[BEARING]), REACH), np.quantile(rows[RANGE], REACH)
+    off = np.abs(bearing)
+    asked = (
+        (
+            "field_of_view",
+            "bearings",
+            (far <= long) & (wide < off) & (off <= half),
+            2.0 * wide,
+            "rad",
+        ),
+        ("max_range", "ranges", (off <= wide) & (long < far) & (far <= farthest), long, "m"),
+    )
+    return [
+        (
+            f"association.{name} is {getattr(stated, name):.3g} {unit}, but {REACH:.0%} of the "
+            f"{what} are within {value:.3g} {unit}, and of {beyond.sum()} times that landmarks "
+            f"were expected beyond, they were heard {(beyond & heard).sum()} times",
+            f"the map loses landmarks by that; does {value:.3g} fit?",
+        )
+        for name, what, beyond, value, unit in asked
+        if _at_most(int((beyond & heard).sum()), int(beyond.sum()), stated.detection) <= QUESTIONED
+    ]
+
+
+def _at_most(heard: int, times: int, probability: float) -> float:
+    """Return the binomial probability of at most `heard` successes in `times` trials."""
+    powers = ((1.0 - probability) ** (times - k) * probability**k for k in range(heard + 1))
+    return sum(comb(times, k) * power for k, power in enumerate(powers))
+
+
+def _expected_rows(
+    trial: "TrialResult", recorded: "Log"
+) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"], Bool[np.ndarray, " n"]]:
+    """Return predicted range and bearing of each landmark in some scans, and its detection."""
+    track, landmarks = trial.track, trial.track.landmarks
+    mask = placed(landmarks)
+    points, label = landmarks.mean[mask], landmarks.landmark[mask]
+    poses = carried(track.pose, recorded.sensor_pose).mean
+    columns: list[np.ndarray] = [np.empty((3, 0))]
+    for n in range(0, len(track.labels), REMEMBERED):
+        scan, labels = trial.heard[n], track.labels[n]
+        step = np.searchsorted(track.time, scan.time)
+        far, bearing = range_and_bearing(poses[step], points)
+        columns.append(np.vstack((far, bearing, np.isin(label, labels))))
+    far, bearing, heard = np.concatenate(columns, axis=1)
+    return far, bearing, heard > 0.0
