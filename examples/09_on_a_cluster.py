@@ -31,10 +31,9 @@ grid."beacon.level_db" = [36.0, 48.0]
 
 # %%
 # It is done three times. By one process. In three *shards*, each of which does every third world of
-# one folder: so do machines that share a disk, and ``pipistrelle study PLAN --shard 0/16 --emit
-# slurm`` prints the script that has SLURM do it. And by a Dask cluster (``pip install
-# 'pipistrelle[cluster]'``), here of two workers on this machine; elsewhere ``scheduler`` is the
-# address of yours, ``tcp://HOST:PORT``.
+# one folder: so do machines that share a disk, by ``pipistrelle study PLAN --shard 0/16``. And by a
+# Dask cluster (``pip install 'pipistrelle[cluster]'``), here of two workers on this machine;
+# elsewhere ``scheduler`` is the address of yours, ``tcp://HOST:PORT``.
 #
 # Workers are processes, which import the script that starts them: what starts them stands under
 # ``if __name__ == "__main__"``.

@@ -309,15 +309,6 @@ def test_a_study_is_run_with_settings_by_name_from_python_and_the_command_line(t
     assert read_plan(Path("two/plan.toml")) == done.plan
 
 
-def test_the_job_script_of_a_study_names_the_settings(capsys):
-    Path("mine.toml").write_text("[own.iekf]\nrays.power = 5.0\n")
-    words = ("--settings", "mine.toml", "--settings", "best", "--emit", "slurm")
-    assert main(["study", "timing", *words]) == 0
-    line = next(line for line in capsys.readouterr().out.splitlines() if "exec" in line)
-    assert "--settings best" in line
-    assert """--own '{"iekf".rays.power = 5.0}'""" in line
-
-
 def test_the_plans_that_ship_are_listed_in_the_help(capsys):
     assert {"association", "paper", "timing"} <= {*PLANS}
     assert {"iterations", "grid"} <= {*tomllib.loads(find_plan(PLANS[0]).read_text())}

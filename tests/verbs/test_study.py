@@ -1,8 +1,6 @@
 """`pipistrelle study` as a person calls it: what it prints, what it refuses, how it ends."""
 
-import os
 import re
-import subprocess
 import sys
 from pathlib import Path
 
@@ -222,7 +220,6 @@ def test_a_length_of_time_is_worded_in_the_unit_that_fits(seconds, words):
             "small.toml --receiver.engine block --emitter.frequency 3001",
             "emitter.frequency: found 3001 Hz, expected a multiple",
         ),
-        ("small.toml --emit pbs", 'Invalid value "pbs" for --emit'),
         ("small.toml --emitter.radius 0.01", "--emitter.radius: the plan varies this setting"),
         ("small.toml --rays.power 0", "--rays.power: found 0.0, expected greater than 0"),
         ("small.toml --workers 2 --scheduler tcp://here:1", "--workers: the cluster at tcp://here"),
@@ -247,13 +244,6 @@ def test_every_case_of_a_plan_is_checked_before_the_first_world(obey):
     )
     assert "scenario.beacon_distance = 1000000000.0)" in said
     assert not Path("one").exists()
-
-
-def test_no_job_script_is_written_for_a_plan_that_every_job_would_refuse(obey):
-    odd = "--receiver.engine", "block", "--emitter.frequency", "3"
-    status, printed, said = obey("small.toml", "--emit", "slurm", *odd)
-    assert (status, printed) == (2, "")
-    assert "emitter.frequency: found 3 Hz" in said
 
 
 def test_giving_the_default_speed_of_sound_keeps_the_plan(obey):
@@ -317,45 +307,6 @@ def test_an_interrupt_ends_with_130_and_keeps_finished_worlds(obey, monkeypatch)
 
 
 # Clusters
-
-
-def test_a_job_script_does_each_share_in_a_task_of_its_array(obey, monkeypatch):
-    monkeypatch.setenv("PIPISTRELLE_RAYS__RANGE_BOUNDS", "[0.5, 15]")
-    words = ("--seed", "4", "--iterations", "8", "--shard", "0/3", "--emit", "slurm")
-    status, printed, said = obey("small.toml", *words, "-o", "my study", "--workers", "2")
-    assert (status, said) == (0, "")
-    assert not Path("my study").exists()
-    lines = printed.splitlines()
-    assert lines[0] == "#!/bin/sh"
-    assert {"#SBATCH --array=0-2", "#SBATCH --cpus-per-task=2"} <= set(lines)
-    assert lines[-1].startswith("exec pipistrelle study ")
-
-
-def test_the_tasks_of_a_job_script_together_do_the_study(obey, monkeypatch):
-    words = ("small.toml", "--seed", "4", "--rays.range-bounds", "0.5", "15")
-    printed = obey(*words, "--shard", "0/2", "--emit", "slurm", "-o", "my study")[1]
-    Path("job.sh").write_text(printed)
-    Path("bin").mkdir()
-    name = Path("bin/pipistrelle")
-    name.write_text("#!/bin/sh\nprintf '%s\\n' \"$@\"\n")  # says what it is called with
-    name.chmod(0o755)
-    for task in range(2):
-        found = f"{Path('bin').absolute()}{os.pathsep}{os.environ['PATH']}"
-        environment = os.environ | {"SLURM_ARRAY_TASK_ID": str(task), "PATH": found}
-        done = subprocess.run(
-            ["sh", "job.sh"], check=True, env=environment, capture_output=True, text=True
-        )
-        verb, *called = done.stdout.splitlines()
-        assert verb == "study"
-        assert obey(*called)[0] == 0
-    obey(*words, "--quiet", "-o", "whole")
-    assert_same(results("my study"), results("whole"))
-
-
-def test_the_job_script_of_the_paper_has_sixteen_tasks_by_default(obey):
-    printed = obey("--emit", "slurm")[1]
-    assert "#SBATCH --array=0-15\n" in printed
-    assert "exec pipistrelle study paper --iterations 115 " in printed
 
 
 def test_a_cluster_without_its_extra_is_refused_before_a_folder_is_made(refused, monkeypatch):

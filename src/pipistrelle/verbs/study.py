@@ -1,21 +1,16 @@
 """`pipistrelle study`: all cases of a plan in many worlds."""
 
-import json
-import shlex
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from inspect import Parameter as Argument
 from pathlib import Path
 from time import perf_counter
-from typing import TYPE_CHECKING, Annotated, Any, Literal
-
-from cyclopts import Parameter
+from typing import TYPE_CHECKING, Any
 
 from pipistrelle.config import InputError
-from pipistrelle.experiments.named_settings import PLANS, parted
+from pipistrelle.experiments.named_settings import PLANS
 from pipistrelle.scripting import studies
-from pipistrelle.settings import Layer
 from pipistrelle.verbs.options import NamedSettings, layers, setting_flags, switch, verb_of
 from pipistrelle.verbs.streams import put, say, warn
 
@@ -26,19 +21,10 @@ if TYPE_CHECKING:
 Show = Callable[["StudyProgress"], None]
 PROGRESS_INTERVAL = 10.0
 """Minimum time between two lines of progress [s]."""
-SHARDS = 16
-SLURM = """\
-#!/bin/sh
-#SBATCH --job-name=pipistrelle-{name}
-#SBATCH --array=0-{last}
-#SBATCH --cpus-per-task={workers}
-# Each task does its share of the worlds. Sent again, it goes on with what is missing.
-exec {command} --workers {workers} --shard "$SLURM_ARRAY_TASK_ID/{shards}" -o {folder}
-"""
 
 
 def _study(asked: dict[str, Any]) -> int:
-    """Run a study, or print its job script; print the numbers of worlds and its folder."""
+    """Run a study; print the numbers of worlds and its folder."""
     from pipistrelle.experiments.studies.plan import MOST_WORLDS, find_plan, read_plan
 
     iterations, workers, quiet = asked["iterations"], asked["workers"], asked["quiet"]
@@ -52,22 +38,8 @@ def _study(asked: dict[str, Any]) -> int:
     plan = read_plan(find_plan(asked["plan"]), layer, iterations)
     folder = asked["output"] or Path("runs") / plan.name
     from pipistrelle.experiments.machine import cores
-    from pipistrelle.experiments.studies.study import check_cases, run_study, warnings_of_plan
+    from pipistrelle.experiments.studies.study import run_study, warnings_of_plan
 
-    if asked["emit"]:
-        check_cases(plan, 0)
-        warn(*warnings_of_plan(plan))
-        shards = share[1] if asked["shard"] else min(SHARDS, plan.iterations)
-        script = SLURM.format(
-            name=plan.name,
-            last=shards - 1,
-            shards=shards,
-            workers=workers or 1,
-            command=_command(asked["plan"], plan, layer),
-            folder=shlex.quote(str(folder.absolute())),
-        )
-        put(script, end="")
-        return 0
     warn(*warnings_of_plan(plan))
     try:
         with _progress(quiet) as show:
@@ -102,24 +74,6 @@ def _share(text: str | None) -> tuple[int, int]:
     if slash and i.isdecimal() and n.isdecimal() and int(i) < int(n):
         return int(i), int(n)
     raise InputError(f"--shard: found {text!r}, expected I/N with I from 0 to N - 1, as in 0/4")
-
-
-def _command(word: str, plan: "Plan", layer: Layer) -> str:
-    """Return the command line of a study with the settings that override its plan."""
-    place = word if word in PLANS else str(Path(word).absolute())
-    words = ["pipistrelle", "study", place, "--iterations", str(plan.iterations)]
-    common, own = parted(layer)
-    for key, given in common.items():
-        values = given.value if isinstance(given.value, (list, tuple)) else [given.value]
-        words += ["--" + ".".join(key).replace("_", "-"), *map(str, values)]
-    if own:
-        tables = (
-            f"{json.dumps(n)}.{'.'.join(k)} = {json.dumps(one.value)}"
-            for n, layer in own.items()
-            for k, one in layer.items()
-        )
-        words += ["--own", f"{{{', '.join(tables)}}}"]
-    return shlex.join(words)
 
 
 def _compiled_first(plan: "Plan", show: Show, quiet: bool) -> Show:
@@ -230,10 +184,6 @@ def _span(seconds: float) -> str:
     return f"{minutes} min" if minutes < 100 else f"{minutes // 60} h {minutes % 60} min"
 
 
-_EMIT = Annotated[
-    Literal["slurm"] | None,
-    Parameter(help="Print a job script of shards (N of --shard, else 16) and do nothing else."),
-]
 study = verb_of(
     studies.study,
     _study,
@@ -248,7 +198,6 @@ study = verb_of(
     },
     extra=[
         Argument("config", Argument.KEYWORD_ONLY, default=None, annotation=NamedSettings),
-        Argument("emit", Argument.KEYWORD_ONLY, default=None, annotation=_EMIT),
         switch("quiet", "Print only the folder of the study."),
     ],
 )
