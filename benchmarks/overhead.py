@@ -12,8 +12,7 @@ from tempfile import TemporaryDirectory
 from pipistrelle.experiments.runs.compiling import compile_kernels
 from pipistrelle.experiments.studies import world
 from pipistrelle.experiments.studies.plan import find_plan, read_plan
-from pipistrelle.experiments.studies.store import load_study
-from pipistrelle.experiments.studies.study import run_study
+from pipistrelle.experiments.studies.study import load_study, run_study
 
 
 def shares(worlds: int) -> dict[str, float]:

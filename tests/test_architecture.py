@@ -98,8 +98,8 @@ AT_THE_DISK = {
     "experiments/machine.py": {"read_text"},  # of the system: how much memory a process may have
     "experiments/results/writing.py": {"symlink_to", "unlink"},  # runs/latest
     "experiments/results/reading.py": {"loadtxt"},  # of bytes that were read
-    "experiments/runs/rerun.py": {"open"},  # sums of a log's files, of ordinary ones alone
-    "experiments/studies/store.py": {"unlink"},  # what a killed writer left, by its name
+    "experiments/runs/replay.py": {"open"},  # sums of a log's files, of ordinary ones alone
+    "experiments/studies/study.py": {"unlink"},  # what a killed writer left, by its name
     "experiments/studies/world.py": {"scan_parquet", "unlink"},  # checked; left by a kill
     "detection/sounds/sound_file.py": {"open"},  # a few bytes of an ordinary file
     "detection/logs/bag.py": {"open"},  # of a compressed file that rosbags has opened

@@ -21,7 +21,7 @@ from jaxtyping import Float, UInt8
 
 from pipistrelle.estimation.beliefs import Landmarks, placed
 from pipistrelle.estimation.catalogue import short_name, title_of
-from pipistrelle.experiments.runs.rerun import rerun as rerun_folder
+from pipistrelle.experiments.runs.replay import rerun as rerun_folder
 from pipistrelle.figures.maps import (
     PLACED,
     RAY,

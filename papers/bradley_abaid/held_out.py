@@ -18,7 +18,7 @@ import polars as pl
 from readings import BEAMS, Reading, drawn, write_table
 
 from pipistrelle.config import InputError
-from pipistrelle.experiments.studies.store import load_study
+from pipistrelle.experiments.studies.study import load_study
 
 OUTPUT = Path(__file__).with_name("held_out.csv")
 

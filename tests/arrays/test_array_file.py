@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from pipistrelle.arrays.array_file import (
+from pipistrelle.arrays.layout import (
     MAX_BYTES,
     Microphones,
     array_text,

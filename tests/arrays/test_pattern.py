@@ -4,9 +4,8 @@ import numpy as np
 import pytest
 from scipy.special import j0
 
-from pipistrelle.arrays.array_file import microphones_of
 from pipistrelle.arrays.beamforming import beam_power, beampattern, bearing_bound, pattern_of
-from pipistrelle.arrays.layout import scattered
+from pipistrelle.arrays.layout import microphones_of, scattered
 
 WAVE = {"frequency": 35e3, "speed_of_sound": 343.0}
 LENGTH = 343.0 / 35e3

@@ -19,7 +19,7 @@ from pipistrelle.config import (
     ScenarioConfig,
 )
 from pipistrelle.experiments.runs.trial import run_mission
-from pipistrelle.experiments.studies.store import load_study
+from pipistrelle.experiments.studies.study import load_study
 from reference.studies import SMALL
 
 SHORT = (

@@ -16,8 +16,7 @@ from pipistrelle.config import Config, FilterConfig, InputError, RayConfig, Scen
 from pipistrelle.estimation.catalogue import CATALOGUE, PAPERS, entry, title_of
 from pipistrelle.experiments.runs.trial import run_mission
 from pipistrelle.experiments.studies.plan import find_plan, plan_text, read_plan
-from pipistrelle.experiments.studies.store import load_study
-from pipistrelle.experiments.studies.study import run_study
+from pipistrelle.experiments.studies.study import load_study, run_study
 from reference.missions import BICYCLE
 from reference.studies import SMALL, assert_same, plan_of, results
 from report.drawing import draw_only

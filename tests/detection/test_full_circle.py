@@ -12,9 +12,8 @@ from scipy.stats import binom, chi2
 from pipistrelle.acoustics.arrivals import Arrivals
 from pipistrelle.acoustics.paths import callers_of
 from pipistrelle.arithmetic.random_stream import complex_noise, stream_key
-from pipistrelle.arrays.array_file import microphones_of
 from pipistrelle.arrays.beamforming import bearing_bound, spread_towards
-from pipistrelle.arrays.layout import Scattered, scattered, square_of_four
+from pipistrelle.arrays.layout import Scattered, microphones_of, scattered, square_of_four
 from pipistrelle.arrays.receiver import add_echo_blocks, noise_blocks, record_samples
 from pipistrelle.arrays.sampling import BLOCK, blocks_to_hear, sampling
 from pipistrelle.config import Config, DetectionConfig, InputError

@@ -10,8 +10,7 @@ from scipy.stats import binom, chi2
 from pipistrelle.acoustics.arrivals import Arrivals
 from pipistrelle.acoustics.call import Sweep, ToneBurst, band_of, cross_talk, replica
 from pipistrelle.acoustics.paths import callers_of
-from pipistrelle.arrays.array_file import microphones_of
-from pipistrelle.arrays.layout import Layout, scattered, square_of_four
+from pipistrelle.arrays.layout import Layout, microphones_of, scattered, square_of_four
 from pipistrelle.arrays.receiver import record_samples
 from pipistrelle.arrays.sampling import sampling
 from pipistrelle.config import Config

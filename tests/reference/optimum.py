@@ -4,8 +4,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from pipistrelle.estimation.smoother.chain import converged, eliminated
 from pipistrelle.estimation.smoother.records import Stack
+from pipistrelle.estimation.smoother.sweep import converged, eliminated
 
 
 def from_the_truth(belief, path, places):

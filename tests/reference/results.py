@@ -8,7 +8,7 @@ from pipistrelle.experiments.drives import Truth
 from pipistrelle.experiments.results.scores import Scores, TrialResult, score
 from pipistrelle.experiments.results.writing import write_results
 from pipistrelle.experiments.studies.plan import cases_of
-from pipistrelle.experiments.studies.store import open_store
+from pipistrelle.experiments.studies.study import open_store
 from pipistrelle.experiments.studies.world import TrialRecord, write_world
 from pipistrelle.files import RESULTS, OwnFiles
 from reference.missions import map_with, scan_with

@@ -7,9 +7,8 @@ windowed-sinc delays, real samples. The package only reads the recordings, as fo
 import numpy as np
 
 import pipistrelle
-from pipistrelle.arrays.array_file import array_text, microphones_of
 from pipistrelle.arrays.beamforming import spread_towards
-from pipistrelle.arrays.layout import scattered
+from pipistrelle.arrays.layout import array_text, microphones_of, scattered
 from pipistrelle.detection.noise import BEARING_FLOOR, RANGE_FLOOR
 from pipistrelle.geometry import wrap
 from reference.sounds import write_beside

@@ -7,7 +7,7 @@ from pathlib import Path
 import polars as pl
 
 from pipistrelle.experiments.studies.plan import read_plan
-from pipistrelle.experiments.studies.store import load_study
+from pipistrelle.experiments.studies.study import load_study
 from pipistrelle.experiments.studies.world import TABLES
 
 SMALL = """\

@@ -10,7 +10,7 @@ from pipistrelle.acoustics.emitter import beamwidth
 from pipistrelle.config import Config
 from pipistrelle.experiments.hearing.scenario import world_of
 from pipistrelle.experiments.studies.plan import cases_of, find_plan, read_plan
-from pipistrelle.experiments.studies.store import open_store
+from pipistrelle.experiments.studies.study import open_store
 from pipistrelle.experiments.studies.world import TABLES, with_sums, world_file, world_schemas
 from pipistrelle.report.study import COMMON, READ, Study, Trials
 from pipistrelle.report.variables import beam_variable

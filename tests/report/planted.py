@@ -7,7 +7,7 @@ import numpy as np
 import polars as pl
 
 from pipistrelle.experiments.studies.plan import cases_of, read_plan
-from pipistrelle.experiments.studies.store import open_store
+from pipistrelle.experiments.studies.study import open_store
 from pipistrelle.experiments.studies.world import TABLES, with_sums, world_file, world_schemas
 from report.invented import noise
 

@@ -19,7 +19,7 @@ from pipistrelle.detection.logs.folder import read_log
 from pipistrelle.detection.scans import COLUMNS
 from pipistrelle.estimation.catalogue import CATALOGUE, PAPERS
 from pipistrelle.experiments.runs import replay
-from pipistrelle.experiments.runs import rerun as once_more
+from pipistrelle.experiments.runs import replay as once_more
 from pipistrelle.experiments.runs.replay import motion_of
 from pipistrelle.settings import from_text
 from reference.bags import (

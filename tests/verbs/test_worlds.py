@@ -7,7 +7,7 @@ import polars as pl
 import pytest
 
 from pipistrelle.__main__ import main
-from pipistrelle.experiments.runs.rerun import rerun
+from pipistrelle.experiments.runs.replay import rerun
 from reference.command_line import SHORT, contents, summary
 
 pytestmark = pytest.mark.usefixtures("undrawn")

@@ -59,7 +59,7 @@ def pattern_of(layout: Scattered, g: int, *, frequency: float, speed_of_sound: f
     Over all bearings, or for a line on a face within 75 degrees of its normal. `speed_of_sound`
     [m/s].
 
-    >>> from pipistrelle.arrays.array_file import microphones_of
+    >>> from pipistrelle.arrays.layout import microphones_of
     >>> from pipistrelle.arrays.layout import scattered
     >>> line = scattered(microphones_of([(0, 0.0049 * i, 0, 0, "") for i in range(10)]))
     >>> found = pattern_of(line, 0, frequency=35e3, speed_of_sound=343.0)

@@ -394,7 +394,7 @@ def front_end(
     not whole bins, at the rate ``receiver.sample_rate``. Raises InputError as `detector` does, if
     microphones are too far apart, and for detection settings that require lines on faces.
 
-    >>> from pipistrelle.arrays.array_file import microphones_of
+    >>> from pipistrelle.arrays.layout import microphones_of
     >>> from pipistrelle.arrays.layout import scattered
     >>> cross = [(0.02, 0.0), (0.0, 0.02), (-0.02, 0.0), (0.0, -0.02)]
     >>> layout = scattered(microphones_of([(x, y, 0.0, 0.0, "") for x, y in cross]))

@@ -23,7 +23,7 @@ class Gaussian:
     """Covariance of true value minus mean, (*n, d, d); to first order if another error is normal.
     """
     invariant: bool = False
-    """Whether the right-invariant error of a pose is normal (`estimation.ekf.invariant_error`)."""
+    """Whether the right-invariant error of a pose is normal (`estimation.ekf.gaussian`)."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

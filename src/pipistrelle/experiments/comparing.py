@@ -32,7 +32,7 @@ from pipistrelle.experiments.results.reading import (
     results_in,
 )
 from pipistrelle.experiments.studies.plan import RADIUS, Plan, PlannedCase, cases_of, plan_settings
-from pipistrelle.experiments.studies.store import load_study
+from pipistrelle.experiments.studies.study import load_study
 from pipistrelle.experiments.studies.world import check_world, done_worlds
 from pipistrelle.files import read_file, without_links
 from pipistrelle.geometry import wrap

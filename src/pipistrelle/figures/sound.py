@@ -5,9 +5,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from pipistrelle.arrays.array_file import Microphones
 from pipistrelle.arrays.beamforming import Pattern, beam_power, spread_towards
-from pipistrelle.arrays.layout import Scattered
+from pipistrelle.arrays.layout import Microphones, Scattered
 from pipistrelle.detection.sounds.check import Overview
 from pipistrelle.figures.chart import PLAIN
 from pipistrelle.figures.style import INK, STRATEGY_COLOURS, STYLE, TRUTH

@@ -22,7 +22,7 @@ from pipistrelle.estimation.catalogue import CATALOGUE
 from pipistrelle.evaluation.scores import NOT_MEANS, SCORES
 from pipistrelle.experiments.hearing.scenario import Scenario, standing_landmarks, world_of
 from pipistrelle.experiments.studies.plan import MAKERS, RADIUS, Plan, cases_of, common
-from pipistrelle.experiments.studies.store import load_study
+from pipistrelle.experiments.studies.study import load_study
 from pipistrelle.experiments.studies.world import (
     STEPS,
     check_world,

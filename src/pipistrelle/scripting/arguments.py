@@ -241,7 +241,7 @@ def mission_settings(door: Door) -> tuple[Config, "World | None", tuple[str, ...
 
         layer = with_calls(layer)
     if ARRAY_KEY in layer:
-        from pipistrelle.arrays.array_file import with_array
+        from pipistrelle.arrays.layout import with_array
 
         layer = with_array(layer)
     if WORLD_KEY in layer:

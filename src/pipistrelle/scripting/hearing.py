@@ -9,9 +9,9 @@ from typing import TYPE_CHECKING, Any
 from pipistrelle.config import Config, InputError
 from pipistrelle.detection.logs.folder import RowsHeard
 from pipistrelle.detection.sounds.check import Overview
-from pipistrelle.detection.sounds.description import FILE as ABOUT
-from pipistrelle.detection.sounds.description import Description, read_description
 from pipistrelle.detection.sounds.hearing import Frame, hear_recording, log_callers
+from pipistrelle.detection.sounds.sound_file import FILE as ABOUT
+from pipistrelle.detection.sounds.sound_file import Description, read_description
 from pipistrelle.experiments.runs.truth_files import read_truth
 from pipistrelle.files import (
     LOG,

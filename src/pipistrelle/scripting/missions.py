@@ -35,8 +35,7 @@ from pipistrelle.experiments.named_settings import (
 from pipistrelle.experiments.results.scores import TrialResult, is_placed
 from pipistrelle.experiments.results.writing import write_results
 from pipistrelle.experiments.runs.heard_world import Mission
-from pipistrelle.experiments.runs.replay import load, replay
-from pipistrelle.experiments.runs.rerun import log_entry
+from pipistrelle.experiments.runs.replay import load, log_entry, replay
 from pipistrelle.experiments.runs.trial import Watch, run_mission
 from pipistrelle.experiments.runs.truth_files import truth_files
 from pipistrelle.experiments.runs.validate import checked_scenario, warnings_of

@@ -554,7 +554,7 @@ def load(
     True
     """
     from pipistrelle.experiments.results.reading import read_summary
-    from pipistrelle.experiments.runs.rerun import rerun
+    from pipistrelle.experiments.runs.replay import rerun
 
     place = folder_named(folder, "load")
     if (place / "plan.toml").is_file():

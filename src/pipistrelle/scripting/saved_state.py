@@ -37,9 +37,9 @@ from pipistrelle.estimation.data_association.rows import (
     EarlyScan,
     Memory,
     ScanRows,
+    Tracks,
 )
 from pipistrelle.estimation.data_association.sequential import METHODS
-from pipistrelle.estimation.data_association.tracks import Tracks
 from pipistrelle.estimation.ekf.filter import EkfBelief
 from pipistrelle.estimation.ekf.gaussian import INVARIANT, LINEAR
 from pipistrelle.estimation.fastslam.block import LANES

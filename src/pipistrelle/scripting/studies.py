@@ -9,8 +9,7 @@ from typing import TYPE_CHECKING, Any
 from pipistrelle.config import InputError
 from pipistrelle.evaluation.scores import NOT_MEANS, SCORES
 from pipistrelle.experiments.studies.plan import FORMAT, Plan, find_plan, plan_of, read_plan
-from pipistrelle.experiments.studies.store import load_study
-from pipistrelle.experiments.studies.study import StudyProgress, run_study
+from pipistrelle.experiments.studies.study import StudyProgress, load_study, run_study
 from pipistrelle.refusals import shown
 from pipistrelle.settings import from_keywords
 

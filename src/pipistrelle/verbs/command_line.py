@@ -53,7 +53,7 @@ for parent, name, place, words in (
     (
         app,
         "report",
-        "report:report",
+        "compare:report",
         "Write a study as one page: answer, figures, claims.",
     ),
     (app, "compare", "compare:compare", "Compare the results of runs, logs or studies."),

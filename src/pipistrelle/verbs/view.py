@@ -103,7 +103,7 @@ def _play_again(
 ) -> "Playback":
     """Conduct the mission again, and return its frames."""
     from pipistrelle.experiments.machine import keep_freed_memory
-    from pipistrelle.experiments.runs.rerun import rerun
+    from pipistrelle.experiments.runs.replay import rerun
     from pipistrelle.figures.player.playback import playback
     from pipistrelle.figures.recorder import MissionRecorder
     from pipistrelle.kernel_clock import announce
@@ -190,9 +190,8 @@ def array(
     """Draw a microphone array; print its aperture, beam widths and ambiguous bearings."""
     if output is not None:
         check_place(output, None, ".png", "-o", overwrite)
-    from pipistrelle.arrays.array_file import read_array
     from pipistrelle.arrays.beamforming import pattern_of
-    from pipistrelle.arrays.layout import scattered, square_microphones
+    from pipistrelle.arrays.layout import read_array, scattered, square_microphones
 
     settled = resolve(over_named(layers(named, None))[0])
     if frequency is None:

@@ -12,8 +12,8 @@ import pipistrelle
 from pipistrelle.acoustics.call import Sweep
 from pipistrelle.config import Config, InputError
 from pipistrelle.detection.logs.folder import RowsHeard
-from pipistrelle.detection.sounds.description import read_description
 from pipistrelle.detection.sounds.hearing import hear_recording, log_callers
+from pipistrelle.detection.sounds.sound_file import read_description
 from pipistrelle.experiments.hearing.listening import listen
 from pipistrelle.experiments.hearing.scenario import world_of
 from pipistrelle.scripting.arguments import Door, mission_settings

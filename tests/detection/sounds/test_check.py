@@ -9,7 +9,7 @@ import soundfile
 
 from pipistrelle.config import Config
 from pipistrelle.detection.sounds.check import check_recording
-from pipistrelle.detection.sounds.description import read_description
+from pipistrelle.detection.sounds.sound_file import read_description
 from reference.sounds import foreign, record
 
 DRIVE = ("--landmarks", "20", "--duration", "4", "--seed", "7")

@@ -15,8 +15,8 @@ from pipistrelle.config import Config, DetectionConfig, InputError
 from pipistrelle.detection.logs.folder import RowsHeard, read_log
 from pipistrelle.detection.sounds.calls import _loudest_around, calls_of
 from pipistrelle.detection.sounds.check import check_recording
-from pipistrelle.detection.sounds.description import read_description
 from pipistrelle.detection.sounds.hearing import hear_recording, log_callers
+from pipistrelle.detection.sounds.sound_file import read_description
 from pipistrelle.experiments.hearing.listening import listen
 from pipistrelle.experiments.hearing.scenario import world_of
 from pipistrelle.scripting.arguments import Door, base_layer, mission_settings

@@ -9,8 +9,7 @@ import pytest
 import soundfile
 
 from pipistrelle.config import InputError
-from pipistrelle.detection.sounds.description import read_description
-from pipistrelle.detection.sounds.sound_file import open_sound
+from pipistrelle.detection.sounds.sound_file import open_sound, read_description
 from reference.sounds import write_beside
 
 KINDS = [

@@ -12,8 +12,13 @@ from pipistrelle.estimation.data_association.caller_search import (
     searched,
 )
 from pipistrelle.estimation.data_association.pairs import Rows
-from pipistrelle.estimation.data_association.rows import Caller, CallerPlace
-from pipistrelle.estimation.data_association.tracks import Tracks, followed, in_window
+from pipistrelle.estimation.data_association.rows import (
+    Caller,
+    CallerPlace,
+    Tracks,
+    followed,
+    in_window,
+)
 from pipistrelle.estimation.measurement import excess_path_slopes
 
 CALLER = np.array([9.0, -7.0])

@@ -9,7 +9,6 @@ from pipistrelle.config import PARAMETERS, Config, FilterConfig, InputError, Pri
 from pipistrelle.detection.scans import with_columns
 from pipistrelle.estimation.beliefs import Gaussian
 from pipistrelle.estimation.motion import Motion, motion_step
-from pipistrelle.estimation.smoother.chain import converged, relinearised, smoothed
 from pipistrelle.estimation.smoother.filter import Smoother
 from pipistrelle.estimation.smoother.history import in_hindsight
 from pipistrelle.estimation.smoother.preintegration import (
@@ -18,6 +17,7 @@ from pipistrelle.estimation.smoother.preintegration import (
     extended,
     no_odometry,
 )
+from pipistrelle.estimation.smoother.sweep import converged, relinearised, smoothed
 from pipistrelle.geometry import range_and_bearing, wrap
 from reference import dense_smoothing
 from reference.missions import (

@@ -6,9 +6,9 @@ import gtsam
 import numpy as np
 import pytest
 
-from pipistrelle.estimation.smoother.chain import converged, relinearised
 from pipistrelle.estimation.smoother.filter import Smoother
 from pipistrelle.estimation.smoother.history import in_hindsight
+from pipistrelle.estimation.smoother.sweep import converged, relinearised
 from pipistrelle.geometry import wrap
 from reference import dense_smoothing
 from reference.factor_graph import graph_of, optimum, pose_key, turned

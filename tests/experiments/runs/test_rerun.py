@@ -12,7 +12,7 @@ import pytest
 
 from pipistrelle.__main__ import main
 from pipistrelle.config import InputError
-from pipistrelle.experiments.runs.rerun import rerun
+from pipistrelle.experiments.runs.replay import rerun
 from reference.command_line import SHORT
 from reference.pictures import without_picture
 

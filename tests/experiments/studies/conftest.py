@@ -2,7 +2,7 @@
 
 import pytest
 
-from pipistrelle.experiments.studies.store import open_store
+from pipistrelle.experiments.studies.study import open_store
 from pipistrelle.experiments.studies.world import failed_records
 from reference.studies import plan_of
 

@@ -7,7 +7,7 @@ import pytest
 from pipistrelle.acoustics.emitter import beamwidth, piston_radius
 from pipistrelle.config import Config, InputError
 from pipistrelle.experiments.studies.plan import cases_of, changed_settings, plan_text
-from pipistrelle.experiments.studies.store import open_store
+from pipistrelle.experiments.studies.study import open_store
 from pipistrelle.settings import from_flags
 from reference.studies import plan_of
 

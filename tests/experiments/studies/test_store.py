@@ -12,7 +12,7 @@ import pytest
 
 from pipistrelle.config import Config, InputError
 from pipistrelle.experiments.studies.plan import plan_text, read_plan
-from pipistrelle.experiments.studies.store import load_study, open_store
+from pipistrelle.experiments.studies.study import load_study, open_store
 from pipistrelle.experiments.studies.world import TABLES, write_world
 from pipistrelle.settings import from_file, resolve
 from reference.studies import SMALL, contents, leftovers, plan_of

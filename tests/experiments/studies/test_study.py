@@ -4,8 +4,7 @@ import pytest
 
 from pipistrelle.config import InputError
 from pipistrelle.experiments.studies import study, world
-from pipistrelle.experiments.studies.store import load_study
-from pipistrelle.experiments.studies.study import run_study
+from pipistrelle.experiments.studies.study import load_study, run_study
 from pipistrelle.experiments.studies.world import done_worlds, world_file
 from reference.studies import as_rows, assert_same, leftovers, plan_of, results
 

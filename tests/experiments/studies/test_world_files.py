@@ -10,8 +10,7 @@ import pytest
 
 from pipistrelle.config import InputError
 from pipistrelle.experiments.studies import world as world_files
-from pipistrelle.experiments.studies.store import load_study, open_store
-from pipistrelle.experiments.studies.study import run_study
+from pipistrelle.experiments.studies.study import load_study, open_store, run_study
 from pipistrelle.experiments.studies.world import (
     TABLES,
     check_world,

@@ -6,7 +6,7 @@ import pytest
 
 from pipistrelle.config import Config, ScenarioConfig
 from pipistrelle.experiments.results.writing import write_results
-from pipistrelle.experiments.runs.rerun import rerun
+from pipistrelle.experiments.runs.replay import rerun
 from pipistrelle.experiments.runs.trial import run_mission
 from pipistrelle.figures.player.playback import playback
 from pipistrelle.figures.recorder import MissionRecorder

@@ -27,9 +27,8 @@ from pipistrelle.acoustics.call import Call, ToneBurst
 from pipistrelle.config import BLOCK, InputError
 from pipistrelle.detection.logs.text_tables import place_of, read_table
 from pipistrelle.detection.matched import BandFilters
-from pipistrelle.detection.sounds.description import FILE as ABOUT
-from pipistrelle.detection.sounds.description import Description
-from pipistrelle.detection.sounds.sound_file import Sound
+from pipistrelle.detection.sounds.sound_file import FILE as ABOUT
+from pipistrelle.detection.sounds.sound_file import Description, Sound
 from pipistrelle.jit import kernel
 from pipistrelle.refusals import refusal
 

@@ -24,9 +24,14 @@ from pipistrelle.detection.noise import energy_of
 from pipistrelle.detection.scans import OWN, Scan
 from pipistrelle.detection.snapshots import Detections
 from pipistrelle.detection.sounds.calls import Blocks, Calls, calls_of
-from pipistrelle.detection.sounds.description import Description, RecordedArray, recorded_array
 from pipistrelle.detection.sounds.hearing import Frame, Hearing, copied_channels, sums_of
-from pipistrelle.detection.sounds.sound_file import Sound, open_sound
+from pipistrelle.detection.sounds.sound_file import (
+    Description,
+    RecordedArray,
+    Sound,
+    open_sound,
+    recorded_array,
+)
 from pipistrelle.geometry import wrap
 
 CALLS, SNAPSHOTS = 64, 60

@@ -52,14 +52,15 @@ from pipistrelle.detection.sounds.calls import (
     blocks_of,
     calls_of,
 )
-from pipistrelle.detection.sounds.description import ARRAY_FILE as ARRAY
-from pipistrelle.detection.sounds.description import (
+from pipistrelle.detection.sounds.sound_file import ARRAY_FILE as ARRAY
+from pipistrelle.detection.sounds.sound_file import (
     FILE,
     Description,
     RecordedArray,
+    Sound,
+    open_sound,
     recorded_array,
 )
-from pipistrelle.detection.sounds.sound_file import Sound, open_sound
 from pipistrelle.detection.wideband import Wide
 from pipistrelle.refusals import refusal
 

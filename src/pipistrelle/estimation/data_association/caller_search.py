@@ -43,8 +43,15 @@ from pipistrelle.estimation.data_association.pairs import (
     pair_costs,
     pair_innovations,
 )
-from pipistrelle.estimation.data_association.rows import Caller, CallerPlace, EarlyScan, part_of
-from pipistrelle.estimation.data_association.tracks import TURN, Tracks, in_window
+from pipistrelle.estimation.data_association.rows import (
+    TURN,
+    Caller,
+    CallerPlace,
+    EarlyScan,
+    Tracks,
+    in_window,
+    part_of,
+)
 from pipistrelle.geometry import wrap_angle
 from pipistrelle.jit import kernel, no_alloc
 

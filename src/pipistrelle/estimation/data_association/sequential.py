@@ -69,15 +69,16 @@ from pipistrelle.estimation.data_association.rows import (
     EarlyScan,
     Joint,
     Memory,
+    Tracks,
     bearing_fits,
     compared,
+    followed,
     part_of,
     place_of,
     places_of,
     rows_of_scan,
     settled,
 )
-from pipistrelle.estimation.data_association.tracks import Tracks, followed
 
 PLACE_SHARE, MOVING_SHARE = 0.12, 0.2
 """Std of the range of a found caller, stationary or moving, relative to the range."""

@@ -7,7 +7,7 @@ The state contains the pose and, two numbers each, the hypotheses of all landmar
    :label: eq-8
 
 (Eq. (8); the correspondence is known, and no part of it). `correction` updates it with a scan. The
-covariance is of the linear or the right-invariant error (`invariant_error`).
+covariance is of the linear or the right-invariant error (`gaussian`).
 
 **Merging landmarks** (`merged`) is a measurement of their difference :math:`d = l_k - l_g` as 0, up
 to `MERGED_STD`. With :math:`H = (\dots, I, \dots, -I, \dots)` and S = H P H^T + R = L L^T,
@@ -62,10 +62,13 @@ from pipistrelle.estimation.checking import (
 )
 from pipistrelle.estimation.ekf.correction import corrected
 from pipistrelle.estimation.ekf.delayed_initialization import WAITING_WEIGHT
-from pipistrelle.estimation.ekf.gaussian import INVARIANT, LINEAR, propagate, retract
-from pipistrelle.estimation.ekf.invariant_error import (
+from pipistrelle.estimation.ekf.gaussian import (
+    INVARIANT,
+    LINEAR,
     linear_part,
+    propagate,
     propagate_invariant,
+    retract,
     rotated_left,
     shifted_covariance,
 )

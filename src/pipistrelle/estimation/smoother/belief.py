@@ -17,12 +17,18 @@ from pipistrelle.estimation.beliefs import (
     Landmarks,
 )
 from pipistrelle.estimation.rays import ray_members
-from pipistrelle.estimation.smoother.chain import Smoothed, converged, eliminated, smoothed
 from pipistrelle.estimation.smoother.history import NEVER, History
 from pipistrelle.estimation.smoother.preintegration import Odometry, placed, poses_between
 from pipistrelle.estimation.smoother.records import CALLER, POSE, Stack
 from pipistrelle.estimation.smoother.solution import joint
-from pipistrelle.estimation.smoother.sweep import Noise, Solution
+from pipistrelle.estimation.smoother.sweep import (
+    Noise,
+    Smoothed,
+    Solution,
+    converged,
+    eliminated,
+    smoothed,
+)
 from pipistrelle.geometry import wrap
 from pipistrelle.jit import kernel
 

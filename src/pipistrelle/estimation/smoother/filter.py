@@ -45,7 +45,6 @@ from pipistrelle.estimation.motion import Motion
 from pipistrelle.estimation.rays import gate_bounds
 from pipistrelle.estimation.recovery import corrected
 from pipistrelle.estimation.smoother.belief import SmootherBelief
-from pipistrelle.estimation.smoother.chain import eliminated, off_line, relinearised, stepped
 from pipistrelle.estimation.smoother.history import (
     NEVER,
     STRETCH,
@@ -86,7 +85,16 @@ from pipistrelle.estimation.smoother.records import (
     work_of,
 )
 from pipistrelle.estimation.smoother.solution import joint
-from pipistrelle.estimation.smoother.sweep import Noise, Points, Solution, Sweep
+from pipistrelle.estimation.smoother.sweep import (
+    Noise,
+    Points,
+    Solution,
+    Sweep,
+    eliminated,
+    off_line,
+    relinearised,
+    stepped,
+)
 from pipistrelle.geometry import wrap_angle
 from pipistrelle.jit import Whole, kernel, no_alloc
 

@@ -13,15 +13,14 @@ from pipistrelle.acoustics.arrivals import Arrivals
 from pipistrelle.acoustics.call import RecordedCall, settings_of
 from pipistrelle.acoustics.paths import VEHICLE, Caller, moves
 from pipistrelle.arithmetic.random_stream import stream_key
-from pipistrelle.arrays.array_file import array_text
-from pipistrelle.arrays.layout import layout_of, microphones_in
+from pipistrelle.arrays.layout import array_text, layout_of, microphones_in
 from pipistrelle.arrays.receiver import real_samples
 from pipistrelle.arrays.sampling import sampling
 from pipistrelle.config import SQUARE, Config, InputError
 from pipistrelle.detection.logs.text_tables import table_text
 from pipistrelle.detection.sounds.calls import FILE as CALLS
-from pipistrelle.detection.sounds.description import ARRAY_FILE as ARRAY
-from pipistrelle.detection.sounds.description import FILE as DESCRIPTION
+from pipistrelle.detection.sounds.sound_file import ARRAY_FILE as ARRAY
+from pipistrelle.detection.sounds.sound_file import FILE as DESCRIPTION
 from pipistrelle.experiments.hearing.scenario import Scenario, caller_labels
 from pipistrelle.files import OwnFiles, PiecesFile, make_folder, remove_empty
 

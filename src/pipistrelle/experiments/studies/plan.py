@@ -23,7 +23,7 @@ from pydantic import Field, PlainValidator, ValidationError
 from pydantic_core import PydanticCustomError
 
 from pipistrelle.acoustics.call import with_calls
-from pipistrelle.arrays.array_file import with_array
+from pipistrelle.arrays.layout import with_array
 from pipistrelle.config import STRATEGIES, Config, InputError, Section, Strategy
 from pipistrelle.estimation.catalogue import (
     CATALOGUE,
