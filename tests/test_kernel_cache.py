@@ -374,7 +374,7 @@ def test_the_key_of_kernels_depends_on_all_code_and_on_nothing_else():
         assert kept.count(b"\n") < text.count(b"\n")
 
 
-def test_kernels_are_shared_by_copies_of_the_package_whose_prose_differs(tmp_path):
+def test_kernels_are_shared_by_copies_of_the_package_with_other_docstrings(tmp_path):
     copies = [tmp_path / name / "pipistrelle" for name in ("first", "second")]
     for copy in copies:
         shutil.copytree(PACKAGE, copy, ignore=shutil.ignore_patterns("__pycache__", "*.toml"))

@@ -174,7 +174,7 @@ class PiecesFile:
         return self._sum.hexdigest()
 
     def write(self, data: bytes) -> None:
-        """Write one more piece."""
+        """Append bytes to the file and to its checksum."""
         with self._faults_named():
             self._file.write(data)
         self._sum.update(data)
@@ -649,7 +649,7 @@ def _in_the_way(path: Path, what: str) -> InputError:
 
 
 def _list_in(folder: Path) -> bytes | None:
-    """Return the content of a folder's list of sums; None if there is no such file."""
+    """Return the content of a folder's SHA256SUMS; None if it cannot be read."""
     path = folder / SUMS
     if path.is_symlink():
         return None

@@ -58,7 +58,7 @@ def test_a_fault_is_seen_and_named_without_its_numbers(given, fault):
         {"found": 1, "said": "pipistrelle: warning: fused ekf failed\n", "printed": "out\n"},
     ],
 )
-def test_what_a_command_may_do_is_no_fault(given):
+def test_allowed_results_of_a_command_are_no_fault(given):
     assert faults(**given) == []
 
 

@@ -108,7 +108,10 @@ def _modulus(mantissa, exponent, length, variance, modulus):
 
 @kernel
 def _turn(modulus, angular, length, real, imaginary):
-    """Rotate moduli by 32-bit angles: a half turn, a quarter turn, 30 bits of a quarter turn."""
+    """Convert moduli and random 32-bit angles to Cartesian coordinates.
+
+    The highest bit of an angle is a half turn, the next a quarter turn, the others its fraction.
+    """
     for i in range(length):
         fraction = _F(np.int32(angular[i] & np.uint32(0x3FFFFFFF))) * _F(2.0**-30)
         x = (fraction - _F(0.5)) * _QUARTER_TURN

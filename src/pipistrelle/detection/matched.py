@@ -226,7 +226,7 @@ class BandFilters:
     def around(
         self, samples: Float[np.ndarray, "t f e"], noise_std: float = 1.0
     ) -> Complex[np.ndarray, "l f c e"]:
-        """Return the outputs, with lags for calls that are only partly among the samples.
+        """Return matched-filter outputs also at lags where a call overlaps the samples only partly.
 
         These lags precede and follow the others, as many at each end as a call is long, as if
         silence surrounded the samples.

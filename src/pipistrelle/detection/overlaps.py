@@ -326,7 +326,7 @@ def resolve(
 
 @no_alloc
 def _are_apart(found: Sources, count: Whole) -> bool:
-    """Return whether all directions have a standard deviation of at most `UNSURE` in unit noise."""
+    """Return whether all directions are resolved: std of at most the limit in unit noise."""
     apart = 0
     for k in range(count):
         apart += 0.5 * found.inverse[k, k] <= UNSURE * UNSURE

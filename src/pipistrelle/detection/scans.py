@@ -116,10 +116,10 @@ def make_scan(
     bearing: Float[np.ndarray, " m"],
     **columns: np.ndarray | float,
 ) -> Scan:
-    """Make a scan from some of its columns.
+    """Make a scan from labels, bearings and any other columns; missing columns are NaN.
 
-    `time` [s]; `bearing` [rad]; `columns`: any others, as arrays or one number for all rows.
-    Missing columns are NaN, and the caller is the vehicle. Raises InputError for unknown columns,
+    `time` [s]; `bearing` [rad]; `columns`: any others, as arrays or a number for all rows.
+    Without a caller column, the caller is the vehicle. Raises InputError for unknown columns,
     and columns of different lengths or not of numbers.
 
     >>> scan = make_scan(0.5, np.array([3, 8]), np.array([0.2, 1.0]), bearing_std=0.15)

@@ -1,4 +1,4 @@
-"""Scans to beliefs: where the vehicle is, where the landmarks are, and how surely.
+"""Estimators: beliefs about pose and map from scans, with covariances.
 
 `motion` and `measurement` are the models (Bradley & Abaid, Sec. II-E), `rays` the partially
 initialised landmarks of passive sensing (Sec. III-C), `beliefs` the records and protocols of all

@@ -418,7 +418,7 @@ def _ffmpeg(width: int, height: int, path: Path) -> list[str]:
 
 
 def _palette() -> "Image":
-    """Return the palette: the strategies' colours, and steps to white, dark ink and each other.
+    """Return the palette: the strategies' colours with gradients to white, to ink and between them.
 
     Pillow compares colours by their upper six bits: steps towards white are wide enough to keep
     white.

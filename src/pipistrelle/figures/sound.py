@@ -99,7 +99,7 @@ def _turned(axes: "Axes") -> None:
 def _draw_beams(
     axes: "Axes", layout: Scattered, patterns: tuple[Pattern, ...], wave: dict[str, float]
 ) -> None:
-    """Draw two beams of the largest group: along its normal, and with the highest side lobe."""
+    """Draw two beam patterns: steered along the normal, and where the side lobe is highest."""
     g = int(np.argmax([pattern.microphones for pattern in patterns]))
     around = np.linspace(-np.pi, np.pi, 3601)
     normal, (worst, _) = layout.normal[g], patterns[g].worst

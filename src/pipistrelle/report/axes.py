@@ -26,7 +26,7 @@ ASIDE = {"active": 0.985, "fused": 1.015, "passive": 1.0}
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Line:
-    """The cases of one filter and strategy along an axis."""
+    """The line of one filter and strategy in a chart: its cases along the horizontal axis."""
 
     way: Way
     name: str

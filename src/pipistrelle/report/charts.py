@@ -362,7 +362,7 @@ def effect_charts(selection: Selection) -> list[Chart]:
 
 
 def gain_charts(selection: Selection) -> list[Chart]:
-    """Chart active minus fused over each variable, paired over worlds."""
+    """Chart the RMSE of active minus fused sensing over each variable, paired over worlds."""
     study = selection.study
     return [_gain_chart(selection, variable) for variable in study.variables]
 
@@ -581,7 +581,7 @@ def _drives_alike(study: Study) -> bool:
 
 
 def _ideal(study: Study, way: Way, runs: int) -> Series:
-    """Return the ANEES of a consistent filter over `runs` worlds, with the bounds of all cases."""
+    """Return the ANEES of a consistent filter over time, and its bounds for `runs` worlds."""
     expected, variance = study.trials[way].consistent
     low, high = anees_bounds_about(expected, variance, runs)
     return Series(

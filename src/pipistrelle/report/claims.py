@@ -458,7 +458,7 @@ def ekf_more_consistent(selection: Selection) -> list[Part]:
 
 
 def _nears_passive(selection: Selection) -> list[Part]:
-    """Return the part on the slope of the distance from fused to passive over the beamwidth."""
+    """Return the statement that the RMSE of fused sensing nears that of passive in narrow beams."""
     slopes = {label: approach(selection, POSITION, name) for name, label in FILTERS.items()}
     return [
         Part(

@@ -268,7 +268,7 @@ def _of_strategies(study: Study) -> Iterator[Pairing]:
 
 
 def _of_filters(study: Study) -> Iterator[Pairing]:
-    """Pair the first filter of each strategy with the others."""
+    """Yield the pairs of results to compare: the first filter of each strategy with each other."""
     titles = filter_titles(study)
     for strategy in STRATEGIES:
         names = [name for name in titles if (name, strategy) in study.trials]
@@ -462,7 +462,7 @@ def question(study: Study) -> str:
 
 
 def answer(selection: Selection, effects: Sequence[Effect]) -> list[str]:
-    """Answer a study's question: a sentence per variable, else per strategy or filter.
+    """Return the headline: a sentence per variable or, without variables, per strategy or filter.
 
     `effects`: under the rule `HEADLINE`. Each sentence is the change of the position RMSE between
     two values, averaged over everything else; of several values of a variable the largest shown.
@@ -530,7 +530,7 @@ def _averaged(
 
 
 def _shown_by(study: Study, group: Sequence[Effect]) -> str:
-    """Return the sentence on the filters and strategies with which an effect is shown."""
+    """Return the sentence that lists the filters and strategies of a shown effect."""
     titles, parts = filter_titles(study), []
     for sign, verb in ((1, "rise"), (-1, "fall")):
         shown = [e.pairing for e in group if direction(e.finding) == sign]

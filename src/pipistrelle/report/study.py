@@ -228,7 +228,7 @@ def lost_worlds(study: Study, name: str) -> Bool[np.ndarray, " n"]:
 
 
 def kept(selection: Selection, cells: Sequence[Cell]) -> Bool[np.ndarray, " n"]:
-    """Return a mask of the worlds that count if some cells are compared.
+    """Return a mask of the worlds without failed or excluded trials in the compared cells.
 
     A failed trial counts as diverged; under the rule "none" it has no number.
     """

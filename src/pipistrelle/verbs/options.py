@@ -298,7 +298,7 @@ else:
 
 
 def layers(named: Sequence[str] | None, settings: SettingFlags | None) -> Layer:
-    """Merge named settings, files, environment and flags.
+    """Merge presets, files, environment variables and flags to settings.
 
     >>> layers(None, {"seed": 3})["seed",].value
     3

@@ -115,7 +115,7 @@ def test_channels_that_are_dead_clipped_or_off_zero_are_named(tape):
     assert len(faults) == 4  # and that the order was not looked at
 
 
-def test_silence_says_nothing_of_the_sample_rate(tape):
+def test_silence_gives_no_warning_of_the_sample_rate(tape):
     with_samples(tape, lambda samples: samples.fill(0.0))
     faults = checked(tape)
     assert any("dead" in fault for fault in faults)

@@ -346,7 +346,7 @@ class RowsHeard:
         return text.split("\n", 1)[1]
 
     def files(self) -> dict[str, str]:
-        """Return the log's other files; raise if no row is within the odometry's time span."""
+        """Return odometry, README and log.toml by name; raise without echoes while it drives."""
         if not self.inside:
             begin, end = self.time[[0, -1]].tolist()
             found = f"{self.rows} echoes, none between {begin!r} s and {end!r} s"

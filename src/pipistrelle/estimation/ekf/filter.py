@@ -83,7 +83,7 @@ _NOBODY, _SUM = UNLABELLED, UNLABELLED - 1
 
 @kernel
 def velocity_of(label: Whole) -> Whole:
-    """Return the label of a caller's velocity, or of a velocity's caller.
+    """Convert a caller's label to the label of its velocity, and back.
 
     >>> velocity_of(51), velocity_of(velocity_of(51))
     (-53, 51)

@@ -314,7 +314,7 @@ def keep_heaviest(rows: Rows, count: Counts) -> None:
 
 @no_alloc
 def drop_heaviest(rows: Rows, count: Counts) -> None:
-    """Remove the heaviest hypothesis of each lane with several."""
+    """Remove the heaviest hypothesis of a ray from each particle that has several."""
     for i in range(LANES):
         if count[i] == 1:
             continue

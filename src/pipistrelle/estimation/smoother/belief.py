@@ -96,7 +96,7 @@ def _with_rows(
 def _link(
     ends: Int[np.ndarray, "r 4"], numbers: Float[np.ndarray, "r 8"], latest: Int[np.ndarray, " s"]
 ) -> None:
-    """Link each measurement to the previous bearing of its slot; write the latest of each slot."""
+    """Write into each measurement the index of its landmark's previous bearing."""
     for row in range(ends.shape[0]):
         ends[row, 3] = -1
         if not np.isnan(numbers[row, BEARING]):

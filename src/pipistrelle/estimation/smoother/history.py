@@ -175,7 +175,7 @@ def heard_more(history: History, odometry: Odometry, scan: Scan) -> History:
 
 @optimised_once
 def _write_leg(legs: Arrays, steps: Arrays, led: Led, span: tuple[Whole, Whole, float]) -> None:
-    """Write the motion to a node; ``span``: the node, the number of steps, duration [s]."""
+    """Write the motion to a chain node; ``span``: node, number of steps, duration [s]."""
     (mean, noise, seconds, _, ends, slopes), (k, last, took) = legs, span
     count = led[0].shape[0]
     first, moved = last - count, False

@@ -84,7 +84,7 @@ def place_by_excess_path(
 def _offset_covariance(
     i: Whole, front: Front, R: Float[np.ndarray, "n n"]
 ) -> Float[np.ndarray, "4 4"]:
-    """Return the covariance of position offset and heading; the fourth row and column are 0."""
+    """Return the 4x4 covariance of vehicle-to-caller offset (2), heading and an unused 0."""
     by_chain, by_border = np.zeros((3, front.P.shape[0])), np.zeros((3, R.shape[0]))
     for a in range(2):
         by_chain[a, a] = -1.0

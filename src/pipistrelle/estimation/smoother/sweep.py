@@ -423,7 +423,7 @@ def _between(points: Points, others: Points) -> Float[np.ndarray, " u"]:
 
 
 def _beyond(points: Points, step: Float[np.ndarray, " u"], times: float) -> Points:
-    """Move points by a multiple of a step."""
+    """Return linearisation points moved by a multiple of an optimisation step."""
     if times == 0.0:
         return points
     states, size = points.at.entries(0), points.spots.size

@@ -336,7 +336,7 @@ def _known_callers(log: Log) -> Landmarks:
 def _whose(
     reader: Reader, folder: Path, robot: Robot | None, formats: Sequence[Reader]
 ) -> tuple[Robot, ...]:
-    """Return the robot as arguments for the reader: empty if the format holds a single robot."""
+    """Return the robot that the log's reader is called with; () if its format has one robot."""
     if reader.robots is None:
         if robot is None:
             return ()

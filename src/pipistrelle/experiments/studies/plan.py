@@ -378,7 +378,7 @@ def plan_of(
 def _check_unvaried(
     path: Path, layer: Layer, grid: Mapping[str, Any], over: Layer, in_degrees: bool
 ) -> None:
-    """Raise if a setting has a value although the grid varies it, perhaps as a beamwidth."""
+    """Raise if a value is given for a setting that the plan's grid varies."""
     for key in (key for key in layer if ".".join(key) in grid):
         # The plan in a study's folder lists every setting, so a default value is no conflict.
         if key in over or resolve({key: layer[key]}) != Config():

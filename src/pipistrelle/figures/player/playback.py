@@ -55,7 +55,7 @@ SCRIPTS = ("numbers.js", "drawing.js", "map.js", "charts.js", "player.js")
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Rows:
-    """Rows of numbers of all frames."""
+    """Numbers of landmarks or scan rows in all frames, with the first row of each frame."""
 
     first: Int[np.ndarray, " n"]
     """Frame i has the rows first[i] to first[i + 1]."""
@@ -339,7 +339,7 @@ def _excess_paths(frames: Sequence[Snapshot]) -> Rows:
 
 
 def _mapped(maps: Sequence[Landmarks], origin: Float[np.ndarray, "2"]) -> Rows:
-    """Return mean, covariance and weight of the members of all maps."""
+    """Return mean, covariance and weight of all Gaussian hypotheses of the frames' maps."""
     numbers = [
         np.column_stack([rows.mean - origin, rows.covariance[:, (0, 0, 1), (0, 1, 1)], rows.weight])
         for rows in maps
