@@ -26,9 +26,8 @@ def pytest_sessionstart(session: pytest.Session) -> None:
 
 
 @pytest.fixture
-def undrawn():
-    """Leave out the picture of missions."""
-    from reference.pictures import without_picture
+def undrawn(monkeypatch):
+    """Leave out the picture of missions, by the test's own patch: it is undone in order."""
+    from reference.pictures import leave_out_picture
 
-    with without_picture():
-        yield
+    leave_out_picture(monkeypatch)

@@ -5,10 +5,15 @@ from contextlib import contextmanager
 import pytest
 
 
+def leave_out_picture(patch: pytest.MonkeyPatch) -> None:
+    """Replace the drawing and the writing of a mission's figure by nothing."""
+    patch.setattr("pipistrelle.figures.mission.draw_mission", lambda *_, **__: None)
+    patch.setattr("pipistrelle.figures.style.save_figure", lambda *_: None)
+
+
 @contextmanager
 def without_picture():
     """Leave out the picture of missions; yield the patch, to leave out more."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("pipistrelle.figures.mission.draw_mission", lambda *_, **__: None)
-        patch.setattr("pipistrelle.figures.style.save_figure", lambda *_: None)
+        leave_out_picture(patch)
         yield patch

@@ -20,7 +20,7 @@ def test_numbers_rise_and_are_their_positions():
     assert level.given == (36.8, 42.8, 48.8)
     assert places(level).tolist() == [36.8, 42.8, 48.8]
     assert level.label == "beacon.level_db [dB]"
-    assert level.meaning.startswith("Source level at 1 m [dB]")
+    assert level.meaning.startswith("Source level at 1 m of the beacon")
 
 
 @pytest.mark.parametrize(
@@ -44,7 +44,10 @@ def test_a_unit_is_read_from_the_setting_and_a_range_is_none():
     assert setting_variable("scenario.speed", [1, 2]).label == "scenario.speed [m/s]"
     assert setting_variable("air.relative_humidity", [0.1, 0.2]).label == "air.relative_humidity"
     assert setting_variable("scenario.steps", [100, 200]).label == "scenario.steps"
-    assert setting_variable("filter.range_std", [0.1, 0.2]).meaning == "Noise of a range [m]."
+    assert (
+        setting_variable("filter.range_std", [0.1, 0.2]).meaning
+        == "Standard deviation of a range [m]."
+    )
 
 
 @given(st.lists(st.floats(1e-12, 1e12), min_size=2, max_size=9, unique=True))

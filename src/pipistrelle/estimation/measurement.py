@@ -172,8 +172,8 @@ def measurement_jacobians(
     .. math:: \phi_i = \operatorname{atan2}(y_i - y_v, x_i - x_v) - \theta_v
        :label: eq-7
 
-    with only the second rows. Source: Bradley & Abaid, with Eqs. (6), (7) and (11). ``pose`` is (3)
-    [m, m, rad], ``point`` (2) [m]; returns H_x (2, 3) and H_m (2, 2).
+    with only the second rows (Bradley & Abaid, Eqs. (6), (7) and (11)). ``pose`` is (3) [m, m,
+    rad], ``point`` (2) [m]; returns H_x (2, 3) and H_m (2, 2).
 
     >>> measurement_jacobians(np.zeros(3), np.array([2.0, 0.0]))[1]
     array([[ 1. ,  0. ],

@@ -33,7 +33,7 @@ class StudyResults:
     >>> few.trials.height, few.summary.height
     (50, 50)
     >>> few.answer[0]
-    'Not decided: no world is left.'
+    'EKF and FastSLAM 2.0: not decided, no world is left, averaged over the beamwidths.'
     """
 
     def __init__(self, folder: Path, kept_by: "TemporaryDirectory[str] | None" = None) -> None:
