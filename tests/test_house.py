@@ -7,8 +7,6 @@ import pytest
 
 import house
 
-CLONE = (house.ROOT / ".git").exists()
-
 
 @pytest.fixture(scope="module")
 def measured():
@@ -51,7 +49,7 @@ def earlier_budgets() -> dict[str, float]:
     return smallest
 
 
-@pytest.mark.skipif(not CLONE, reason="not a clone")
+@pytest.mark.skipif(not (house.ROOT / ".git").exists(), reason="not a clone")
 def test_no_budget_is_raised():
     now = house.budgets()
     raised = {n: (now[n], was) for n, was in earlier_budgets().items() if n in now and now[n] > was}

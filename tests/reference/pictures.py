@@ -13,7 +13,7 @@ def leave_out_picture(patch: pytest.MonkeyPatch) -> None:
 
 @contextmanager
 def without_picture():
-    """Leave out the picture of missions; yield the patch, to leave out more."""
+    """Leave out the picture of missions; yield the patch."""
     with pytest.MonkeyPatch.context() as patch:
         leave_out_picture(patch)
         yield patch

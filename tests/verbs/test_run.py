@@ -179,9 +179,7 @@ def test_results_are_replaced_only_when_asked(obey, refused, undrawn):
 @pytest.mark.parametrize(
     "place", ["scripting.missions.run_mission", "figures.mission.draw_mission"]
 )
-def test_earlier_results_and_logs_survive_a_failed_mission(
-    obey, undrawn, monkeypatch, trouble, place
-):
+def test_earlier_results_survive_a_failed_mission(obey, undrawn, monkeypatch, trouble, place):
     def interrupted(*_, **__):
         raise trouble
 

@@ -36,6 +36,7 @@ from reference.bags import (
 )
 from reference.command_line import SHORT, summary, table, track
 from reference.odometry import as_motions, poses_file
+from reference.pictures import without_picture
 
 DATA = Path(__file__).parents[1] / "data"
 
@@ -178,7 +179,7 @@ def test_a_restarted_odometry_frame_is_questioned(obey, undrawn):
 def saved(tmp_path_factory):
     """The log of a run."""
     folder = tmp_path_factory.mktemp("saved")
-    with pytest.MonkeyPatch.context() as patch:
+    with without_picture() as patch:
         patch.setattr(sys, "argv", ["pipistrelle"])
         words = ("--save-log", str(folder / "log"), "--quiet", "-o", str(folder / "one"))
         assert main(["run", *SHORT, *words]) == 0

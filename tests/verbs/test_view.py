@@ -14,16 +14,15 @@ from pipistrelle.__main__ import main
 from pipistrelle.config import InputError
 from pipistrelle.files import REPORT, OwnFiles
 from reference.command_line import SHORT
+from reference.pictures import without_picture
 
 
 @pytest.fixture(scope="module")
 def made(tmp_path_factory):
     """A run's folder."""
     folder = tmp_path_factory.mktemp("made") / "one"
-    with pytest.MonkeyPatch.context() as patch:
+    with without_picture() as patch:
         patch.setattr(sys, "argv", ["pipistrelle"])
-        patch.setattr("pipistrelle.figures.mission.draw_mission", lambda *_, **__: None)
-        patch.setattr("pipistrelle.figures.style.save_figure", lambda *_: None)
         assert main(["run", *SHORT, "--quiet", "-o", str(folder)]) == 0
     return folder
 

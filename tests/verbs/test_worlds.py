@@ -9,6 +9,7 @@ import pytest
 from pipistrelle.__main__ import main
 from pipistrelle.experiments.runs.replay import rerun
 from reference.command_line import SHORT, contents, summary
+from reference.pictures import without_picture
 
 pytestmark = pytest.mark.usefixtures("undrawn")
 
@@ -27,10 +28,8 @@ filters = ["ekf"]
 def kept(tmp_path_factory):
     """A folder with a world that was drawn, and what came of it."""
     folder = tmp_path_factory.mktemp("kept")
-    with pytest.MonkeyPatch.context() as patch:
+    with without_picture() as patch:
         patch.chdir(folder)
-        patch.setattr("pipistrelle.figures.mission.draw_mission", lambda *_, **__: None)
-        patch.setattr("pipistrelle.figures.style.save_figure", lambda *_: None)
         assert main(["run", *SHORT, "--save-world", "here/drawn", "-o", "one", "--quiet"]) == 0
     return folder
 

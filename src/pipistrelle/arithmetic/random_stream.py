@@ -108,10 +108,7 @@ def _modulus(mantissa, exponent, length, variance, modulus):
 
 @kernel
 def _turn(modulus, angular, length, real, imaginary):
-    """Convert moduli and random 32-bit angles to Cartesian coordinates.
-
-    The highest bit of an angle is a half turn, the next a quarter turn, the others its fraction.
-    """
+    """Convert moduli and 32-bit angles (turn: 2 bits of quarters, 30 of their part) to x and y."""
     for i in range(length):
         fraction = _F(np.int32(angular[i] & np.uint32(0x3FFFFFFF))) * _F(2.0**-30)
         x = (fraction - _F(0.5)) * _QUARTER_TURN

@@ -227,7 +227,7 @@ def _squarest(
 
 
 def resolved(frames: Sequence[Snapshot]) -> list[int]:
-    """Select the landmark of each frame whose excess-path ellipses are drawn; or `UNLABELLED`.
+    """Select for each frame the landmark to draw with excess-path ellipses; or `UNLABELLED`.
 
     In this order: a landmark that the frame's excess paths have initialised; the ray with the
     fewest members that they update; the landmark initialised last, at most `RECENT_FRAMES` frames

@@ -458,7 +458,7 @@ def ekf_more_consistent(selection: Selection) -> list[Part]:
 
 
 def _nears_passive(selection: Selection) -> list[Part]:
-    """Return the statement that the RMSE of fused sensing nears that of passive in narrow beams."""
+    """Return the part that fused sensing nears the RMSE of passive sensing in narrow beams."""
     slopes = {label: approach(selection, POSITION, name) for name, label in FILTERS.items()}
     return [
         Part(
