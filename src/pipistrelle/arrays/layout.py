@@ -498,7 +498,8 @@ def at_one_centre(microphones: Microphones, where: str) -> tuple[Layout, Int[np.
         odd = array.name[int(np.argmax(np.isnan(array.normal)))]
         found = f"{odd!r}, which is no evenly spaced line of them" if odd else "microphones alone"
         raise InputError(f"{where}: found {found}, expected lines on faces where one_centre is set")
-    lines = sorted((along_line(array, g) for g in range(array.normal.size)), key=_first)
+    lines = [along_line(array, g) for g in range(array.normal.size)]
+    lines.sort(key=lambda line: int(line[0].min()))  # by their first microphones
     positions = [line.position for _, line in lines]
     alike = len({place.size for place in positions}) == 1
     if not alike or np.ptp(positions, axis=0).max() > LINE_TOLERANCE:
@@ -507,11 +508,6 @@ def at_one_centre(microphones: Microphones, where: str) -> tuple[Layout, Int[np.
     normal = np.array([line.normal[0] for _, line in lines])
     members = np.array([numbers for numbers, _ in lines])
     return Layout(normal=normal, position=np.mean(positions, axis=0)), members
-
-
-def _first(line: tuple[Int[np.ndarray, " k"], Layout]) -> int:
-    """Return the smallest index of a line's microphones."""
-    return int(line[0].min())
 
 
 def square_microphones(receiver: ReceiverConfig) -> Microphones:

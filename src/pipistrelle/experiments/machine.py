@@ -102,7 +102,8 @@ def check_recording(
     }
     numbers = 2 * settled.tones.size  # complex sums of each tone
     if settled.dense:  # samples and each tone's filter, in single precision
-        length |= {"scenario.step": max(length.get("scenario.step", 0.0), _period(setup))}
+        period = setup.step * setup.steps_per_frame
+        length |= {"scenario.step": max(length.get("scenario.step", 0.0), period)}
         numbers = (1 + settled.tones.size) * settled.block
     key = max(length, key=length.__getitem__)
     numbers *= math.prod(layout.shape)
@@ -113,11 +114,6 @@ def check_recording(
 def _farthest(places: Any) -> float:
     """Return the largest distance of points from the centre [m]; 0 if there are none."""
     return float(np.hypot(*np.reshape(places, (-1, 2)).T).max(initial=0.0))
-
-
-def _period(setup: ScenarioConfig) -> float:
-    """Return the time between two calls of the vehicle [s]."""
-    return setup.step * setup.steps_per_frame
 
 
 def _refuse_beyond(what: str, need: float, workers: int) -> None:

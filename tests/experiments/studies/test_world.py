@@ -1,12 +1,16 @@
 """A study's world: each case is the trial that it would be alone, though heard together."""
 
+import os
+import shutil
 from dataclasses import asdict, fields, replace
+from pathlib import Path
 
 import numpy as np
+import polars as pl
 import pytest
 
 from pipistrelle.acoustics.emitter import beamwidth
-from pipistrelle.config import Config, WaterConfig
+from pipistrelle.config import Config, InputError, WaterConfig
 from pipistrelle.detection.scans import with_columns
 from pipistrelle.evaluation.bound import nees_of_exact_start, pose_bound
 from pipistrelle.evaluation.consistency import nees
@@ -17,41 +21,56 @@ from pipistrelle.experiments.runs import heard_world
 from pipistrelle.experiments.runs.heard_world import drive_of, scans_of
 from pipistrelle.experiments.runs.trial import run_mission, run_trial
 from pipistrelle.experiments.studies import world
+from pipistrelle.experiments.studies import world as world_files
 from pipistrelle.experiments.studies.plan import Plan, cases_of
-from pipistrelle.experiments.studies.world import failed_records, run_world, world_tables
+from pipistrelle.experiments.studies.study import load_study, open_store, run_study
+from pipistrelle.experiments.studies.world import (
+    TABLES,
+    check_world,
+    done_worlds,
+    failed_records,
+    read_ended_trials,
+    refuse_strange,
+    run_world,
+    sweep,
+    world_file,
+    world_tables,
+    write_world,
+)
+from pipistrelle.files import write_down
 from pipistrelle.settings import Given, from_flags, known_settings, resolve
-from reference.studies import SMALL, as_rows, plan_of
+from reference.studies import SMALL, as_rows, contents, leftovers, plan_of
 
 BOUNDS = ("position_bound_m", "heading_bound_rad")
 
 
 @pytest.fixture(scope="module")
-def plan(tmp_path_factory):
-    varied = '"rays.power" = [2.0, 4.0]\n"scenario.landmarks" = [10, 12]\n'
-    text = SMALL.replace("landmarks = 12\n", "") + varied
+def varied(tmp_path_factory):
+    grid = '"rays.power" = [2.0, 4.0]\n"scenario.landmarks" = [10, 12]\n'
+    text = SMALL.replace("landmarks = 12\n", "") + grid
     return plan_of(tmp_path_factory.mktemp("plan"), text)
 
 
 @pytest.fixture(scope="module")
-def records(plan):
-    return run_world(plan, 0)
+def ran(varied):
+    return run_world(varied, 0)
 
 
 @pytest.fixture(scope="module")
-def alone(plan):
+def alone(varied):
     """The same cases one by one, as `pipistrelle run` would try them."""
-    return [run_mission(c.config, (c.strategy,), (c.filter,)) for c in cases_of(plan)]
+    return [run_mission(c.config, (c.strategy,), (c.filter,)) for c in cases_of(varied)]
 
 
-def test_each_case_scores_as_in_a_separate_mission(records, alone):
-    assert len(records) == 2 * 2 * (2 * 2 * 2 + 2)
-    for record, mission in zip(records, alone, strict=True):
+def test_each_case_scores_as_in_a_separate_mission(ran, alone):
+    assert len(ran) == 2 * 2 * (2 * 2 * 2 + 2)
+    for record, mission in zip(ran, alone, strict=True):
         (trial,) = mission.trials
         assert asdict(record.scores) == asdict(trial.scores)
 
 
-def test_steps_are_the_errors_and_the_nees_at_the_frames(records, alone):
-    for record, mission in zip(records, alone, strict=True):
+def test_steps_are_the_errors_and_the_nees_at_the_frames(ran, alone):
+    for record, mission in zip(ran, alone, strict=True):
         track, truth = mission.trials[0].track, mission.scenario.path
         assert record.steps.shape == (10, 5)
         for frame in range(10):
@@ -63,8 +82,8 @@ def test_steps_are_the_errors_and_the_nees_at_the_frames(records, alone):
             np.testing.assert_allclose(record.steps[frame, :3], expected, rtol=1.2e-7, atol=1e-14)
 
 
-def test_steps_contain_the_expected_nees_of_a_consistent_filter(records, alone):
-    for record, mission in zip(records, alone, strict=True):
+def test_steps_contain_the_expected_nees_of_a_consistent_filter(ran, alone):
+    for record, mission in zip(ran, alone, strict=True):
         drive, path = mission.drive, mission.scenario.path
         scans = scans_of(mission.heard, record.case.strategy, mission.config)
         bound = pose_bound(
@@ -74,9 +93,9 @@ def test_steps_contain_the_expected_nees_of_a_consistent_filter(records, alone):
         np.testing.assert_allclose(record.steps[:, 3:], np.transpose(expected)[4::4], rtol=1e-5)
 
 
-def test_the_map_is_kept_with_the_distance_of_each_landmark_from_its_place(records, alone):
+def test_the_map_is_kept_with_the_distance_of_each_landmark_from_its_place(ran, alone):
     rows = 0
-    for record, mission in zip(records, alone, strict=True):
+    for record, mission in zip(ran, alone, strict=True):
         hypotheses = mission.trials[0].track.landmarks
         places = dict(zip(*mission.drive.truth.landmarks, strict=True))
         assert set(record.landmark) == set(hypotheses.landmark)
@@ -87,19 +106,19 @@ def test_the_map_is_kept_with_the_distance_of_each_landmark_from_its_place(recor
             best = mine[np.argmax(hypotheses.weight[mine])]
             assert error == pytest.approx(np.hypot(*(hypotheses.mean[best] - places[label])))
             rows += 1
-    assert rows > len(records)
+    assert rows > len(ran)
 
 
-def test_particles_record_their_mean_number_of_full_landmarks(records, alone):
-    for record, mission in zip(records, alone, strict=True):
+def test_particles_record_their_mean_number_of_full_landmarks(ran, alone):
+    for record, mission in zip(ran, alone, strict=True):
         full = mission.trials[0].track.full
         expected = record.scores.landmarks_full if full is None else full
         assert record.landmarks_full_mean == expected
         assert (full is None) == (record.case.filter == "ekf")
 
 
-def test_only_active_and_fused_cases_have_their_pistons_beamwidth(records):
-    for record in records:
+def test_only_active_and_fused_cases_have_their_pistons_beamwidth(ran):
+    for record in ran:
         if record.case.strategy == "passive":
             assert record.beamwidth_deg is None
         else:
@@ -107,11 +126,11 @@ def test_only_active_and_fused_cases_have_their_pistons_beamwidth(records):
             assert record.beamwidth_deg == pytest.approx(np.degrees(width), rel=1e-12)
 
 
-def test_clutter_per_frame_is_counted_in_the_cases_beam(records, alone):
-    for record, mission in zip(records, alone, strict=True):
+def test_clutter_per_frame_is_counted_in_the_cases_beam(ran, alone):
+    for record, mission in zip(ran, alone, strict=True):
         clutter = [heard.clutter for heard in mission.heard]
         assert record.clutter_per_frame == pytest.approx(np.mean(clutter), rel=1e-12)
-    assert len({record.clutter_per_frame for record in records}) > 1
+    assert len({record.clutter_per_frame for record in ran}) > 1
 
 
 def test_the_beamwidth_uses_the_cases_frequency_and_speed_of_sound():
@@ -126,7 +145,7 @@ def test_the_beamwidth_uses_the_cases_frequency_and_speed_of_sound():
             assert record.beamwidth_deg == pytest.approx(width, rel=1e-6)
 
 
-def test_cases_that_hear_the_same_world_listen_once(plan, monkeypatch):
+def test_cases_that_hear_the_same_world_listen_once(varied, monkeypatch):
     heard = []
     listen = world.listen
 
@@ -135,7 +154,7 @@ def test_cases_that_hear_the_same_world_listen_once(plan, monkeypatch):
         return listen(scenario, config, radii, **named)
 
     monkeypatch.setattr(world, "listen", counted)
-    run_world(plan, 1)
+    run_world(varied, 1)
     assert [(landmarks, *radii) for landmarks, _, *radii in heard] == [
         (10, 0.0025, 0.025),
         (12, 0.0025, 0.025),
@@ -318,8 +337,8 @@ def plan_with(config, setting="", values=(), filters=("ekf", "fastslam")):
     return Plan(name="one", iterations=1, config=config, grid=grid, **ways)
 
 
-def found_in(plan):
-    """All that is found in a plan's first world but for the times that it took, to the bit."""
+def found_in(varied):
+    """All that is found in the first world of a plan but for the times that it took, to the bit."""
     skipped = ("case", "wall_s", "cpu_s")
     return [
         {
@@ -328,7 +347,7 @@ def found_in(plan):
             if field.name not in skipped
             for value in [getattr(record, field.name)]
         }
-        for record in run_world(plan, 0)
+        for record in run_world(varied, 0)
     ]
 
 
@@ -354,15 +373,15 @@ def test_values_of_a_grid_give_the_results_of_separate_runs(setting):
     assert alone[0] != alone[1], "or nothing is proved"
 
 
-def test_different_worlds_have_different_scores(plan, records):
-    again, other = run_world(plan, 0), run_world(plan, 1)
-    assert [r.scores for r in again] == [r.scores for r in records]
-    pairs = zip(other, records, strict=True)
+def test_different_worlds_have_different_scores(varied, ran):
+    again, other = run_world(varied, 0), run_world(varied, 1)
+    assert [r.scores for r in again] == [r.scores for r in ran]
+    pairs = zip(other, ran, strict=True)
     assert all(a.scores.position_rmse_m != b.scores.position_rmse_m for a, b in pairs)
 
 
-def test_each_case_of_a_later_world_equals_a_separate_trial(plan):
-    for record in run_world(plan, 1):
+def test_each_case_of_a_later_world_equals_a_separate_trial(varied):
+    for record in run_world(varied, 1):
         config, number = record.case.config, replace(record.case, iteration=1)
         scenario = world_of(config, 1)
         (heard,) = listen(scenario, config, [config.emitter.radius], iteration=1)
@@ -372,7 +391,7 @@ def test_each_case_of_a_later_world_equals_a_separate_trial(plan):
         assert asdict(record.scores) == asdict(trial.scores) | bounds
 
 
-def test_a_trial_that_raises_is_recorded_and_the_others_go_on(plan, records, monkeypatch):
+def test_a_trial_that_raises_is_recorded_and_the_others_go_on(varied, ran, monkeypatch):
     run_trial = world.run_trial
 
     def moody(case, drive, scans, config, **_):
@@ -381,7 +400,7 @@ def test_a_trial_that_raises_is_recorded_and_the_others_go_on(plan, records, mon
         return run_trial(case, drive, scans, config)
 
     monkeypatch.setattr(world, "run_trial", moody)
-    for record, whole in zip(run_world(plan, 0), records, strict=True):
+    for record, whole in zip(run_world(varied, 0), ran, strict=True):
         case = record.case
         if (case.strategy, case.filter) == ("fused", "fastslam"):
             assert record.error.startswith("Traceback")
@@ -395,18 +414,18 @@ def test_a_trial_that_raises_is_recorded_and_the_others_go_on(plan, records, mon
 
 def test_a_world_that_cannot_be_drawn_fails_only_its_cases(tmp_path):
     text = SMALL.replace("landmarks = 12", "radius = 12.0") + '"scenario.landmarks" = [5, 900]\n'
-    plan = plan_of(tmp_path, text)
-    for record in run_world(plan, 0):
+    varied = plan_of(tmp_path, text)
+    for record in run_world(varied, 0):
         crowded = record.case.config.scenario.landmarks == 900
         assert (record.error is not None) == crowded
         if crowded:
             assert "InputError: scenario.landmarks: found 900" in record.error
 
 
-def test_a_failed_trial_keeps_its_case_its_seed_and_its_error(plan):
-    tables = world_tables(plan, 7, failed_records(plan, "gone\n"))
+def test_a_failed_trial_keeps_its_case_its_seed_and_its_error(varied):
+    tables = world_tables(varied, 7, failed_records(varied, "gone\n"))
     rows = as_rows(tables["trials"])
-    assert [row["case"] for row in rows] == [case.number for case in cases_of(plan)]
+    assert [row["case"] for row in rows] == [case.number for case in cases_of(varied)]
     assert {(r["iteration"], r["seed"], r["status"], r["error"]) for r in rows} == {
         (7, 7, "failed", "gone\n")
     }
@@ -414,12 +433,12 @@ def test_a_failed_trial_keeps_its_case_its_seed_and_its_error(plan):
     assert len(tables["steps"]) == len(tables["landmarks"]) == 0
 
 
-def test_tables_keep_infinities_and_store_missing_values_as_null(plan, records):
+def test_tables_keep_infinities_and_store_missing_values_as_null(varied, ran):
     scores = replace(
-        records[0].scores, nees_max=np.inf, position_rmse_m=np.nan, map_rmse_m=None, diverged=True
+        ran[0].scores, nees_max=np.inf, position_rmse_m=np.nan, map_rmse_m=None, diverged=True
     )
     steps = np.array([[np.nan, np.inf, np.inf, 2.2, 3.5]], dtype=np.float32)
-    tables = world_tables(plan, 0, [replace(records[0], scores=scores, steps=steps)])
+    tables = world_tables(varied, 0, [replace(ran[0], scores=scores, steps=steps)])
     (row,) = as_rows(tables["trials"])
     assert row["nees_max"] == np.inf
     assert np.isnan(row["position_rmse_m"])
@@ -451,10 +470,10 @@ def test_an_exact_start_leaves_frames_unscored_until_the_covariance_is_positive_
     assert np.isinf(steps[:, 2]).tolist() == [True] + 9 * [False]
 
 
-def test_columns_of_a_worlds_tables_equal_their_records(plan, records):
-    tables = world_tables(plan, 3, records)
-    trials, scored = as_rows(tables["trials"]), asdict(records[0].scores)
-    for row, record in zip(trials, records, strict=True):
+def test_columns_of_a_worlds_tables_equal_their_records(varied, ran):
+    tables = world_tables(varied, 3, ran)
+    trials, scored = as_rows(tables["trials"]), asdict(ran[0].scores)
+    for row, record in zip(trials, ran, strict=True):
         assert (row["iteration"], row["case"]) == (3, record.case.number)
         left = {"nis_mean", *OF_ASSOCIATION}
         assert not left & {*row}, "worlds of a study that was begun before have none"
@@ -470,9 +489,9 @@ def test_columns_of_a_worlds_tables_equal_their_records(plan, records):
         np.testing.assert_array_equal(own["error_m"], record.landmark_error.astype(np.float32))
 
 
-def test_columns_have_the_names_of_varied_settings(plan, records):
-    tables = world_tables(plan, 0, records)
-    for row, case in zip(as_rows(tables["trials"]), cases_of(plan), strict=True):
+def test_columns_have_the_names_of_varied_settings(varied, ran):
+    tables = world_tables(varied, 0, ran)
+    for row, case in zip(as_rows(tables["trials"]), cases_of(varied), strict=True):
         assert (row["strategy"], row["filter"]) == (case.strategy, case.filter)
         assert {name: row[name] for name in case.values} == case.values
     kinds = {name: str(kind) for name, kind in tables["steps"].schema.items()}
@@ -489,7 +508,7 @@ def test_columns_have_the_names_of_varied_settings(plan, records):
 
 
 @pytest.mark.parametrize("stage", ["listen", "run_trial"])
-def test_an_interruption_that_a_library_hides_is_no_failed_trial(plan, monkeypatch, stage):
+def test_an_interruption_that_a_library_hides_is_no_failed_trial(varied, monkeypatch, stage):
     def hidden(*_, **__):
         try:
             raise KeyboardInterrupt
@@ -498,7 +517,7 @@ def test_an_interruption_that_a_library_hides_is_no_failed_trial(plan, monkeypat
 
     monkeypatch.setattr(world, stage, hidden)
     with pytest.raises(KeyboardInterrupt):
-        run_world(plan, 0)
+        run_world(varied, 0)
 
 
 # The bound
@@ -515,11 +534,11 @@ def bounded(tmp_path_factory):
     return run_world(plan_of(tmp_path_factory.mktemp("bounded"), text), 0)
 
 
-def bounds_of(records, strategy, radius=0.0025):
+def bounds_of(ran, strategy, radius=0.0025):
     """All bounds of a strategy at a radius, each once."""
     return {
         tuple(getattr(record.scores, name) for name in BOUNDS)
-        for record in records
+        for record in ran
         if record.case.strategy == strategy and record.case.config.emitter.radius == radius
     }
 
@@ -544,7 +563,7 @@ def test_hearing_more_never_raises_the_bound(bounded):
     assert all(one <= other for one, other in zip(wide, narrow, strict=True))
 
 
-def test_only_measured_noise_raises_the_bound(plan, monkeypatch):
+def test_only_measured_noise_raises_the_bound(varied, monkeypatch):
     def doubled(rows, settings, **options):
         rows = without_hidden(rows, settings, **options)
         more = {name: 2.0 * getattr(rows, name) for name in ("bearing_std", "range_std")}
@@ -552,7 +571,7 @@ def test_only_measured_noise_raises_the_bound(plan, monkeypatch):
 
     without_hidden, short = (
         heard_world.without_hidden,
-        replace(plan, strategies=("active",), filters=("ekf",)),
+        replace(varied, strategies=("active",), filters=("ekf",)),
     )
     before = run_world(short, 0)
     coarse = short.config.filter.model_copy(update={"range_std": 0.4, "bearing_std": 0.3})
@@ -568,3 +587,268 @@ def test_only_measured_noise_raises_the_bound(plan, monkeypatch):
             assert getattr(other.scores, name) > getattr(one.scores, name)
             assert getattr(same.scores, name) == getattr(one.scores, name)
         assert other.scores.position_rmse_m == one.scores.position_rmse_m
+
+
+def test_a_world_is_done_when_its_trials_are_there(folder, plan, records):
+    assert done_worlds(folder) == set()
+    write_world(folder, plan, 2, records)
+    assert done_worlds(folder) == {2}
+    for table in TABLES:
+        assert world_file(folder, table, 2).is_file()
+    assert leftovers(folder) == []
+    assert read_ended_trials(folder, plan, 2) == [(r.case.strategy, r.error) for r in records]
+
+
+def test_the_trials_are_written_last(folder, plan, records, monkeypatch):
+    order = []
+    rename = world_files.put_in_place
+    monkeypatch.setattr(
+        world_files, "put_in_place", lambda a, b: (order.append(b.parent.name), rename(a, b))
+    )
+    write_world(folder, plan, 0, records)
+    assert order == ["steps", "landmarks", "trials"]
+
+
+@pytest.mark.parametrize("table", TABLES)
+@pytest.mark.skipif(
+    not Path("/dev/full").exists(), reason="this system has no device that is always full"
+)
+def test_a_full_disk_raises_a_clear_error_and_keeps_existing_files(
+    folder, plan, records, monkeypatch, table
+):
+    write_world(folder, plan, 1, records)
+    before = contents(folder)
+
+    def full(path, data):
+        if path.parent.name == table:
+            path.write_bytes(data[:7])
+            raise OSError(28, "No space left on device")
+        write_down(path, data)
+
+    monkeypatch.setattr(world_files, "write_down", full)
+    for iteration in (0, 1):
+        with pytest.raises(InputError, match=r"could not be written \(No space left on device\)"):
+            write_world(folder, plan, iteration, failed_records(plan, "never written\n"))
+    assert contents(folder) == before
+    assert leftovers(folder) == []
+    assert done_worlds(folder) == {1}
+
+
+@pytest.mark.parametrize("nth", [1, 2, 3])
+def test_a_rename_that_fails_leaves_no_half_a_world_that_counts(
+    folder, plan, records, monkeypatch, nth
+):
+    calls = []
+
+    def failing(partial, path):
+        calls.append(path)
+        if len(calls) == nth:
+            raise OSError(5, "Input/output error", str(path))
+        partial.replace(path)
+
+    monkeypatch.setattr(world_files, "put_in_place", failing)
+    with pytest.raises(InputError, match="Input/output error"):
+        write_world(folder, plan, 0, records)
+    assert done_worlds(folder) == set()
+    assert leftovers(folder) == []
+    assert len(load_study(folder).steps.collect()) == 0
+
+
+def test_leftovers_of_a_killed_writer_are_removed_with_its_world(folder, plan, records):
+    for table in TABLES:
+        path = world_file(folder, table, 0)
+        path.with_name(f"{path.name}.deadbeef.partial").write_bytes(b"PAR1 half a")
+    world_file(folder, "steps", 0).write_bytes(b"whole, but of a world that is not done")
+    other = world_file(folder, "steps", 1)
+    living = other.with_name(f"{other.name}.01234567.partial")
+    living.write_bytes(b"another process is writing this")
+    assert done_worlds(folder) == set()
+    assert len(load_study(folder).steps.collect()) == 0
+    write_world(folder, plan, 0, records)
+    assert leftovers(folder) == [living]
+    sweep(folder, [1])
+    assert leftovers(folder) == []
+
+
+@pytest.mark.parametrize("table", ["steps", "landmarks"])
+@pytest.mark.parametrize("kind", ["text", "link", "other columns"])
+def test_a_file_of_somebodys_in_a_tables_place_is_refused_before_the_work(
+    folder, plan, tmp_path, table, kind
+):
+    path, other = world_file(folder, table, 1), tmp_path / "mine.parquet"
+    pl.DataFrame({"mine": [1.0]}).write_parquet(other)
+    if kind == "link":
+        path.symlink_to(other)
+    else:
+        path.write_bytes(b"my notes" if kind == "text" else other.read_bytes())
+    before = contents(folder)
+    with pytest.raises(InputError, match=f"{table}/iteration_00001.parquet: is no table .* move"):
+        run_study(plan, folder)
+    assert contents(folder) == before
+
+
+def test_tables_that_a_killed_writer_left_without_trials_block_nothing(folder, plan, records):
+    write_world(folder, plan, 1, records)
+    world_file(folder, "trials", 1).unlink()
+    refuse_strange(folder, plan, range(3))
+
+
+@pytest.mark.skipif(not Path("/proc/self/fd").is_dir(), reason="only Linux has such a path")
+@pytest.mark.parametrize("moment", ["write_down", "put_in_place"])
+def test_a_study_that_takes_the_folders_place_is_unchanged(
+    folder, plan, records, monkeypatch, tmp_path, moment
+):
+    other = tmp_path / "other"
+    another = replace(plan, config=resolve(from_flags({"seed": 99})))
+    open_store(other, another)
+    write_world(other, another, 2, records)
+    before, plain = contents(other), getattr(world_files, moment)
+
+    def swapped(*words):
+        if not folder.is_symlink():
+            folder.rename(tmp_path / "moved")
+            folder.symlink_to(other)
+        return plain(*words)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(world_files, moment, swapped)
+        write_world(folder, plan, 2, records)
+    assert done_worlds(tmp_path / "moved") >= {2}
+    with pytest.raises(InputError, match="found the folder of another study"):
+        write_world(folder, plan, 2, records)
+    assert contents(other) == before
+
+
+def test_an_overtaken_writer_succeeds(folder, plan, records, monkeypatch):
+    write = world_files.write_down
+
+    def overtaken(path, data):
+        write(path, data)
+        if path.parent.name == "trials" and len(leftovers(folder)) == 3:
+            monkeypatch.setattr(world_files, "write_down", write)
+            write_world(folder, plan, 0, records)  # which sweeps ours away
+
+    monkeypatch.setattr(world_files, "write_down", overtaken)
+    write_world(folder, plan, 0, records)
+    assert done_worlds(folder) == {0}
+    assert leftovers(folder) == []
+
+
+def test_a_damaged_world_is_named_with_the_way_out(folder, plan):
+    world_file(folder, "trials", 0).write_bytes(b"nothing of ours")
+    with pytest.raises(
+        InputError, match=r"0\.parquet: could not be read: it is no whole .*; remove"
+    ):
+        read_ended_trials(folder, plan, 0)
+
+
+@pytest.mark.parametrize("table", TABLES)
+@pytest.mark.parametrize("place", [0.1, 0.5, 0.8, 0.9, 0.98])
+def test_one_bit_that_a_disk_changed_is_noticed(folder, plan, records, table, place):
+    write_world(folder, plan, 3, records)
+    check_world(folder, plan, 3)
+    path = world_file(folder, table, 3)
+    data = bytearray(path.read_bytes())
+    data[int(place * len(data))] ^= 4
+    path.write_bytes(data)
+    with pytest.raises(InputError) as refused:
+        read_ended_trials(folder, plan, 3)
+    assert str(refused.value).startswith(f"{path}: ")
+    assert "remove trials/iteration_00003.parquet" in str(refused.value)
+
+
+def test_a_world_of_a_plan_with_other_settings_of_a_filters_own_is_noticed(tmp_path, plan, records):
+    own = {"ekf": {"filter.gate": 0.9}}
+    for k, (there, here) in enumerate((({}, own), (own, {}), (own, {"ekf": {"filter.gate": 0.8}}))):
+        folder = tmp_path / str(k)
+        open_store(folder, replace(plan, own=there))
+        write_world(folder, replace(plan, own=there), 0, records)
+        check_world(folder, replace(plan, own=there, iterations=99), 0)
+        with pytest.raises(InputError, match=r"iteration_00000\.parquet: was computed by another"):
+            check_world(folder, replace(plan, own=here), 0)
+
+
+def test_a_world_of_another_plan_is_noticed_and_more_worlds_are_no_other_plan(
+    folder, plan, records
+):
+    write_world(folder, plan, 0, records)
+    check_world(folder, replace(plan, iterations=99), 0)
+    other = replace(plan, config=resolve(from_flags({"rays": {"power": 3.0}})))
+    with pytest.raises(InputError, match=r"iteration_00000\.parquet: was computed by another plan"):
+        check_world(folder, other, 0)
+
+
+def test_trials_of_other_columns_are_named_though_their_sums_are_right(folder, plan, records):
+    tables = world_files.world_tables(plan, 0, records)
+    other = tables | {"trials": tables["trials"].drop("error")}
+    for name, file in world_files.with_sums(other, plan, 0).items():
+        world_file(folder, name, 0).write_bytes(file)
+    with pytest.raises(InputError, match=r"iteration_00000\.parquet: has not the columns"):
+        read_ended_trials(folder, plan, 0)
+
+
+@pytest.mark.parametrize("table", TABLES)
+def test_a_file_of_another_world_or_by_another_hand_is_noticed(folder, plan, table):
+    for number in (0, 1):
+        write_world(folder, plan, number, run_world(plan, number))
+    here, there = (world_file(folder, table, number) for number in (0, 1))
+    kept = here.read_bytes()
+    shutil.copy(there, here)
+    found = "is the file of world 1" if table == "trials" else "is not as it was written"
+    with pytest.raises(InputError, match=found):
+        check_world(folder, plan, 0)
+    here.write_bytes(kept)
+    check_world(folder, plan, 0)
+    pl.read_parquet(kept)[::2].write_parquet(here)
+    with pytest.raises(InputError, match=r"bears no sums|is not as it was written"):
+        check_world(folder, plan, 0)
+
+
+def test_a_writer_killed_while_it_replaces_a_world_leaves_it_undone(
+    folder, plan, records, monkeypatch
+):
+    write_world(folder, plan, 0, records)
+    tables = world_files.world_tables(plan, 0, records)
+    other = tables["steps"].select(
+        pl.lit(1).cast(kind).alias(c) for c, kind in tables["steps"].schema.items()
+    )
+    monkeypatch.setattr(world_files, "world_tables", lambda *_: tables | {"steps": other})
+
+    def killed(partial, path):
+        partial.replace(path)
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(world_files, "put_in_place", killed)
+    with pytest.raises(KeyboardInterrupt):
+        write_world(folder, plan, 0, records)
+    assert done_worlds(folder) == set(), "new steps beside old trials are no world"
+
+
+@pytest.mark.parametrize(
+    "name",
+    ["a*b", "s[1]/x", "q?", "file:x", "{a,b}", "http:/x", "\x1b[31m", "new\nline", "x ", "~x"],
+)
+def test_no_name_of_a_folder_is_a_pattern_or_a_place_elsewhere(
+    tmp_path, plan, records, monkeypatch, name
+):
+    monkeypatch.chdir(tmp_path)
+    beside = Path(name.replace("*", "X").replace("?", "X").replace("[1]", "1"))
+    for folder in {Path(name), beside}:
+        world_files_of(folder, plan, records)
+    for folder in {Path(name), beside}:
+        assert len(read_ended_trials(folder, plan, 0)) == len(records)
+        study = load_study(folder)
+        assert [len(getattr(study, table).collect()) for table in TABLES] == [0, 0, len(records)]
+
+
+@pytest.mark.skipif(os.name == "nt", reason="all names are Unicode there")
+def test_a_folder_with_an_undecodable_name_is_read(tmp_path, plan, records):
+    folder = tmp_path / os.fsdecode(b"log\xff")
+    world_files_of(folder, plan, records)
+    assert len(load_study(folder).trials.collect()) == len(records)
+
+
+def world_files_of(folder, plan, records):
+    """Open a study of one world."""
+    open_store(folder, plan)
+    write_world(folder, plan, 0, records)

@@ -422,11 +422,6 @@ def _laid(path: Path, table: Mapping[str, Any], over: Layer, worlds: dict[str, W
     return settled(world, layer) | {WORLD_KEY: Given(world.name, layer[WORLD_KEY].where)}
 
 
-def _beside(path: Path, folder: str) -> str:
-    """Return the path of a folder relative to a plan's file."""
-    return str(path.parent / folder)
-
-
 def _read(path: Path, key: Key, values: Any, worlds: dict[str, World]) -> Any:
     """Read the files that a grid names: worlds, arrays, and callers' routes."""
     if key == WORLD_KEY:
@@ -447,7 +442,7 @@ def _worlds(path: Path, folders: Any, worlds: dict[str, World]) -> Any:
         return folders  # rejected later with all values
     names = []
     for folder in folders:
-        world = read_world(Path(_beside(path, folder)))
+        world = read_world(path.parent / folder)
         if world.files != worlds.setdefault(world.name, world).files:
             raise InputError(
                 f"{path}: grid.{WORLD}: found two worlds called {world.name}; rename a folder"

@@ -53,9 +53,10 @@ from pipistrelle.experiments.results.writing import calibration_of
 from pipistrelle.experiments.runs.heard_world import HeardWorld, drive_of
 from pipistrelle.experiments.runs.trial import run_trial
 from pipistrelle.experiments.runs.validate import failure_text, first_belief
-from pipistrelle.experiments.studies.plan import Plan, PlannedCase, cases_of
+from pipistrelle.experiments.studies.plan import Plan, PlannedCase, cases_of, read_plan
 from pipistrelle.files import (
     check_ordinary,
+    held,
     partial_of,
     put_in_place,
     read_file,
@@ -408,9 +409,24 @@ def done_worlds(folder: Path) -> set[int]:
 def write_world(folder: Path, plan: Plan, iteration: int, records: Sequence[TrialRecord]) -> None:
     """Write a world's tables over earlier ones, and delete the leftovers of killed processes.
 
-    If writing fails, the earlier tables are unchanged.
+    If writing fails, the earlier tables are unchanged. Raises if another study has taken the place
+    of the folder.
     """
     files = with_sums(world_tables(plan, iteration, records), plan, iteration)
+    try:
+        with held(folder) as place:
+            if _plan_sum(read_plan(place / "plan.toml")) != _plan_sum(plan):
+                raise InputError(
+                    f"{folder}: found the folder of another study, which took the place of this "
+                    "one meanwhile; nothing in it is replaced; move it away and run the study again"
+                )
+            _write_held(place, iteration, files)
+    except OSError as error:
+        raise unusable(folder, error) from error
+
+
+def _write_held(folder: Path, iteration: int, files: dict[str, bytes]) -> None:
+    """Write a world's files under temporary names and rename them, the trials last."""
     paths = [world_file(folder, name, iteration) for name in TABLES]
     partials = {path: partial_of(path) for path in paths}
     try:
@@ -419,8 +435,6 @@ def write_world(folder: Path, plan: Plan, iteration: int, records: Sequence[Tria
         _make_way(folder, iteration, files)
         for path, partial in partials.items():
             put_in_place(partial, path)
-    except OSError as error:
-        raise unusable(folder, error) from error
     finally:
         for partial in partials.values():
             with contextlib.suppress(OSError):

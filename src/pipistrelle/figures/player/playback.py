@@ -154,7 +154,7 @@ def playback(
     for trial in trials:
         frames = snapshots[trial.strategy, trial.filter]
         estimates.append(_estimate(trial, frames, time, steps, done, origin))
-    true = done.drive.truth.path
+    true, points = done.drive.truth.path, done.drive.truth.landmarks
     title, facts = _title_and_facts(done, len(longest), len(time))
     return Playback(
         title=title,
@@ -164,7 +164,7 @@ def playback(
         limits=_limits(done, trials, origin),
         true_start=None if true is None else _moved(true[0], origin),
         true_pose=None if true is None else _moved(true[steps], origin),
-        landmarks=_landmarks(done.drive.truth.landmarks, origin),
+        landmarks=points and (points[0], points[1] - origin),
         callers=_callers(done, steps, origin),
         beamwidth=done.beamwidth,
         farthest=done.config.rays.range_bounds[1],
@@ -213,13 +213,6 @@ def _limits(
     )
     x, y = origin.tolist()
     return (left - x, right - x), (bottom - y, top - y)
-
-
-def _landmarks(
-    landmarks: LabelledPoints | None, origin: Float[np.ndarray, "2"]
-) -> LabelledPoints | None:
-    """Return the true landmarks relative to an origin."""
-    return None if landmarks is None else (landmarks[0], landmarks[1] - origin)
 
 
 def _callers(
@@ -451,7 +444,7 @@ def _packed_estimate(estimate: Estimate) -> dict[str, Any]:
             "resolved": _packed(estimate.resolved),
         }
     return optional | {
-        "name": _name(estimate),
+        "name": f"{estimate.strategy} · {title_of(estimate.filter)}",
         "role": estimate.strategy if known else "ink",
         "calls": estimate.strategy != "passive",
         "outcome": upright(estimate.outcome),
@@ -467,11 +460,6 @@ def _packed_estimate(estimate: Estimate) -> dict[str, Any]:
         "revisedAt": _packed(estimate.revised_at),
         "revised": _packed_rows(estimate.revised),
     }
-
-
-def _name(estimate: Estimate) -> str:
-    """Return the title of an estimate."""
-    return f"{estimate.strategy} · {title_of(estimate.filter)}"
 
 
 def _packed_rows(rows: Rows) -> dict[str, Any]:
