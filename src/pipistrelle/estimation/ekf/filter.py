@@ -329,7 +329,7 @@ class EkfBelief:
         """Return the joint Gaussian of pose, initialised landmarks and moving callers."""
         placed = is_placed(self.landmark)
         if among is not None:
-            placed &= np.isin(self.landmark, among)
+            placed &= (self.landmark[:, np.newaxis] == among).any(axis=1)  # faster than np.isin
         mean, covariance = self._linear(placed, with_pose=True)
         return JointGaussian(landmark=self.landmark[placed], mean=mean, covariance=covariance)
 
