@@ -13,7 +13,6 @@ import pytest
 import pipistrelle
 from pipistrelle import InputError
 from pipistrelle.__main__ import main
-from pipistrelle.scripting import studies
 from reference.studies import SMALL
 from report.drawing import draw_only
 
@@ -106,12 +105,12 @@ def test_shards_on_one_folder_and_a_cluster_do_the_whole(monkeypatch):
         assert set(part.trials["iteration"]) == done
     assert part.trials.drop(TIMES).equals(whole)
     asked = []
-    monkeypatch.setattr(studies, "run_study", lambda *a, **k: asked.append(k))
+    place = "pipistrelle.experiments.studies.study.run_study"
+    monkeypatch.setattr(place, lambda *a, **k: asked.append(k))
     with pytest.raises(InputError):  # nothing was done
         pipistrelle.study("small.toml", scheduler="tcp://here:1", workers=3, output="t")
-    assert [(k["scheduler"], k["workers"], k["shard"]) for k in asked] == [
-        ("tcp://here:1", 3, (0, 1))
-    ]
+    (given,) = asked
+    assert (given["scheduler"], given["workers"], given["shard"]) == ("tcp://here:1", 3, (0, 1))
 
 
 @pytest.mark.parametrize("shard", [(2, 2), (-1, 2), (0, 0), (0.5, 2), "0/2", (1,), None])

@@ -13,7 +13,6 @@ from pipistrelle.config import Config, InputError
 from pipistrelle.detection.logs.readers import Robot
 from pipistrelle.evaluation.scores import shown_in
 from pipistrelle.experiments.named_settings import over_named
-from pipistrelle.experiments.results.writing import result_folder
 from pipistrelle.files import RESULTS, OwnFiles, claim, read_file
 from pipistrelle.refusals import refusal, shown
 from pipistrelle.scripting.arguments import (
@@ -497,6 +496,8 @@ def _conducted(
 
 def _folder(door: Door, name: str) -> AbstractContextManager[OwnFiles | None]:
     """Return a context that yields the claimed result folder, None if nothing is to be kept."""
+    from pipistrelle.experiments.results.writing import result_folder
+
     path, flags = door.folder("output"), door.ways_out("output")
     if path is None and not door.makes_folder:
         for option in ("animate", "save_bag"):

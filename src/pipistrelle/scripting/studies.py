@@ -8,8 +8,6 @@ from typing import TYPE_CHECKING, Any
 
 from pipistrelle.config import InputError
 from pipistrelle.evaluation.scores import NOT_MEANS, SCORES
-from pipistrelle.experiments.studies.plan import FORMAT, Plan, find_plan, plan_of, read_plan
-from pipistrelle.experiments.studies.study import StudyProgress, load_study, run_study
 from pipistrelle.refusals import shown
 from pipistrelle.settings import from_keywords
 
@@ -17,6 +15,7 @@ if TYPE_CHECKING:
     import polars as pl
     from matplotlib.figure import Figure
 
+    from pipistrelle.experiments.studies.plan import Plan
     from pipistrelle.report.page import Answered
 
 
@@ -39,10 +38,12 @@ class StudyResults:
     def __init__(self, folder: Path, kept_by: "TemporaryDirectory[str] | None" = None) -> None:
         self.folder = folder
         """Folder of the study; deleted with this object if none was named."""
+        from pipistrelle.experiments.studies.study import load_study
+
         self._kept_by, self._stored = kept_by, load_study(folder)
 
     @property
-    def plan(self) -> Plan:
+    def plan(self) -> "Plan":
         """The plan of the study."""
         return self._stored.plan
 
@@ -140,7 +141,7 @@ def study(
     scheduler: str | None = None,
     output: Path | str | None = None,
     retry_failed: bool = False,
-    progress: Callable[[StudyProgress], None] | None = None,
+    progress: Callable[[Any], None] | None = None,
     **settings: Any,
 ) -> StudyResults:
     """Run all cases of a plan in many worlds, as `pipistrelle study` does.
@@ -166,7 +167,7 @@ def study(
     retry_failed : bool
         Run worlds with failed trials again.
     progress : callable, optional
-        Called with the state of the study after each world.
+        Called with the state of the study (a `StudyProgress`) after each world.
     **settings
         Settings that override the plan's.
 
@@ -186,6 +187,9 @@ def study(
     >>> study(levels, iterations=1, scenario={"steps": 8, "landmarks": 5}).trials.height
     6
     """
+    from pipistrelle.experiments.studies.plan import FORMAT, find_plan, plan_of, read_plan
+    from pipistrelle.experiments.studies.study import run_study
+
     match shard:
         case (int(i), int(n)) if 0 <= i < n:
             share = i, n

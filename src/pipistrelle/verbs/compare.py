@@ -23,7 +23,7 @@ def report(
             help="Where index.html, summary.json and the figures go. [default: FOLDER/report]",
         ),
     ] = None,
-    quiet: Annotated[bool, Parameter(negative=(), help="Print the page's path alone.")] = False,
+    quiet: Annotated[bool, Parameter(negative=(), help="Print only the path of the page.")] = False,
 ) -> None:
     """Answer a study's question on one page, with its figures; judge the paper's claims by it."""
     from pipistrelle.evaluation.comparison import INTERVALS

@@ -142,7 +142,7 @@ def begun(pose: Gaussian, calibration: Calibration) -> History:
             np.zeros((0, 3, q)),
         )
     ).extended(1)
-    legs.arrays[0][0], legs.arrays[1][0] = pose.mean, _sure(pose.covariance)
+    legs.arrays[0][0], legs.arrays[1][0] = pose.mean, pose.covariance + SMALLEST_STD**2 * np.eye(3)
     steps = Stack((np.zeros((0, 3)), np.zeros((0, 3, 3)), np.zeros((0, 3, q))))
     rows = Stack((np.zeros((0, 4), np.int64), np.zeros((0, NUMBERS))))
     known = np.empty((0, 2)), np.empty((0, 3))
@@ -308,8 +308,3 @@ def slots_heard(history: History) -> Int[np.ndarray, " u"]:
     _, first, last = history.span
     ends = history.rows.arrays[0][first:last, :2].ravel()
     return ends[ends >= 0]
-
-
-def _sure(covariance: Float[np.ndarray, "3 3"]) -> Float[np.ndarray, "3 3"]:
-    """Regularise a covariance by `SMALLEST_STD`."""
-    return covariance + SMALLEST_STD**2 * np.eye(3)
