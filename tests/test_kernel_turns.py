@@ -7,7 +7,7 @@ import time
 
 import pytest
 
-from pipistrelle import kernel_folder as kernel_turns
+from pipistrelle import kernel_folder
 from pipistrelle.kernel_folder import Turn
 
 LINES = """
@@ -59,11 +59,11 @@ def test_another_kernel_has_a_separate_turn(tmp_path, holder):
     began, turn = time.monotonic(), Turn()
     turn.take(tmp_path / "other.nbi")
     turn.end()
-    assert time.monotonic() - began < kernel_turns._LONGEST_S / 2.0
+    assert time.monotonic() - began < kernel_folder._LONGEST_S / 2.0
 
 
 def test_a_turn_ends_with_the_process_that_has_it(tmp_path, holder, monkeypatch):
-    monkeypatch.setattr(kernel_turns.time, "sleep", lambda _: holder.kill())
+    monkeypatch.setattr(kernel_folder.time, "sleep", lambda _: holder.kill())
     turn = Turn()
     turn.take(tmp_path / "one.nbi")
     assert holder.wait() != 0, "nobody waited, or nobody had the turn"
@@ -72,8 +72,8 @@ def test_a_turn_ends_with_the_process_that_has_it(tmp_path, holder, monkeypatch)
 
 def test_waiting_for_a_stalled_process_is_limited(tmp_path, holder, monkeypatch):
     waited = []
-    monkeypatch.setattr(kernel_turns, "_LONGEST_S", 0.2)
-    monkeypatch.setattr(kernel_turns.time, "sleep", waited.append)
+    monkeypatch.setattr(kernel_folder, "_LONGEST_S", 0.2)
+    monkeypatch.setattr(kernel_folder.time, "sleep", waited.append)
     Turn().take(tmp_path / "one.nbi")
     assert holder.poll() is None
     assert waited
@@ -82,7 +82,7 @@ def test_waiting_for_a_stalled_process_is_limited(tmp_path, holder, monkeypatch)
 @pytest.mark.parametrize("lock", [None, "a folder"])
 def test_where_files_cannot_be_locked_each_compiles_for_itself(tmp_path, monkeypatch, lock):
     if lock is None:
-        monkeypatch.setattr(kernel_turns, "fcntl", None)
+        monkeypatch.setattr(kernel_folder, "fcntl", None)
     else:
         (tmp_path / "compiling.lock").mkdir()
     turn = Turn()

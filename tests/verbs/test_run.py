@@ -15,8 +15,7 @@ import pytest
 from scipy.special import j1
 
 import pipistrelle
-from pipistrelle import files as own_files
-from pipistrelle import kernel_clock
+from pipistrelle import files, kernel_clock
 from pipistrelle.acoustics.emitter import beamwidth
 from pipistrelle.config import Config
 from pipistrelle.estimation.catalogue import PAPERS
@@ -337,7 +336,7 @@ def test_a_log_is_saved_over_a_log_of_ours_and_over_nothing_of_the_users(
 
 @pytest.mark.parametrize("room", range(6))
 def test_a_log_for_which_there_is_no_room_leaves_nothing(refused, undrawn, monkeypatch, room):
-    write, left = own_files.write_down, [room]
+    write, left = files.write_down, [room]
 
     def full(path, data):
         left[0] -= path.resolve().parent.name == "log"
@@ -346,7 +345,7 @@ def test_a_log_for_which_there_is_no_room_leaves_nothing(refused, undrawn, monke
             raise OSError(28, "No space left on device", str(path))
         write(path, data)
 
-    monkeypatch.setattr(own_files, "write_down", full)
+    monkeypatch.setattr(files, "write_down", full)
     said = refused("run", *SHORT, "--save-log", "log", "-o", "one", "--quiet")
     assert "could not be written (No space left on device)" in said
     assert not Path("log").exists()

@@ -8,7 +8,7 @@ from cyclopts import Parameter
 
 from pipistrelle.evaluation.scores import heading, shown_in
 from pipistrelle.verbs.console import announced, text_table
-from pipistrelle.verbs.streams import put
+from pipistrelle.verbs.streams import put, say
 
 
 def report(
@@ -30,7 +30,6 @@ def report(
     from pipistrelle.report.page import MIN_WORLDS, write_report
     from pipistrelle.report.study import read_study
     from pipistrelle.report.tables import not_the_papers_line
-    from pipistrelle.verbs.streams import put, say
 
     target = folder / "report" if output is None else output
     study = read_study(folder)

@@ -21,7 +21,6 @@ from pipistrelle.experiments.runs import heard_world
 from pipistrelle.experiments.runs.heard_world import drive_of, scans_of
 from pipistrelle.experiments.runs.trial import run_mission, run_trial
 from pipistrelle.experiments.studies import world
-from pipistrelle.experiments.studies import world as world_files
 from pipistrelle.experiments.studies.plan import Plan, cases_of
 from pipistrelle.experiments.studies.study import load_study, open_store, run_study
 from pipistrelle.experiments.studies.world import (
@@ -601,9 +600,9 @@ def test_a_world_is_done_when_its_trials_are_there(folder, plan, records):
 
 def test_the_trials_are_written_last(folder, plan, records, monkeypatch):
     order = []
-    rename = world_files.put_in_place
+    rename = world.put_in_place
     monkeypatch.setattr(
-        world_files, "put_in_place", lambda a, b: (order.append(b.parent.name), rename(a, b))
+        world, "put_in_place", lambda a, b: (order.append(b.parent.name), rename(a, b))
     )
     write_world(folder, plan, 0, records)
     assert order == ["steps", "landmarks", "trials"]
@@ -625,7 +624,7 @@ def test_a_full_disk_raises_a_clear_error_and_keeps_existing_files(
             raise OSError(28, "No space left on device")
         write_down(path, data)
 
-    monkeypatch.setattr(world_files, "write_down", full)
+    monkeypatch.setattr(world, "write_down", full)
     for iteration in (0, 1):
         with pytest.raises(InputError, match=r"could not be written \(No space left on device\)"):
             write_world(folder, plan, iteration, failed_records(plan, "never written\n"))
@@ -646,7 +645,7 @@ def test_a_rename_that_fails_leaves_no_half_a_world_that_counts(
             raise OSError(5, "Input/output error", str(path))
         partial.replace(path)
 
-    monkeypatch.setattr(world_files, "put_in_place", failing)
+    monkeypatch.setattr(world, "put_in_place", failing)
     with pytest.raises(InputError, match="Input/output error"):
         write_world(folder, plan, 0, records)
     assert done_worlds(folder) == set()
@@ -702,7 +701,7 @@ def test_a_study_that_takes_the_folders_place_is_unchanged(
     another = replace(plan, config=resolve(from_flags({"seed": 99})))
     open_store(other, another)
     write_world(other, another, 2, records)
-    before, plain = contents(other), getattr(world_files, moment)
+    before, plain = contents(other), getattr(world, moment)
 
     def swapped(*words):
         if not folder.is_symlink():
@@ -711,7 +710,7 @@ def test_a_study_that_takes_the_folders_place_is_unchanged(
         return plain(*words)
 
     with monkeypatch.context() as patch:
-        patch.setattr(world_files, moment, swapped)
+        patch.setattr(world, moment, swapped)
         write_world(folder, plan, 2, records)
     assert done_worlds(tmp_path / "moved") >= {2}
     with pytest.raises(InputError, match="found the folder of another study"):
@@ -720,15 +719,15 @@ def test_a_study_that_takes_the_folders_place_is_unchanged(
 
 
 def test_an_overtaken_writer_succeeds(folder, plan, records, monkeypatch):
-    write = world_files.write_down
+    write = world.write_down
 
     def overtaken(path, data):
         write(path, data)
         if path.parent.name == "trials" and len(leftovers(folder)) == 3:
-            monkeypatch.setattr(world_files, "write_down", write)
+            monkeypatch.setattr(world, "write_down", write)
             write_world(folder, plan, 0, records)  # which sweeps ours away
 
-    monkeypatch.setattr(world_files, "write_down", overtaken)
+    monkeypatch.setattr(world, "write_down", overtaken)
     write_world(folder, plan, 0, records)
     assert done_worlds(folder) == {0}
     assert leftovers(folder) == []
@@ -779,9 +778,9 @@ def test_a_world_of_another_plan_is_noticed_and_more_worlds_are_no_other_plan(
 
 
 def test_trials_of_other_columns_are_named_though_their_sums_are_right(folder, plan, records):
-    tables = world_files.world_tables(plan, 0, records)
+    tables = world.world_tables(plan, 0, records)
     other = tables | {"trials": tables["trials"].drop("error")}
-    for name, file in world_files.with_sums(other, plan, 0).items():
+    for name, file in world.with_sums(other, plan, 0).items():
         world_file(folder, name, 0).write_bytes(file)
     with pytest.raises(InputError, match=r"iteration_00000\.parquet: has not the columns"):
         read_ended_trials(folder, plan, 0)
@@ -808,17 +807,17 @@ def test_a_writer_killed_while_it_replaces_a_world_leaves_it_undone(
     folder, plan, records, monkeypatch
 ):
     write_world(folder, plan, 0, records)
-    tables = world_files.world_tables(plan, 0, records)
+    tables = world.world_tables(plan, 0, records)
     other = tables["steps"].select(
         pl.lit(1).cast(kind).alias(c) for c, kind in tables["steps"].schema.items()
     )
-    monkeypatch.setattr(world_files, "world_tables", lambda *_: tables | {"steps": other})
+    monkeypatch.setattr(world, "world_tables", lambda *_: tables | {"steps": other})
 
     def killed(partial, path):
         partial.replace(path)
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(world_files, "put_in_place", killed)
+    monkeypatch.setattr(world, "put_in_place", killed)
     with pytest.raises(KeyboardInterrupt):
         write_world(folder, plan, 0, records)
     assert done_worlds(folder) == set(), "new steps beside old trials are no world"
