@@ -12,20 +12,8 @@ from pipistrelle.verbs.streams import heard_signals, hold_streams, say
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run a command line.
+    """Run a command line, by default of this process, and return its exit status.
 
-    Parameters
-    ----------
-    arguments : sequence of str, optional
-        Command line, by default that of this process.
-
-    Returns
-    -------
-    int
-        Exit status.
-
-    Examples
-    --------
     >>> main(["study", "nowhere.toml"])
     2
     """

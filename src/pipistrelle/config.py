@@ -14,7 +14,6 @@ from pydantic import (
     BaseModel,
     ConfigDict,
     Field,
-    JsonValue,
     PlainValidator,
     field_validator,
     model_validator,
@@ -54,6 +53,7 @@ Positive = Annotated[float, Field(gt=0, le=LARGEST), AfterValidator(_not_tiny)]
 NonNegative = Annotated[float, Field(ge=0, le=LARGEST)]
 DistanceStd = Annotated[float, Field(ge=LEAST_STD, le=FARTHEST)]
 AngleStd = Annotated[float, Field(ge=LEAST_STD, le=WIDEST)]
+SoundSpeed = Annotated[float, Field(ge=10, le=10_000)]
 Count = Annotated[int, Field(ge=1, lt=2**63)]
 Level = Annotated[float, Field(ge=-300, le=300)]
 Probability = Annotated[float, Field(gt=0, le=1)]
@@ -97,21 +97,10 @@ MAX_OTHERS = 7
 """Most callers besides the vehicle that a recording can distinguish."""
 
 
-Mark = dict[str, JsonValue]
-FOLDER: Mark = {"is": "folder"}
-BEAM: Mark = {"is": "beam"}
-TABLES: Mark = {"is": "tables"}
-ARRAY: Mark = {"is": "array"}
-CALL: Mark = {"is": "call"}
-"""Marks of settings with a special treatment, read by `settings`: a folder, the piston of the beam,
-a list of tables, the files of an array and of a call. Paths of marked settings are relative to the
-file of settings. ``derived`` names the property with the value of an omitted setting."""
-
-
 class ScenarioConfig(Section):
     """The true world: a noisy drive, round the paper's circle, among random landmarks."""
 
-    world: Annotated[str, Field(min_length=1)] | None = Field(None, json_schema_extra=FOLDER)
+    world: Annotated[str, Field(min_length=1)] | None = None
     """Folder of a world to use; whatever it omits is drawn by the other settings."""
     medium: Literal["air", "water"] = "air"
     """Medium of the sound; its properties are in the section `air` or `water`."""
@@ -153,9 +142,7 @@ class ScenarioConfig(Section):
 class AirConfig(Section):
     """The air, the default medium; the paper does not report its humidity."""
 
-    speed_of_sound: Annotated[float, Field(ge=10, le=10_000)] | None = Field(
-        None, json_schema_extra={"derived": "sound_speed"}
-    )
+    speed_of_sound: SoundSpeed | None = None
     """Speed of sound [m/s]; by default 343 sqrt(T / 293.15 K) at the temperature T."""
     temperature_c: Annotated[float, Field(gt=-50, lt=60)] = 20.0
     """Temperature of the air [degrees Celsius]."""
@@ -178,9 +165,7 @@ class AirConfig(Section):
 class WaterConfig(Section):
     """Sea or fresh water, the medium if `scenario.medium` is `water`."""
 
-    speed_of_sound: Annotated[float, Field(ge=10, le=10_000)] | None = Field(
-        None, json_schema_extra={"derived": "sound_speed"}
-    )
+    speed_of_sound: SoundSpeed | None = None
     """Speed of sound [m/s]; by default computed from temperature, salinity and depth."""
     temperature_c: Annotated[float, Field(ge=-2, le=35)] = 10.0
     """Temperature of the water [degrees Celsius]."""
@@ -229,7 +214,7 @@ Share = Annotated[float, Field(ge=0, le=1)]
 class CallConfig(Section):
     """A call: a tone, a sweep or a recorded sound."""
 
-    call: CallName = Field(TONE, json_schema_extra=CALL)
+    call: CallName = TONE
     """Waveform of the call: `tone`, `sweep`, or a WAV file no longer than the call."""
     sweep: Sweep = "linear"
     """Law of a sweep: `linear`, its frequency is linear in time, or `hyperbolic`, its period is."""
@@ -250,7 +235,7 @@ class CallConfig(Section):
 class EmitterConfig(CallConfig):
     """The vehicle's back-baffled piston and its call."""
 
-    radius: Positive = Field(0.0088, json_schema_extra=BEAM)
+    radius: Positive = 0.0088
     """Radius of the piston [m]; 8.8 mm give a half-power beamwidth of 33 degrees."""
     level_db: Level = 49.7
     """Source level of the vehicle's call on the axis at 1 m [dB]; unreported, fitted."""
@@ -275,6 +260,8 @@ class BeaconConfig(CallConfig):
 
 Point = tuple[Real, Real]
 RouteRow = Annotated[tuple[Real, ...], Field(min_length=3, max_length=4)]
+_CLOCK = ("period", "offset", "jitter", "times")
+"""Settings of a caller's clock."""
 _WAYS = {
     "route": ((), "a route"),
     "waypoints": (("speed",), "way-points"),
@@ -284,10 +271,6 @@ _WAYS = {
     "stand": (("place", "distance"), "a caller that stands"),
 }
 """Settings allowed for each kind of motion, and its name in messages."""
-
-
-_CLOCK = ("period", "offset", "jitter", "times")
-"""Settings of a caller's clock."""
 
 
 class CallerConfig(Section):
@@ -347,7 +330,7 @@ class CallerConfig(Section):
     @property
     def own_clock(self) -> bool:
         """Whether it calls at other times than the vehicle."""
-        return any(one is not None for one in (self.period, self.offset, self.jitter, self.times))
+        return any(getattr(self, name) is not None for name in _CLOCK)
 
     @property
     def way(self) -> str:
@@ -373,46 +356,30 @@ class CallerConfig(Section):
         if self.speed == 0.0:
             raise ValueError("found speed 0, expected another; give a place to one that stands")
         if isinstance(self.route, tuple):
-            _check_rows(self.route)
-        if self.times is not None:
-            _check_times(self)
+            if len({len(row) for row in self.route}) > 1:
+                expected = "one in all or in none"
+                raise ValueError(f"found headings in some rows of the route, expected {expected}")
+            for row, ((before, *_), (time, *_)) in enumerate(pairwise(self.route), start=2):
+                if time <= before:
+                    found = f"found time {time:g} after {before:g} in row {row} of the route"
+                    raise ValueError(f"{found}, expected times that rise")
+        for key in () if self.times is None else _CLOCK[:-1]:
+            if getattr(self, key) is not None:
+                raise ValueError(f"found times and {key}, expected one of them; leave one out")
+        for before, time in pairwise(self.times or ()):
+            if time <= before:
+                raise ValueError(f"found time {time:g} after {before:g}, expected times that rise")
         return self
-
-
-def _check_times(caller: CallerConfig) -> None:
-    """Raise if times of calls are given with a period, offset or jitter, or do not increase."""
-    for key in _CLOCK[:-1]:
-        if getattr(caller, key) is not None:
-            raise ValueError(f"found times and {key}, expected one of them; leave one out")
-    for before, time in pairwise(caller.times or ()):
-        if time <= before:
-            raise ValueError(f"found time {time:g} after {before:g}, expected times that rise")
-
-
-def _check_rows(route: tuple[tuple[float, ...], ...]) -> None:
-    """Raise if the times of a route do not increase, or only some of its rows have a heading."""
-    if len({len(row) for row in route}) > 1:
-        raise ValueError("found headings in some rows of the route, expected one in all or in none")
-    for row, ((before, *_), (time, *_)) in enumerate(pairwise(route), start=2):
-        if time <= before:
-            raise ValueError(
-                f"found time {time:g} after {before:g} in row {row} of the route, expected times "
-                "that rise"
-            )
 
 
 def caller_names(callers: tuple[CallerConfig, ...]) -> tuple[str, ...]:
     """Return the names of callers; without a name `beacon` or the number in the list.
 
-    Examples
-    --------
     >>> caller_names((CallerConfig(), CallerConfig(name="boat"), CallerConfig()))
     ('beacon', 'boat', 'caller3')
     """
-    return tuple(
-        caller.name or ("beacon" if j == 1 else f"caller{j}")
-        for j, caller in enumerate(callers, start=1)
-    )
+    numbered = enumerate(callers, start=1)
+    return tuple(caller.name or ("beacon" if j == 1 else f"caller{j}") for j, caller in numbered)
 
 
 SQUARE = "square"
@@ -448,7 +415,7 @@ Array = Annotated[
 class ReceiverConfig(Section):
     """The microphones, their sampling and their noise."""
 
-    array: Array = Field(SQUARE, json_schema_extra=ARRAY)
+    array: Array = SQUARE
     """Microphones: the paper's `square` of four line arrays, or a file: CSV `channel,x,y`,
     optionally `z,face,gain_db`, in the vehicle's frame [m], or Acoular's XML. Results hold its
     rows."""
@@ -568,7 +535,7 @@ class AssumedConfig(Section):
     """Assumed standard deviation of the noise of a bicycle's steering angle [rad]."""
     angular_rate_std: NonNegative | None = None
     """Assumed standard deviation of the noise of a unicycle's angular rate [rad/s]."""
-    speed_of_sound: Annotated[float, Field(ge=10, le=10_000)] | None = None
+    speed_of_sound: SoundSpeed | None = None
     """Assumed speed of sound, which converts delays to ranges and phases to bearings [m/s]."""
 
 
@@ -734,7 +701,7 @@ class BagConfig(Section):
     """Times of messages: `header`, from their headers, or `received`, the times of reception."""
     sensor_pose: tuple[Real, Real, Real] | None = None
     """Pose of every sensor on the vehicle: x, y [m], heading [rad]; by default the bag's."""
-    speed_of_sound: Annotated[float, Field(ge=10, le=10_000)] | None = None
+    speed_of_sound: SoundSpeed | None = None
     """Speed of sound for pings with travel times that do not contain it [m/s]."""
     step: Annotated[NonNegative, Field(le=LONGEST_STEP)] = 0.1
     """Length of the steps into which odometry is merged; 0: each message is a step [s]."""
@@ -774,9 +741,7 @@ class Config(Section):
     """Preset that the other settings override: `paper`, `physics` or `best`."""
     own: dict[str, dict[str, dict[str, Any]]] | None = None
     """Settings for only one estimator, e.g. `own.iekf`; they override the common ones."""
-    callers: Annotated[tuple[CallerConfig, ...], Field(max_length=MAX_OTHERS)] | None = Field(
-        None, json_schema_extra=TABLES
-    )
+    callers: Annotated[tuple[CallerConfig, ...], Field(max_length=MAX_OTHERS)] | None = None
     """Callers besides the vehicle, a table each; by default the paper's beacon."""
     scenario: ScenarioConfig = ScenarioConfig()
     air: AirConfig = AirConfig()

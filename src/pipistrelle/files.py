@@ -1,7 +1,6 @@
 """Safe files: read ordinary files only, write atomically, and replace only Pipistrelle's output.
 
-Pipes and devices may never end, so they are not read. A file is written beside its final place
-under a new random name, and renamed when it is complete.
+A file is written beside its final place under a new random name, and renamed when it is complete.
 
 ``SHA256SUMS``, in the format of ``sha256sum -c``, lists the files that we wrote into a folder. As
 many downloads have such a list, it is ours only if its first line states so and all its names are
@@ -35,13 +34,7 @@ _PARTIAL = re.compile(r"(.+)\.[0-9a-f]{8}\.partial")
 
 
 def check_ordinary(path: Path) -> None:
-    """Raise if a path exists but is not an ordinary file.
-
-    >>> check_ordinary(Path("/dev/null"))
-    Traceback (most recent call last):
-    pipistrelle.config.InputError: /dev/null: found a pipe or a device, expected a file; put what it
-    holds into a file
-    """
+    """Raise if a path exists but is not an ordinary file; a pipe or a device may never end."""
     if path.exists() and not path.is_file():
         if path.is_dir():
             raise refusal(path, "a folder", "a file", "name a file, or move the folder away")
@@ -86,11 +79,7 @@ def printable(path: Path) -> str:
 
 
 def text_of(name: str | Path) -> str:
-    r"""Return a path or a text of paths as valid UTF-8, with other bytes escaped.
-
-    >>> text_of("log" + chr(0xDCFF))
-    'log\\xff'
-    """
+    """Return a path or a text of paths as valid UTF-8, with other bytes escaped."""
     return str(name).encode(errors="surrogateescape").decode(errors="backslashreplace")
 
 
@@ -115,11 +104,7 @@ def upright(text: str) -> str:
 
 
 def without_links(path: Path) -> Path:
-    """Resolve the links of a path; a link to itself is returned unchanged.
-
-    >>> without_links(Path("/dev/../dev"))
-    PosixPath('/dev')
-    """
+    """Resolve the links of a path; a link to itself is returned unchanged."""
     return Path(os.path.realpath(path))  # Path.resolve raises RuntimeError for a link to itself
 
 
@@ -144,12 +129,6 @@ def partial_of(path: Path) -> Path:
     return path.with_name(f"{path.name}.{uuid4().hex[:8]}.partial")
 
 
-def sum_of(path: Path) -> str:
-    """Return the SHA-256 sum of a file, read in pieces."""
-    with path.open("rb") as file:
-        return file_digest(file, "sha256").hexdigest()
-
-
 class PiecesFile:
     """A new file that is written in pieces under a temporary name, with its SHA-256 sum.
 
@@ -158,7 +137,7 @@ class PiecesFile:
     ...     long = PiecesFile(Path(place) / "long.wav")
     ...     long.write(b"one")
     ...     long.close()
-    ...     whole_name(long.path.name), long.sum == sum_of(long.path)
+    ...     whole_name(long.path.name), long.sum == sha256(b"one").hexdigest()
     ('long.wav', True)
     """
 
@@ -211,24 +190,13 @@ def not_written(path: Path, error: OSError) -> InputError:
 
 
 def whole_name(partial: str) -> str | None:
-    """Return the final name of a partial file; None for any other name.
-
-    >>> whole_name("mission.png.0f3a9c2e.partial"), whole_name("debian.iso.partial")
-    ('mission.png', None)
-    """
+    """Return the final name of a partial file; None for any other name."""
     found = _PARTIAL.fullmatch(partial)
     return found[1] if found else None
 
 
 def write_down(path: Path, data: bytes) -> None:
-    """Write a new file and flush it to the disk, so that a rename cannot outlive its content.
-
-    >>> from tempfile import TemporaryDirectory
-    >>> with TemporaryDirectory() as place:
-    ...     write_down(Path(place) / "one.partial", b"word")
-    ...     (Path(place) / "one.partial").read_bytes()
-    b'word'
-    """
+    """Write a new file and flush it to the disk, so that a rename cannot outlive its content."""
     with path.open("xb") as file:  # exclusive: it follows no link
         file.write(data)
         file.flush()
@@ -239,12 +207,6 @@ def write_whole(path: Path, data: bytes, *, replace: bool = True) -> None:
     """Write a file completely or not at all, even if writing is interrupted.
 
     `replace`: whether an existing file, or a link itself but not its target, is replaced.
-
-    >>> import tempfile
-    >>> with tempfile.TemporaryDirectory() as parent:
-    ...     write_whole(Path(parent) / "one.txt", b"word")
-    ...     [path.name for path in Path(parent).iterdir()]
-    ['one.txt']
     """
     partial = partial_of(path)
     try:
@@ -258,28 +220,15 @@ def write_whole(path: Path, data: bytes, *, replace: bool = True) -> None:
 def put_in_place(partial: Path, path: Path, *, replace: bool = True) -> None:
     """Rename a complete file to its final name, unless another process has already done so.
 
-    `replace`: whether an existing file is replaced.
-
-    >>> from tempfile import TemporaryDirectory
-    >>> with TemporaryDirectory() as place:
-    ...     partial, whole = Path(place) / "one.partial", Path(place) / "one"
-    ...     write_down(partial, b"word")
-    ...     put_in_place(partial, whole)
-    ...     put_in_place(partial, whole)  # by another process, after this one
-    ...     partial.exists(), whole.exists()
-    (False, True)
+    `replace`: whether an existing file is replaced; if not, there is no race with its writer.
     """
-    if not replace:
-        return _put_where_nothing_is(partial, path)
-    try:
-        partial.replace(path)
-    except FileNotFoundError:
-        if not path.exists():
-            raise
-
-
-def _put_where_nothing_is(partial: Path, path: Path) -> None:
-    """Rename a file without replacing an existing one, without a race."""
+    if replace:
+        try:
+            partial.replace(path)
+        except FileNotFoundError:
+            if not path.exists():
+                raise
+        return
     try:
         os.link(partial, path, follow_symlinks=False)
     except FileExistsError:
@@ -288,8 +237,8 @@ def _put_where_nothing_is(partial: Path, path: Path) -> None:
         if os.path.lexists(path):
             raise FileExistsError(17, os.strerror(17), str(path)) from None
         partial.replace(path)
-        return
-    partial.unlink()
+    else:
+        partial.unlink()
 
 
 SUMS = "SHA256SUMS"
@@ -391,17 +340,17 @@ def claim(
     if empty:
         return own
     own.check_kind()
-    if own.there and not overwrite:
-        raise InputError(
-            f"{folder}: is not empty; name a new folder with {another}, or add {allow} to replace "
-            f"the {word} there"
-        )
     if not own.there:
         listed = os.path.lexists(folder / SUMS)
         named = f"its {SUMS} is not Pipistrelle's" if listed else f"no {SUMS} names any"
         raise InputError(
             f"{folder}: is not empty and holds no {word} of Pipistrelle's ({named}), so nothing in "
             f"it is replaced; name a new folder with {another}"
+        )
+    if not overwrite:
+        raise InputError(
+            f"{folder}: is not empty; name a new folder with {another}, or add {allow} to replace "
+            f"the {word} there"
         )
     own.check()
     return own
@@ -425,7 +374,7 @@ def remove_empty(folders: Iterable[Path]) -> None:
             folder.rmdir()
 
 
-def drawn_files(draw: Callable[[Path], None], under: str = "") -> dict[str, bytes]:
+def drawn_files(draw: Callable[[Path], object], under: str = "") -> dict[str, bytes]:
     """Run a drawing function in a temporary folder; return its files as {under + name: bytes}."""
     try:
         with TemporaryDirectory(prefix="pipistrelle-") as place:
@@ -458,12 +407,8 @@ class OwnFiles:
         self._place = folder
         """The path of the folder while it is written to (`held`)."""
         self._list = _list_in(folder)
-        self._there, self._sums = _sums_of(self._list)
-
-    @property
-    def there(self) -> str | None:
-        """The title of the kind in the folder; None if it has no files of ours."""
-        return self._there
+        self.there, self._sums = _sums_of(self._list)
+        """The title of the kind in the folder, None if it has no files of ours, and their sums."""
 
     def __contains__(self, name: str) -> bool:
         """Return whether a file is listed: we wrote it, or began to."""
@@ -488,9 +433,9 @@ class OwnFiles:
 
     def check_kind(self) -> None:
         """Raise if the folder contains results of another kind."""
-        if self._there not in (None, self.kind.title):
+        if self.there not in (None, self.kind.title):
             raise InputError(
-                f"{self.folder}: holds {self._there} of Pipistrelle, which {self.kind.title} does "
+                f"{self.folder}: holds {self.there} of Pipistrelle, which {self.kind.title} does "
                 "not replace; name another folder"
             )
 
@@ -505,7 +450,7 @@ class OwnFiles:
         """Raise if a file to be replaced was not written by us, or was changed since."""
         if "\n" in name:
             raise InputError(f"{name!r}: holds a line break; choose another name")
-        if self._there is None and os.path.lexists(self._place / SUMS):
+        if self.there is None and os.path.lexists(self._place / SUMS):
             raise _in_the_way(self.folder / SUMS, "is not Pipistrelle's")
         for parent in reversed(PurePosixPath(name).parents[:-1]):
             place = self._place / parent
@@ -521,8 +466,8 @@ class OwnFiles:
         path = self._place / name
         if name not in self._sums or path.is_symlink() or not path.is_file():
             return False
-        with contextlib.suppress(OSError):
-            return sum_of(path) in self._sums[name]
+        with contextlib.suppress(OSError), path.open("rb") as file:
+            return file_digest(file, "sha256").hexdigest() in self._sums[name]
         return False
 
     def replace(self, files: Mapping[str, str | bytes | PiecesFile]) -> None:
@@ -547,23 +492,19 @@ class OwnFiles:
             with held(self.folder) as self._place:
                 if keep:
                     self.check_kind()
-                else:
-                    self._check_list()
+                elif _list_in(self._place) == self._list:
                     self.check()
+                else:
+                    raise InputError(
+                        f"{self.folder}: somebody else wrote into it meanwhile, so nothing there "
+                        "is replaced; name another folder"
+                    )
                 self._write_held(files, keep=keep)
         except OSError as error:
             raise not_written(self.folder, error) from error
         finally:
             self._place = self.folder
             remove_empty(made)
-
-    def _check_list(self) -> None:
-        """Raise if the list of sums changed since this object was made."""
-        if _list_in(self._place) != self._list:
-            raise InputError(
-                f"{self.folder}: somebody else wrote into it meanwhile, so nothing there is "
-                "replaced; name another folder"
-            )
 
     def _write_held(self, files: Mapping[str, str | bytes | PiecesFile], *, keep: bool) -> None:
         """Write files under temporary names, list their sums, and rename them."""
@@ -572,7 +513,11 @@ class OwnFiles:
             if not self.kind.writes(name):
                 raise ValueError(f"{name}: is no file of {self.kind.title}")
             self.refuse(name)
-        before, new = self._sums, {n: {_sum_of(c)} for n, c in contents.items()}
+        before = self._sums
+        new = {
+            name: {sha256(c).hexdigest() if isinstance(c, bytes) else c.sum}
+            for name, c in contents.items()
+        }
         partials = {
             name: (self._place / name).with_name(c.path.name)
             if isinstance(c, PiecesFile)
@@ -591,7 +536,13 @@ class OwnFiles:
                     if isinstance(content, bytes):
                         write_down(partial, content)
             except BaseException:
-                self._list_again(before, partials.values(), made)
+                with contextlib.suppress(OSError):
+                    _remove(partials.values())
+                    if before:
+                        self._list_sums(before)
+                    elif self.there:
+                        (self._place / SUMS).unlink(missing_ok=True)
+                remove_empty(made)
                 raise
             self._put_in_place(partials, () if keep else before.keys() - new.keys())
             self._list_sums(before | new if keep else new)
@@ -601,44 +552,24 @@ class OwnFiles:
             with contextlib.suppress(OSError):
                 _remove(partials.values())
 
-    def _list_again(
-        self, sums: Mapping[str, set[str]], partials: Iterable[Path], made: Iterable[Path]
-    ) -> None:
-        """Restore the list of sums after a failure to write."""
-        with contextlib.suppress(OSError):
-            _remove(partials)
-            if sums:
-                self._list_sums(sums)
-            elif self._there:
-                (self._place / SUMS).unlink(missing_ok=True)
-        remove_empty(made)
-
     def _put_in_place(self, partials: Mapping[str, Path], old: Iterable[str]) -> None:
         """Rename the new files; remove old ones, and leftovers of killed processes."""
         *_, last = partials
         _remove(self._place / name for name in (*([last] if last in self._sums else ()), *old))
-        left = (self._place / name for name in _names_in(self._place) if self._is_left(name))
-        _remove([path for path in left if path not in partials.values()])
+        for name in [*_names_in(self._place)]:
+            path, ours = self._place / name, whole_name(name) in (*self._sums, SUMS)
+            if ours and path not in partials.values() and path.is_file() and not path.is_symlink():
+                path.unlink(missing_ok=True)
         for name, partial in partials.items():
             put_in_place(partial, self._place / name, replace=self._is_ours(name))
-
-    def _is_left(self, name: str) -> bool:
-        """Return whether a file is a leftover of a killed process for one of our names."""
-        path = self._place / name
-        return whole_name(name) in (*self._sums, SUMS) and path.is_file() and not path.is_symlink()
 
     def _list_sums(self, sums: Mapping[str, set[str]]) -> None:
         """Write the list of sums; its files are ours from then on, even after a crash."""
         lines = [f"{one}  {name}" for name, some in sums.items() for one in sorted(some)]
         text = "\n".join([_HEAD.format(self.kind.title), *lines, ""])
         data = text.encode(errors="surrogateescape")
-        write_whole(self._place / SUMS, data, replace=self._there is not None)
-        self._list, self._there, self._sums = data, self.kind.title, dict(sums)
-
-
-def _sum_of(content: bytes | PiecesFile) -> str:
-    """Return the SHA-256 sum of a file's content."""
-    return content.sum if isinstance(content, PiecesFile) else sha256(content).hexdigest()
+        write_whole(self._place / SUMS, data, replace=self.there is not None)
+        self._list, self.there, self._sums = data, self.kind.title, dict(sums)
 
 
 def _in_the_way(path: Path, what: str) -> InputError:

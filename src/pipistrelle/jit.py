@@ -13,9 +13,7 @@ Linking and checked files use private parts of Numba. If these are missing, kern
 cached by Numba's public functions, with the same results, and a message is printed.
 """
 
-import sys
 from collections.abc import Callable
-from contextlib import suppress
 from typing import Any, TypeVar
 
 import numba
@@ -23,7 +21,7 @@ import numpy as np
 from numba import config
 
 from pipistrelle import kernel_clock
-from pipistrelle.kernel_folder import place_kernels
+from pipistrelle.kernel_folder import place_kernels, say
 
 _fault: Exception | None = None
 """Why kernels are compiled by Numba's public functions; None if they are not."""
@@ -36,12 +34,10 @@ try:
 except Exception as error:
     _fault = error
 if not place_kernels(plain=_fault is not None) and _fault is not None:
-    with suppress(OSError, AttributeError):  # no standard error
-        print(
-            f"pipistrelle: Numba {numba.__version__} is not as those that were tested "
-            f"({type(_fault).__name__}): compiling kernels takes longer; install numba<0.69",
-            file=sys.stderr,
-        )
+    say(
+        f"Numba {numba.__version__} is not as those that were tested ({type(_fault).__name__}): "
+        "compiling kernels takes longer; install numba<0.69"
+    )
 
 Whole = int | np.integer
 """An integer in a kernel: Python's or NumPy's."""

@@ -18,7 +18,6 @@ import stat
 import sys
 import tempfile
 import time
-from collections.abc import Iterable
 from contextlib import suppress
 from hashlib import sha256
 from pathlib import Path
@@ -26,13 +25,26 @@ from zlib import crc32
 
 try:
     import fcntl
+    import grp
+    import pwd
 except ImportError:  # on Windows
-    fcntl = None
+    fcntl = grp = pwd = None
 
 _LONGEST_S = 60.0
 """Longest wait for a lock [s]: several times the compilation of the largest kernel."""
-_PAUSE_S = 0.02
-"""Time between two attempts [s]."""
+_KEY = "[0-9a-f]{16}"
+"""Pattern of the name of a state's folder (`sources_key`)."""
+_NO_CODE = re.compile(rb'^ *r?"{3}[^"]*(?:"{1,2}[^"]+)*"{3}\n|^ *#.*\n|^ *\n', re.MULTILINE)
+"""Docstrings, lines of comments and empty lines."""
+_said: set[str] = set()
+
+
+def say(line: str) -> None:
+    """Print a message once, if standard error is open."""
+    if line not in _said:
+        _said.add(line)
+        with suppress(OSError, AttributeError):
+            print(f"pipistrelle: {line}", file=sys.stderr)
 
 
 class Turn:
@@ -53,7 +65,7 @@ class Turn:
                 try:
                     fcntl.lockf(self._file, fcntl.LOCK_EX | fcntl.LOCK_NB, 1, byte)
                 except (BlockingIOError, PermissionError):  # another process has it
-                    time.sleep(_PAUSE_S)
+                    time.sleep(0.02)
                 else:
                     return
 
@@ -67,22 +79,6 @@ class Turn:
 TURN = Turn()
 
 
-try:
-    import grp
-    import pwd
-except ImportError:  # on Windows
-    grp = pwd = None
-
-_MAX_STATES = 3
-"""Number of source states with cached kernels."""
-_KEY = "[0-9a-f]{16}"
-"""Pattern of the name of a state's folder (`sources_key`)."""
-_NO_CODE = re.compile(rb'^ *r?"{3}[^"]*(?:"{1,2}[^"]+)*"{3}\n|^ *#.*\n|^ *\n', re.MULTILINE)
-"""Docstrings, lines of comments and empty lines."""
-_MIN_ROOM = 64_000_000
-"""Room for all kernels of a state, several times over [byte]."""
-
-
 def place_kernels(*, plain: bool = False) -> bool:
     """Set Numba's cache folder, ``NUMBA_CACHE_DIR``, below the user's if that is already set.
 
@@ -93,12 +89,10 @@ def place_kernels(*, plain: bool = False) -> bool:
     folder = wanted = _wanted(plain)
     if why := _unfit(wanted):
         folder = _temporary() / wanted.name
-        with suppress(OSError, AttributeError):  # no standard error
-            print(
-                f"pipistrelle: {wanted} {why}: compiled kernels are kept in {folder}; set "
-                "NUMBA_CACHE_DIR to a folder of your own that lasts",
-                file=sys.stderr,
-            )
+        say(
+            f"{wanted} {why}: compiled kernels are kept in {folder}; set NUMBA_CACHE_DIR to a "
+            "folder of your own that lasts"
+        )
     os.environ["NUMBA_CACHE_DIR"] = str(folder)
     _drop_old(folder)
     if "numba" in sys.modules:  # it has already read its configuration
@@ -120,20 +114,15 @@ def sources_key(plain: bool = False) -> str:
     return digest.hexdigest()[:16]
 
 
-def close_to_others(folder: Path) -> None:
-    """Remove other users' permissions on a new folder."""
-    if os.name == "posix" and folder.stat().st_mode & 0o077:
-        folder.chmod(0o700)
-
-
 def _unfit(folder: Path) -> str | None:
     """Create the cache folder; return the reason if it cannot be used."""
     try:
         for one in (*reversed(folder.parents), folder):
             if not one.exists():
                 one.mkdir(mode=0o700, exist_ok=True)
-        if _is_mine(folder.parent, writable=True):  # the package's folder, made above
-            close_to_others(folder.parent)
+        ours = folder.parent  # the package's folder, made above
+        if os.name == "posix" and _is_mine(ours, writable=True) and ours.stat().st_mode & 0o077:
+            ours.chmod(0o700)
         with tempfile.TemporaryFile(dir=folder):
             pass
         empty = not any(folder.iterdir())
@@ -142,16 +131,16 @@ def _unfit(folder: Path) -> str | None:
             return fault
     except OSError:
         return "cannot be written"
-    return "has too little room" if empty and free < _MIN_ROOM else None
+    # 64 MB hold all kernels of a state, several times over
+    return "has too little room" if empty and free < 64_000_000 else None
 
 
 def _open_to_others(folder: Path) -> str | None:
     """Return how another user could put kernels into a folder; None if impossible."""
     if os.name != "posix":
         return None
-    inside = (one for one in folder.iterdir() if one.is_dir())
-    own: Iterable[Path] = (folder.parent, folder, *inside)
-    if not all(map(_is_mine, own)):
+    inside = (path for path in folder.iterdir() if path.is_dir())
+    if not all(map(_is_mine, (folder.parent, folder, *inside))):
         return "can be written by others, or is a link"
     for parent in folder.parent.parents:
         state = parent.stat()
@@ -221,12 +210,12 @@ def _wanted(plain: bool) -> Path:
 
 
 def _drop_old(folder: Path) -> None:
-    """Mark a state's kernels as used, and remove the least recently used states."""
+    """Mark a state's kernels as used; remove all but the three most recently used states."""
     try:
         os.utime(folder)
         states = [other for other in folder.parent.iterdir() if re.fullmatch(_KEY, other.name)]
         states.sort(key=lambda state: state.stat().st_mtime)
     except OSError:  # another process is removing them
         return
-    for old in states[:-_MAX_STATES]:
+    for old in states[:-3]:
         shutil.rmtree(old, ignore_errors=True)

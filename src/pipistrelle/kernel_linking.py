@@ -10,7 +10,6 @@ removed, and its kernel compiled again.
 """
 
 import gc
-import sys
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from functools import cached_property
@@ -28,10 +27,7 @@ from numba.core.compiler import Compiler
 from numba.core.environment import lookup_environment
 from numba.core.registry import CPUDispatcher
 
-from pipistrelle.kernel_folder import TURN
-
-_said: set[str] = set()
-"""Messages that were already printed."""
+from pipistrelle.kernel_folder import TURN, say
 
 
 class CheckedFiles(IndexDataCacheFile):
@@ -50,7 +46,7 @@ class CheckedFiles(IndexDataCacheFile):
         try:
             super().save(key, data)
         except OSError as error:
-            _say(
+            say(
                 f"{Path(self._cache_path).parent}: compiled kernels could not be kept "
                 f"({error.strerror}), so they are compiled at every start; make room or set "
                 "NUMBA_CACHE_DIR"
@@ -78,7 +74,7 @@ class CheckedFiles(IndexDataCacheFile):
             return True
         except OSError:
             return False
-        _say(f"{path.parent.parent}: compiled kernels were damaged, and are compiled anew")
+        say(f"{path.parent.parent}: compiled kernels were damaged, and are compiled anew")
         with suppress(OSError):
             path.unlink()
         return False
@@ -111,14 +107,6 @@ def checked(dispatcher: Any) -> Any:
         cache._impl.locator._cache_path = cache._cache_path = str(folder)
         cache._cache_file = CheckedFiles(str(folder), function.__qualname__, "")
     return dispatcher
-
-
-def _say(line: str) -> None:
-    """Print a message once."""
-    if line not in _said:
-        _said.add(line)
-        with suppress(OSError, AttributeError):  # no standard error
-            print(f"pipistrelle: {line}", file=sys.stderr)
 
 
 TESTED = (0, 68)

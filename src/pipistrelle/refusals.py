@@ -12,7 +12,6 @@ from pydantic.fields import FieldInfo
 
 from pipistrelle.config import InputError
 
-_MAX_LENGTH = 80
 _PREFIXES = ("Value error, ", "Input should be ", "Value should ")
 _IN_WORDS = {"bool_parsing": "true or false", "bool_type": "true or false", "tuple_type": "a list"}
 """Replacements of pydantic messages in terms of Python."""
@@ -36,16 +35,13 @@ def shown(value: Any) -> str:
     ("'left'", '1, 1, 1...')
     """
     text = repr(value)
-    return text if len(text) <= _MAX_LENGTH else f"{text[: _MAX_LENGTH - 3]}..."
+    return text if len(text) <= 80 else f"{text[:77]}..."
 
 
 def expectation(fault: Any) -> str:
     """Describe the expected value of a setting.
 
     `fault` is one of the errors of pydantic's ValidationError.
-
-    >>> expectation({"msg": "Input should be greater than 0"})
-    'greater than 0'
     """
     message = _IN_WORDS.get(fault.get("type"), fault["msg"])
     for prefix in _PREFIXES:
@@ -57,11 +53,6 @@ def values_expected(fault: Any, field: FieldInfo) -> int | None:
     """Return the expected number of values of a tuple, if a wrong number is the error.
 
     `field`: the rejected setting.
-
-    >>> from pipistrelle.config import FilterConfig
-    >>> field = FilterConfig.model_fields["initial_pose_std"]
-    >>> values_expected({"type": "missing", "loc": ("filter", "initial_pose_std", 2)}, field)
-    3
     """
     few = fault["type"] == "missing" and isinstance(fault["loc"][-1], int)
     return len(get_args(field.annotation)) if few or fault["type"] == "too_long" else None

@@ -22,19 +22,13 @@ from pydantic import BaseModel, ValidationError
 from pydantic.fields import FieldInfo
 
 from pipistrelle.config import (
-    ARRAY,
-    BEAM,
-    CALL,
-    FOLDER,
     MAX_OTHERS,
     SQUARE,
     SWEEP,
-    TABLES,
     TONE,
     CallerConfig,
     Config,
     InputError,
-    Mark,
     Section,
 )
 from pipistrelle.files import read_text
@@ -62,11 +56,7 @@ Layer = dict[Key, Given]
 
 @cache
 def known_settings() -> dict[Key, FieldInfo]:
-    """Return every setting by its key, in the order of `Config`.
-
-    >>> known_settings()["air", "relative_humidity"].default
-    0.5
-    """
+    """Return every setting by its key, in the order of `Config`."""
     found = {}
     for name, field in Config.model_fields.items():
         if isinstance(field.default, Section):
@@ -76,16 +66,13 @@ def known_settings() -> dict[Key, FieldInfo]:
     return found
 
 
-def _marked(mark: Mark) -> Key:
-    """Return the key of the setting that has a mark."""
-    (key,) = (key for key, field in known_settings().items() if field.json_schema_extra == mark)
-    return key
-
-
-WORLD_KEY, RADIUS_KEY, CALLERS, ARRAY_KEY = map(_marked, (FOLDER, BEAM, TABLES, ARRAY))
-"""Settings with a special treatment: the world's folder, the piston, the callers, the array."""
-CALL_KEYS = tuple(key for key, it in known_settings().items() if it.json_schema_extra == CALL)
-"""Settings that can name the file of a call."""
+CALLERS: Key = ("callers",)
+WORLD_KEY: Key = ("scenario", "world")
+RADIUS_KEY: Key = ("emitter", "radius")
+ARRAY_KEY: Key = ("receiver", "array")
+CALL_KEYS: tuple[Key, ...] = (("emitter", "call"), ("beacon", "call"))
+"""Settings with a special treatment: tables of callers, the piston of the beam, and the files of a
+world, an array and calls, which are relative to the file of settings."""
 SETTINGS: Key = ("settings",)
 OWN: Key = ("own",)
 """Keys of the preset (`experiments.named_settings`) and of settings for one estimator:
@@ -93,29 +80,14 @@ OWN: Key = ("own",)
 
 
 def derived(config: Config) -> dict[Key, Any]:
-    """Return the values of all settings that are derived if omitted.
-
-    >>> derived(Config())
-    {('air', 'speed_of_sound'): 343.0, ('water', 'speed_of_sound'): 1489.77}
-    """
-    sources = {
-        key: field.json_schema_extra["derived"]
-        for key, field in known_settings().items()
-        if isinstance(field.json_schema_extra, dict) and "derived" in field.json_schema_extra
+    """Return the values of all settings that are derived if omitted."""
+    return {
+        (name, "speed_of_sound"): getattr(config, name).sound_speed for name in ("air", "water")
     }
-    return {key: getattr(getattr(config, key[0]), str(name)) for key, name in sources.items()}
 
 
 def from_file(path: Path) -> Layer:
-    """Read the settings of a TOML file.
-
-    >>> import tempfile
-    >>> with tempfile.TemporaryDirectory() as folder:
-    ...     file = Path(folder) / "sharp.toml"
-    ...     _ = file.write_text("rays.power = 3.0")
-    ...     from_file(file)["rays", "power"].value
-    3.0
-    """
+    """Read the settings of a TOML file."""
     return with_places(path, from_table(read_toml(path), f"{path}: "))
 
 
@@ -132,51 +104,33 @@ def with_places(path: Path, layer: Layer) -> Layer:
 
 
 def beside(path: Path, callers: Any) -> Any:
-    """Resolve the routes and calls of callers relative to a file.
-
-    `path`: of the file; `callers`: its value of `callers`, valid or not.
-
-    >>> beside(Path("there/plan.toml"), [{"route": "boat.csv"}, {"place": [1, 2]}])
-    [{'route': 'there/boat.csv'}, {'place': [1, 2]}]
-    """
+    """Resolve the routes and calls of callers, valid or not, relative to a file."""
     if not isinstance(callers, list):
         return callers
-    return [
-        caller
-        | {
+
+    def placed(caller: Any) -> Any:
+        if not isinstance(caller, dict):
+            return caller
+        return caller | {
             name: (path.parent / caller[name]).as_posix()
             for name in ("route", "call")
             if isinstance(caller.get(name), str) and caller[name] not in (TONE, SWEEP)
         }
-        if isinstance(caller, dict)
-        else caller
-        for caller in callers
-    ]
+
+    return [*map(placed, callers)]
 
 
 def from_table(values: Mapping[str, Any], where: str, above: str = "") -> Layer:
-    """Return the layer of a table of settings.
+    """Return the layer of a table of settings and sections of settings.
 
-    `values`: settings, and sections of settings; `where`: name of the file in messages;
-    `above`: prefix of a setting's name in the file.
-
-    >>> from_table({"seed": 3}, "world.toml: ", "config.")
-    {('seed',): Given(value=3, where='world.toml: config.seed')}
+    `where`: name of the file in messages; `above`: prefix of a setting's name in the file.
     """
     given = leaves(values, known_settings())
     return _layer(given, lambda key: above + ".".join(key), where)
 
 
 def from_environment(environment: Mapping[str, str]) -> Layer:
-    """Return the layer of the variables of the environment.
-
-    `environment`: the value of ``PIPISTRELLE_SECTION__FIELD`` is spelled as in a file, but text
-    needs no quotes.
-
-    >>> layer = from_environment({"PIPISTRELLE_RAYS__RANGE_BOUNDS": "[1, 15]", "HOME": "/root"})
-    >>> layer["rays", "range_bounds"].value
-    [1, 15]
-    """
+    """Return the layer of the variables of the environment; text there needs no quotes."""
     given = (
         (tuple(name.removeprefix(PREFIX).lower().split("__")), from_text(environment[name]))
         for name in sorted(environment)
@@ -186,21 +140,14 @@ def from_environment(environment: Mapping[str, str]) -> Layer:
 
 
 def from_flags(values: Mapping[str, Any]) -> Layer:
-    """Return the layer of flags.
-
-    `values`: settings, and sections of settings.
-
-    >>> from_flags({"air": {"relative_humidity": 0.3}})
-    {('air', 'relative_humidity'): Given(value=0.3, where='--air.relative-humidity')}
-    """
+    """Return the layer of flags: settings, and sections of settings."""
     given = leaves(values, known_settings())
     return _layer(given, lambda key: "--" + ".".join(key).replace("_", "-"))
 
 
 def from_keywords(values: Mapping[str, Any], others: Iterable[str] = ()) -> Layer:
-    """Return the layer of the keywords of a call.
+    """Return the layer of the keywords of a call: settings, and sections of settings.
 
-    `values`: settings, and sections of settings; two underscores separate a section and a setting;
     `others`: further keywords of the call, for suggestions.
 
     >>> from_keywords({"rays__power": 8.0, "air": {"temperature_c": 5.0}})["rays", "power"]
@@ -214,9 +161,7 @@ def from_keywords(values: Mapping[str, Any], others: Iterable[str] = ()) -> Laye
 
 
 def spread(table: Mapping[str, Any], parts: str) -> dict[str, Any]:
-    """Convert dotted names to nested tables.
-
-    `parts`: the separator of the parts of a name.
+    """Convert names of several parts to nested tables, given the separator of the parts.
 
     >>> spread({"seed": 3, "rays.power": 8.0, "rays": {"prune": 0.1}}, ".")
     {'seed': 3, 'rays': {'power': 8.0, 'prune': 0.1}}
@@ -268,13 +213,9 @@ def _plain(value: Any) -> Any:
 
 
 def to_toml(config: BaseModel) -> str:
-    """Return settings as the text of a TOML file, each with its meaning and unit.
+    """Return all settings, or some sections, as the text of a TOML file, each with its meaning.
 
-    `config`: all settings, or some sections. The text reads back as the same settings; settings
-    without a value are comments.
-
-    >>> tomllib.loads(to_toml(Config(seed=3)))["seed"]
-    3
+    The text reads back as the same settings; settings without a value are comments.
     """
     lines: list[str] = []
     for key in known_settings():
@@ -292,19 +233,15 @@ def to_toml(config: BaseModel) -> str:
         assignment = f"# {leaf} =" if value is None else f"{leaf} = {json.dumps(value)}"
         lines.append(_remarked(assignment, known_settings()[key]))
     for caller in getattr(config, "callers", None) or ():
-        table = caller.model_dump(mode="json", exclude_none=True)
-        fields = type(caller).model_fields
         lines += ["", f"# {type(caller).__doc__}", "[[callers]]"]
+        fields = type(caller).model_fields
         lines += [
-            _remarked(f"{leaf} = {json.dumps(table[leaf], ensure_ascii=False)}", fields[leaf])
-            for leaf in table
+            _remarked(f"{leaf} = {json.dumps(value, ensure_ascii=False)}", fields[leaf])
+            for leaf, value in caller.model_dump(mode="json", exclude_none=True).items()
         ]
     for name, sections in (getattr(config, "own", None) or {}).items():
-        lines += [
-            "",
-            f"# Settings for {name} only.",
-            f"[own.{name if name.isidentifier() else json.dumps(name)}]",
-        ]
+        table = name if name.isidentifier() else json.dumps(name)
+        lines += ["", f"# Settings for {name} only.", f"[own.{table}]"]
         lines += [
             _remarked(f"{'.'.join(key)} = {json.dumps(value)}", known_settings()[key])
             for key, value in leaves(sections)
@@ -324,22 +261,9 @@ def read_toml(path: Path) -> dict[str, Any]:
 
 
 def parse_toml(text: str, where: object) -> dict[str, Any]:
-    """Read TOML; raise above 64 bits in an integer or `_MAX_DEPTH` levels.
-
-    `where`: place of the text, for messages.
-
-    >>> parse_toml("rays.power = 3", "here")
-    {'rays': {'power': 3}}
-    >>> parse_toml("seed = 0xffffffffffffffffff", "here")
-    Traceback (most recent call last):
-    pipistrelle.config.InputError: here: seed: found an integer of 72 bits, expected at most 64;
-    correct it
-    """
-    deep = (
-        f"more than {_MAX_DEPTH} levels",
-        "tables of settings, or lists of them",
-        "mend the file",
-    )
+    """Read TOML; raise above 64 bits in an integer or `_MAX_DEPTH` levels."""
+    found, expected = f"more than {_MAX_DEPTH} levels", "tables of settings, or lists of them"
+    deep = found, expected, "mend the file"
     try:
         table = tomllib.loads(text)
     except tomllib.TOMLDecodeError as error:
@@ -358,21 +282,15 @@ def parse_toml(text: str, where: object) -> dict[str, Any]:
         elif isinstance(value, list):
             waiting += [((*key, str(i)), inner) for i, inner in enumerate(value)]
         elif isinstance(value, int) and not -(2**63) <= value < 2**64:
-            found = f"an integer of {value.bit_length()} bits"
-            raise refusal(f"{where}: {'.'.join(key)}", found, "at most 64", "correct it")
+            bits = f"an integer of {value.bit_length()} bits"
+            raise refusal(f"{where}: {'.'.join(key)}", bits, "at most 64", "correct it")
     return table
 
 
 def leaves(
     values: Mapping[str, Any], whole: Container[Key] = (), above: Key = ()
 ) -> Iterator[tuple[Key, Any]]:
-    """Yield key and value of each leaf of nested tables; an empty table is a leaf.
-
-    `whole`: keys of tables that are leaves; `above`: the key of the table.
-
-    >>> list(leaves({"seed": 3, "air": {"pressure_kpa": 90.0}, "rays": {}}))
-    [(('seed',), 3), (('air', 'pressure_kpa'), 90.0), (('rays',), {})]
-    """
+    """Yield key and value of each leaf of nested tables; empty and `whole` tables are leaves."""
     for name, value in values.items():
         key = (*above, name)
         if isinstance(value, Mapping) and value and key not in whole:
@@ -427,11 +345,7 @@ def _own_layer(tables: Any, where: str) -> Layer:
 
 
 def from_text(text: str) -> Any:
-    """Read a TOML value or a number in Python's spelling; return other text unchanged.
-
-    >>> from_text("[{ frequency = 25e3 }]"), from_text("left")
-    ([{'frequency': 25000.0}], 'left')
-    """
+    """Read a TOML value or a number in Python's spelling; return other text unchanged."""
     with suppress(InputError):
         read = parse_toml(f"value = {text}", "")
         if read.keys() == {"value"}:
@@ -445,9 +359,12 @@ def from_text(text: str) -> Any:
 def _problem(error: Any, layer: Layer) -> str:
     """Return the message for a rejected value: its place, the value and the expected value."""
     if error["type"] == "json_invalid":
-        value, where = next(given for given in layer.values() if not _is_text(given.value))
-        fix = "rename the file or folder, or name a link to it"
-        return f"{where}: found {shown(value)}, expected UTF-8 text; {fix}"
+        for value, where in layer.values():
+            try:
+                json.dumps(value, default=_plain, ensure_ascii=False).encode()
+            except UnicodeEncodeError:
+                fix = "rename the file or folder, or name a link to it"
+                return f"{where}: found {shown(value)}, expected UTF-8 text; {fix}"
     if error["loc"][:1] == CALLERS and CALLERS in layer:
         return _caller_problem(error, layer[CALLERS])
     key = tuple(part for part in error["loc"] if isinstance(part, str))
@@ -464,13 +381,14 @@ def _problem(error: Any, layer: Layer) -> str:
     return f"{where}: found {shown(value)}, expected {expected}"
 
 
-def _is_text(value: Any) -> bool:
-    """Return whether all text in a value can be encoded as UTF-8."""
-    try:
-        json.dumps(value, default=_plain, ensure_ascii=False).encode()
-    except UnicodeEncodeError:
-        return False
-    return True
+_OF_CALLERS = {
+    "route": "a CSV file of time,x,y, or two such rows",
+    "name": "up to 40 letters, digits, _ and -",
+    "waypoints": "a list of points [x, y], two at least",
+    "place": "x and y",
+    "centre": "x and y",
+}
+"""Expected values of keys of a caller."""
 
 
 def _caller_problem(error: Any, given: Given) -> str:
@@ -495,13 +413,7 @@ def _caller_problem(error: Any, given: Given) -> str:
         near = meant(name, CallerConfig.model_fields)
         fix = f"did you mean {near}?" if near else f"it has {', '.join(CallerConfig.model_fields)}"
         return f"{where}.{name}: no such key of a caller; {fix}"
-    if name == "route":
-        expected = "a CSV file of time,x,y, or two such rows"
-    elif name == "name" and error["type"].startswith("string"):
-        expected = "up to 40 letters, digits, _ and -"
-    elif name == "waypoints":
-        expected = "a list of points [x, y], two at least"
-    elif name in ("place", "centre"):
-        expected = "x and y"
+    if name != "name" or error["type"].startswith("string"):
+        expected = _OF_CALLERS.get(name, expected)
     found = caller.get(name) if isinstance(caller, dict) else getattr(caller, name)
     return f"{where}.{name}: found {shown(found)}, expected {expected}"

@@ -23,16 +23,20 @@ def find_version() -> str:
     >>> find_version().startswith("0.")
     True
     """
-    return version_of_clone(Path(__file__).resolve().parents[2]) or _installed()
+    if of_clone := version_of_clone(Path(__file__).resolve().parents[2]):
+        return of_clone
+    from importlib.metadata import PackageNotFoundError, version
+
+    try:
+        return version("pipistrelle")
+    except PackageNotFoundError:
+        return UNKNOWN
 
 
 def version_of_clone(folder: Path) -> str | None:
     """Return the version of a clone by git, or None.
 
     None if the folder is not a clone of this project, or git or hatch-vcs is missing.
-
-    >>> version_of_clone(Path("somewhere else")) is None
-    True
     """
     try:
         settings = tomllib.loads((folder / "pyproject.toml").read_text(encoding="utf-8"))
@@ -44,13 +48,3 @@ def version_of_clone(folder: Path) -> str | None:
             return get_version(root=folder)
     except (ImportError, OSError, ValueError, LookupError):
         return None
-
-
-def _installed() -> str:
-    """Return the version in the installed metadata."""
-    from importlib.metadata import PackageNotFoundError, version
-
-    try:
-        return version("pipistrelle")
-    except PackageNotFoundError:
-        return UNKNOWN
