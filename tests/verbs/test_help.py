@@ -14,7 +14,7 @@ from pipistrelle.config import BagConfig, Config
 from pipistrelle.settings import known_settings
 
 HEAVY = {"numpy", "pydantic", "numba", "matplotlib"}
-VERBS = ["run", "slam", "study", "view", "report", "compare", "array"]
+VERBS = ["run", "slam", "hear", "study", "view", "report", "compare", "array"]
 
 
 @pytest.mark.parametrize("words", [["--help"], ["--version"], *([v, "--help"] for v in VERBS)])
@@ -48,7 +48,7 @@ def test_help_all_lists_every_setting_with_its_default(obey, verb):
     assert printed.count("[default:") >= len(settled)
 
 
-@pytest.mark.parametrize("verb", ["run", "slam", "hear", "study", "view", "array"])
+@pytest.mark.parametrize("verb", VERBS)
 def test_help_lists_at_most_twenty_two_options_without_empty_defaults(obey, verb):
     status, printed, _ = obey(verb, "--help")
     assert status == 0

@@ -158,10 +158,10 @@ def test_on_a_terminal_bars_move(obey, monkeypatch):
 def test_lines_of_progress_are_limited_except_first_and_last(capsys, monkeypatch):
     now = [0.0]
     monkeypatch.setattr(verb, "perf_counter", lambda: now[0])
-    show = verb._lines()
-    for done in range(101):
-        show(so_far(done, 100))
-        now[0] += 1.0
+    with verb._progress(quiet=False) as show:
+        for done in range(101):
+            show(so_far(done, 100))
+            now[0] += 1.0
     told = re.findall(r"^(\d+)/100", capsys.readouterr().err, re.M)
     assert [int(word) for word in told] == [*range(0, 100, 10), 100]
 

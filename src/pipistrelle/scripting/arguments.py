@@ -24,6 +24,7 @@ from pipistrelle.estimation.catalogue import (
     entry,
 )
 from pipistrelle.experiments.named_settings import check_own, laid, over_named, settings_of
+from pipistrelle.files import Kind, OwnFiles, claim
 from pipistrelle.refusals import meant, refusal, shown
 from pipistrelle.settings import (
     ARRAY_KEY,
@@ -100,11 +101,7 @@ BagSlamConfig = create_model("BagSlamConfig", __base__=SlamConfig, bag=(BagConfi
 
 
 def base_layer(base: Base) -> Layer:
-    """Convert the settings to start from to a layer.
-
-    >>> base_layer({"rays.power": 3.0})["rays", "power"]
-    Given(value=3.0, where='config: rays.power')
-    """
+    """Convert the settings to start from to a layer."""
     if base is None:
         return {}
     if isinstance(base, Config):
@@ -125,12 +122,7 @@ def folder_named(place: object, name: str) -> Path:
 
 
 def short_names(short: Layer, flags: Layer) -> Layer:
-    """Select the short options with a value; raise if `flags` give the same setting.
-
-    >>> short_names({("seed",): Given(3, "-s")}, {("seed",): Given(4, "--seed")})
-    Traceback (most recent call last):
-    pipistrelle.config.InputError: -s and --seed are one setting; give one of them
-    """
+    """Select the short options with a value; raise if `flags` give the same setting."""
     short = {key: given for key, given in short.items() if given.value is not None}
     for key in short.keys() & flags.keys():
         both = f"{short[key].where} and {flags[key].where}"
@@ -202,6 +194,13 @@ class Door:
         """Return how to name another folder, and how to allow that its files are replaced."""
         return self.option(name, "DIR"), self.option("overwrite", "True")
 
+    def claimed(self, name: str, kind: Kind) -> OwnFiles | None:
+        """Claim the folder that an argument names, if it is given."""
+        if (folder := self.folder(name)) is None:
+            return None
+        overwrite = self.asked["overwrite"]
+        return claim(folder, kind, overwrite=overwrite, flags=self.ways_out(name))
+
     def estimators(self, usual: str | Sequence[str]) -> tuple[str, ...]:
         """Return the chosen estimators, else the usual; raise for `particles` without FastSLAM."""
         chosen, particles = self.asked["filters"], self.asked.get("particles")
@@ -252,49 +251,49 @@ def mission_settings(door: Door) -> tuple[Config, "World | None", tuple[str, ...
     layer, estimators = over_named(layer, default=door.default)
     base, more = resolve(layer), {}
     if duration.value is not None:
-        more[STEPS] = Given(_steps(duration, base), f"{duration.where} {duration.value:g}")
+        step, frame = base.scenario.step, base.scenario.step * base.scenario.steps_per_frame
+        if not frame <= number(duration) or not isfinite(duration.value / step):
+            found = f"found {duration.value:g}, expected at least one frame ({frame:g} s)"
+            raise InputError(f"{duration.where}: {found}, in finite time")
+        steps = round(duration.value / step)
+        more[STEPS] = Given(steps, f"{duration.where} {duration.value:g}")
     if beamwidth.value is not None:
-        more[RADIUS_KEY] = Given(_radius(number(beamwidth), base), beamwidth.where)
+        from pipistrelle.acoustics.emitter import piston_radius
+
+        width, c = radians(number(beamwidth)), base.medium.sound_speed
+        radius = piston_radius(width, frequency=base.emitter.centre, speed_of_sound=c)
+        more[RADIUS_KEY] = Given(float(radius), beamwidth.where)
     return resolve(layer | short_names(more, flags)), world, estimators
 
 
 def number(given: Given) -> float:
-    """Convert a value to float; raise if it is not a number, even for text such as "60".
-
-    >>> number(Given("60", "duration"))
-    Traceback (most recent call last):
-    pipistrelle.config.InputError: duration: found '60', expected a number
-    """
+    """Convert a value to float; raise if it is not a number, even for text such as "60"."""
     if not isinstance(given.value, Real):
         raise InputError(f"{given.where}: found {shown(given.value)}, expected a number")
     return float(given.value)
 
 
-def frames_named(text: str | None, count: int, where: str) -> range:
+def frames_named(given: Given, count: int) -> range:
     """Parse a slice A:B of `count` frames; None is all of them.
 
-    >>> frames_named("2:4", 10, "--frames"), frames_named(":3", 10, "--frames")
-    (range(2, 4), range(0, 3))
+    >>> frames_named(Given("2:4", "--frames"), 10), frames_named(Given(None, "--frames"), 10)
+    (range(2, 4), range(0, 10))
     """
-    if text is None:
+    if given.value is None:
         return range(count)
-    parts = text.split(":")
+    parts = given.value.split(":")
     if len(parts) == 2 and all(p.isascii() and (p.isdigit() or not p) for p in parts):
         begin, end = (int(p[:18]) if p else None for p in parts)
         if frames := range(count)[begin:end]:
             return frames
     raise InputError(
-        f"{where}: found {shown(text)}, expected A:B, from A to before B of {count} frames that "
-        "are counted from 0"
+        f"{given.where}: found {shown(given.value)}, expected A:B, from A to before B of {count} "
+        "frames that are counted from 0"
     )
 
 
 def named_strategies(chosen: str | Sequence[str]) -> tuple[Strategy, ...]:
-    """Return the strategies of a choice, in the order of `STRATEGIES`.
-
-    >>> named_strategies("all"), named_strategies(["fused"])
-    (('active', 'fused', 'passive'), ('fused',))
-    """
+    """Return the strategies of a choice, in the order of `STRATEGIES`."""
     if isinstance(chosen, str):
         chosen = STRATEGIES if chosen == "all" else (chosen,)
     chosen = tuple(chosen) if isinstance(chosen, Iterable) else (chosen,)
@@ -356,31 +355,6 @@ def _name_of(kind: str | type, where: str) -> str:
     return f"{module}:{name}"
 
 
-def _steps(duration: Given, config: Config) -> int:
-    """Convert a duration to control steps; raise if it is shorter than a frame."""
-    scenario = config.scenario
-    frame = scenario.step * scenario.steps_per_frame
-    if not frame <= number(duration) or not isfinite(duration.value / scenario.step):
-        raise InputError(
-            f"{duration.where}: found {duration.value:g}, expected at least one frame "
-            f"({frame:g} s), in finite time"
-        )
-    return round(duration.value / scenario.step)
-
-
-def _radius(beamwidth: float, config: Config) -> float:
-    """Return the radius of the piston with a beamwidth [deg]."""
-    from pipistrelle.acoustics.emitter import piston_radius
-
-    return float(
-        piston_radius(
-            radians(beamwidth),
-            frequency=config.emitter.centre,
-            speed_of_sound=config.medium.sound_speed,
-        )
-    )
-
-
 def replayed(config: Config) -> Section:
     """Select the settings that affect the solution of a log."""
     kind = SlamConfig if config.bag == BagConfig() else BagSlamConfig
@@ -388,21 +362,12 @@ def replayed(config: Config) -> Section:
 
 
 def is_open(key: Key) -> bool:
-    """Return whether a setting may be given for a log: used, and not decided by it.
-
-    >>> is_open(("rays", "power")), is_open(("filter", "range_std")), is_open(("air", "spreading"))
-    (True, False, False)
-    """
+    """Return whether a setting may be given for a log: used, and not decided by it."""
     return key[0] in BagSlamConfig.model_fields and key not in LOGGED | OF_WORLDS
 
 
 def check_open(flags: Layer) -> None:
-    """Raise if a setting is decided by the log or unused.
-
-    >>> check_open({("filter", "range_std"): Given(0.1, "filter__range_std")})
-    Traceback (most recent call last):
-    pipistrelle.config.InputError: filter__range_std: the log decides this; leave it out
-    """
+    """Raise if a setting is decided by the log or unused."""
     for key, given in flags.items():
         if not is_open(key):
             why = "the log decides this" if key in LOGGED else "means nothing to a recorded log"
@@ -417,6 +382,11 @@ def check_bag(flags: Layer, log: Path) -> None:
         raise InputError(f"{given[0].where}: means nothing to {reader.title}; leave it out")
 
 
+def has_excess_paths(recorded: "Log") -> bool:
+    """Return whether any row of a log has an excess path."""
+    return any((scan.excess_path == scan.excess_path).any() for scan in recorded.scans)
+
+
 def with_log(layer: Layer, recorded: "Log", log: Path) -> tuple[Config, list[str]]:
     """Resolve settings with the values that a log decides; return notes on overruled ones."""
     decided: Layer = {key: Given(getattr(recorded, key[1]), f"{log}: {key[1]}") for key in LOGGED}
@@ -426,8 +396,7 @@ def with_log(layer: Layer, recorded: "Log", log: Path) -> tuple[Config, list[str
     if recorded.gate is not None:
         own[GATE_KEY] = Given(recorded.gate, str(log))
     moves = any(caller.moves for caller in recorded.callers)
-    excess = any((scan.excess_path == scan.excess_path).any() for scan in recorded.scans)
-    own[TIMING] = Given(moves or excess, str(log))
+    own[TIMING] = Given(moves or has_excess_paths(recorded), str(log))
     if recorded.excess_path_std is not None:
         own["filter", "excess_path_std"] = Given(
             recorded.excess_path_std, f"{log}: excess_path_std"

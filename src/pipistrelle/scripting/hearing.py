@@ -1,41 +1,34 @@
 """`hear`: the echoes of a sound recording, as a log and as a figure."""
 
 from collections.abc import Callable
+from contextlib import nullcontext
 from dataclasses import dataclass, replace
 from os.path import lexists
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from pipistrelle.config import Config, InputError
-from pipistrelle.detection.logs.folder import RowsHeard
-from pipistrelle.detection.sounds.check import Overview
-from pipistrelle.detection.sounds.hearing import Frame, hear_recording, log_callers
-from pipistrelle.detection.sounds.sound_file import FILE as ABOUT
-from pipistrelle.detection.sounds.sound_file import Description, read_description
-from pipistrelle.experiments.runs.truth_files import read_truth
 from pipistrelle.files import (
     LOG,
     OwnFiles,
     PiecesFile,
-    claim,
     drawn_files,
     make_folder,
     read_text,
     remove_empty,
 )
 from pipistrelle.refusals import refusal
-from pipistrelle.scripting.arguments import (
-    Progress,
-    folder_named,
-    frames_named,
-    keyword,
-    warn_caller,
-)
+from pipistrelle.scripting.arguments import Door, Progress, folder_named, frames_named
 from pipistrelle.settings import Key, Layer, from_keywords, resolve
 
 if TYPE_CHECKING:
     import polars as pl
     from matplotlib.figure import Figure
+
+    from pipistrelle.detection.logs.folder import RowsHeard
+    from pipistrelle.detection.sounds.check import Overview
+    from pipistrelle.detection.sounds.hearing import Frame
+    from pipistrelle.detection.sounds.sound_file import Description
 
 SECTIONS = ("detection", "matching")
 """Sections of settings that `hear` uses, besides ``assumed.speed_of_sound``."""
@@ -43,11 +36,7 @@ TRUTH, MEASURED = ("truth.csv", "landmarks.csv"), "measurements.csv"
 
 
 def is_heard(key: Key) -> bool:
-    """Return whether `hear` uses a setting.
-
-    >>> is_heard(("detection", "false_alarm")), is_heard(("rays", "power"))
-    (True, False)
-    """
+    """Return whether `hear` uses a setting."""
     return key[0] in SECTIONS or key == ("assumed", "speed_of_sound")
 
 
@@ -63,9 +52,9 @@ def heard_settings(layer: Layer) -> Config:
 class Heard:
     """Result of `hear`: the echoes of a recording, and their figure."""
 
-    overview: Overview
+    overview: "Overview"
     """Matched-filter output of the first calls, for the figure."""
-    log: RowsHeard
+    log: "RowsHeard"
     """Number of rows, and the other contents of the log."""
     text: str | None
     """The rows, unless they are kept in a folder."""
@@ -121,10 +110,6 @@ def hear(
     **settings
         Of the sections detection and matching, and ``assumed__speed_of_sound``.
 
-    Returns
-    -------
-    Heard
-
     Raises
     ------
     InputError
@@ -139,47 +124,46 @@ def hear(
     pipistrelle.config.InputError: nowhere: found no such folder, expected a sound recording's;
     check the path
     """
-    place = folder_named(recording, "hear")
-    config = heard_settings(from_keywords(settings))
-    if output is None:
+    door = Door(
+        asked={**locals()},
+        beneath={},
+        flags=from_keywords(settings),
+        command="pipistrelle.hear(...)",
+        working=lambda: nullcontext(progress),
+    )
+    return hear_by(door)
+
+
+def hear_by(door: Door) -> Heard:
+    """Detect the echoes in a recording as `hear`, called by a door."""
+    place, config = folder_named(door.asked["recording"], "hear"), heard_settings(door.flags)
+    own = door.claimed("output", LOG)
+    if own is None:
         parts: list[str] = []
-        heard = _heard(place, config, frames, keyword, progress, parts.append)
+        with door.working() as progress:
+            heard = _heard(place, config, door, progress, parts.append)
         heard = replace(heard, text="".join(parts))
     else:
-        flags = ("output=", "overwrite=True")
-        own = claim(folder_named(output, "output"), LOG, overwrite=overwrite, flags=flags)
-        heard = heard_into(own, place, config, frames, keyword, progress)
-    warn_caller(*(f"{place}: {line}" for line in heard.odd))
+        with door.working() as progress:
+            heard = _heard_into(own, place, config, door, progress)
+    door.warn(*(f"{place}: {line}" for line in heard.odd))
     return heard
 
 
-def heard_into(
-    own: OwnFiles,
-    folder: Path,
-    config: Config,
-    frames: str | None,
-    option: Callable[[str], str],
-    progress: Progress | None,
+def _heard_into(
+    own: OwnFiles, folder: Path, config: Config, door: Door, progress: Progress | None
 ) -> Heard:
-    """Write the echoes of a recording, its figure and its truth into the folder of a log.
-
-    Rows are written one call at a time; `option` formats the name of an option for messages.
-    """
+    """Write the echoes of a recording, call by call, its figure and its truth into a log."""
     from pipistrelle.figures.style import save_figure
 
     made = make_folder(own.folder)
     rows = PiecesFile(own.folder / MEASURED)
     try:
-        heard = _heard(
-            folder, config, frames, option, progress, lambda text: rows.write(text.encode())
-        )
+        heard = _heard(folder, config, door, progress, lambda text: rows.write(text.encode()))
         rows.close()
         figure = heard.figure()
-
-        def draw(room: Path) -> None:
-            save_figure(figure, room, "hearing")
-
-        picture = {n: data for n, data in drawn_files(draw).items() if n.endswith(".png")}
+        drawn = drawn_files(lambda room: save_figure(figure, room, "hearing"))
+        picture = {name: data for name, data in drawn.items() if name.endswith(".png")}
         truth = {name: read_text(folder / name) for name in TRUTH if lexists(folder / name)}
         own.replace(truth | picture | {MEASURED: rows} | heard.log.files())
     finally:
@@ -191,24 +175,28 @@ def heard_into(
 def _heard(
     folder: Path,
     config: Config,
-    frames: str | None,
-    option: Callable[[str], str],
+    door: Door,
     progress: Progress | None,
     write: Callable[[str], object],
 ) -> Heard:
     """Detect the echoes of a recording, and pass the rows of each call to `write` as text."""
+    from pipistrelle.detection.logs.folder import RowsHeard
+    from pipistrelle.detection.sounds.check import Overview
+    from pipistrelle.detection.sounds.hearing import hear_recording, log_callers
+    from pipistrelle.experiments.runs.truth_files import read_truth
+
     about = described(folder)
-    overview = Overview(names=("vehicle", *(one.name for one in about.callers)))
+    overview = Overview(names=("vehicle", *(caller.name for caller in about.callers)))
     log = RowsHeard(folder, about.log, log_callers(about))
     read_truth(folder, log.time)  # raises for bad truth, which is copied to the log
     write(",".join(log.columns) + "\n")
 
-    def look(frame: Frame) -> None:
+    def look(frame: "Frame") -> None:
         overview.look(frame)
         write(log.text(frame.scan))
 
     def chosen(count: int) -> range:
-        return frames_named(frames, count, option("frames"))
+        return frames_named(door.given("frames"), count)
 
     odd = hear_recording(folder, about, config, chosen, look, progress)
     log.files()  # raises for a log without rows
@@ -222,12 +210,14 @@ def faults_of(folder: Path, config: Config) -> list[str]:
     return check_recording(folder, described(folder), config)
 
 
-def described(folder: Path) -> Description:
+def described(folder: Path) -> "Description":
     """Read the description of a recording; raise if it is not a folder of a recording."""
+    from pipistrelle.detection.sounds.sound_file import FILE, read_description
+
     if not folder.is_dir():
         found = "a file" if folder.exists() else "no such folder"
         raise refusal(folder, found, "a sound recording's", "check the path")
-    if lexists(folder / "log.toml") and not lexists(folder / ABOUT):
+    if lexists(folder / "log.toml") and not lexists(folder / FILE):
         found, fix = "a log, which was heard already", f"solve it by 'pipistrelle slam {folder}'"
-        raise refusal(folder, found, f"a sound recording's {ABOUT}", fix)
+        raise refusal(folder, found, f"a sound recording's {FILE}", fix)
     return read_description(folder)

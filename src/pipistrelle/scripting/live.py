@@ -56,10 +56,9 @@ from pipistrelle.scripting.arguments import (
 )
 from pipistrelle.scripting.saved_state import (
     DriveState,
-    Named,
     check_going_on,
-    not_saved,
     read_state,
+    refused_if_forged,
     write_state,
 )
 from pipistrelle.settings import Given, from_keywords
@@ -213,12 +212,19 @@ class Slam:
     @property
     def map(self) -> "pl.DataFrame":
         """Landmarks, a row for each hypothesis, with the columns of ``landmarks.parquet``."""
-        return _map_table(self._session.landmarks())
+        return self._map_table(self._session.landmarks())
 
     @property
     def moving(self) -> "pl.DataFrame":
         """Moving callers, with the columns of `map`."""
-        return _map_table(answer(self._session.belief, "moving") or no_landmarks())
+        return self._map_table(answer(self._session.belief, "moving") or no_landmarks())
+
+    @staticmethod
+    def _map_table(landmarks: Landmarks) -> "pl.DataFrame":
+        """Return the table of a map without true positions."""
+        return landmark_table(landmarks, None).drop(
+            "true_x_m", "true_y_m", "error_m", "true_landmark"
+        )
 
     @property
     def path(self) -> "pl.DataFrame":
@@ -267,7 +273,8 @@ class Slam:
         if not lengths.size:
             return
         check_clock(ends, self._time)
-        gone = self._at_sensor(steps, ends)
+        times = np.array([self._time, *ends])
+        gone = at_sensor(replace(self._drive, time=times, controls=steps)).controls
         poses = self._change(lambda: self._session.move(gone, lengths))
         placed = self._at_vehicle(poses)
         self._poses += [
@@ -306,13 +313,21 @@ class Slam:
         InputError
             For bad rows, or rows used before; nothing has changed then.
         """
-        check_now(time, self._time)
+        if time is not None and abs((stamp := finite(time, "time")) - self._time) > SAME_TIME:
+            late = "the vehicle has moved on: leave out scans that come late"
+            early = "move to it first, by a part of a step if need be"
+            expected = f"{self._time} s, where the vehicle is"
+            fix = early if stamp > self._time else late
+            raise refusal("hear", f"the time {stamp} s", expected, fix)
         known = self._config.association.method == KNOWN
         table = table_of(columns, self._log.callers, labelled=known)
         if not table.line.size:
             return table.column["landmark"]
         scan = scan_at(self._time, table, self._log.callers)
-        fresh = keys_of(table)
+        names = ("landmark", CALLER, "bearing", "range", "excess_path")
+        numbers_of = (np.nan_to_num(table.column[name], nan=-1.0).tolist() for name in names)
+        rows = zip(*numbers_of, strict=True)
+        fresh = {row[:2] if row[0] >= 0 else row for row in rows}  # by label, or by all numbers
         if fresh & self._heard:
             found, fix = f"rows once more at {self._time} s", "leave out what came twice"
             raise refusal("hear", found, "each once", fix)
@@ -349,7 +364,7 @@ class Slam:
             means=online.mean,
             covariances=online.covariance,
         )
-        write_state(path, Named(self._name, self._config.association.method), state)
+        write_state(path, (self._name, self._config.association.method), state)
         return path
 
     @classmethod
@@ -382,26 +397,22 @@ class Slam:
                 class_of(role, name)
         own = {"filter": named, "association__method": association__method}
         slam = cls.__new__(cls)
-        names, state = read_state(path, own)
-        try:
-            slam._go_on_from(names, state)
-        except InputError:
-            raise
-        except Exception as error:  # a forged file with a right checksum
-            raise not_saved(path, error) from None
+        with refused_if_forged(path):
+            names, state = read_state(path, own)
+            slam._go_on_from(*names, state)
         return slam
 
-    def _go_on_from(self, named: Named, state: DriveState) -> None:
+    def _go_on_from(self, name: str, association: str, state: DriveState) -> None:
         """Restore the contents of a file of `save`."""
         config = Config.model_validate(state.settings)
         belief, method = state.session.belief, config.association.method
         particles = isinstance(belief, FastSlamBelief) and belief.log_weight.size
-        if method != named.association or particles not in (False, config.fastslam.particles):
+        if method != association or particles not in (False, config.fastslam.particles):
             raise ValueError("settings")
         log, _, vehicle = _log_of(state.vehicle, finite(state.start, "start"))
         log = replace(log, name=state.name, former_names=state.former)
-        self._begin(log, vehicle, config, named.filter, state.kept)
-        check_going_on(self._session.state(), state.session, own=names_class(named.filter))
+        self._begin(log, vehicle, config, name, state.kept)
+        check_going_on(self._session.state(), state.session, own=names_class(name))
         self._session.go_on_from(state.session)
         parts = zip(state.times.tolist(), state.means, state.covariances, strict=True)
         self._poses = [(t, Gaussian(mean=m, covariance=P)) for t, m, P in parts]
@@ -454,13 +465,6 @@ class Slam:
         sensor = self._drive.sensor
         return carried(pose, vehicle_in(sensor)) if any(sensor) else pose
 
-    def _at_sensor(
-        self, steps: Float[np.ndarray, "k c"], ends: Float[np.ndarray, " k"]
-    ) -> Float[np.ndarray, "k c"]:
-        """Convert steps of the vehicle to steps of its sensor."""
-        time = np.array([self._time, *ends])
-        return at_sensor(replace(self._drive, time=time, controls=steps)).controls
-
 
 def _fault(pose: Gaussian) -> tuple[str, str] | None:
     """Return the fault of a pose and the expected state; None for a valid pose.
@@ -495,17 +499,8 @@ def _log_of(vehicle: Vehicle, time: float) -> tuple[Log, Path, VehicleKeys]:
     return log, where, told
 
 
-def _map_table(landmarks: Landmarks) -> "pl.DataFrame":
-    """Return the table of a map without true positions."""
-    return landmark_table(landmarks, None).drop("true_x_m", "true_y_m", "error_m", "true_landmark")
-
-
 def numbers(values: object, where: str) -> Float[np.ndarray, "*n"]:
-    """Convert values to an array of numbers, None and masked values to NaN; else raise.
-
-    >>> numbers([1, None], "range")
-    array([ 1., nan])
-    """
+    """Convert values to an array of numbers, None and masked values to NaN; else raise."""
     try:
         given = np.asarray(values)
         if isinstance(values, np.ma.MaskedArray):
@@ -560,15 +555,6 @@ def check_clock(ends: Float[np.ndarray, " k"], now: float = -inf) -> None:
         raise refusal("move", found, expected, "join it with the next, or take another zero")
 
 
-def check_now(time: object, now: float) -> None:
-    """Raise if a scan is not at the time of the vehicle."""
-    if time is None or abs((stamp := finite(time, "time")) - now) <= SAME_TIME:
-        return
-    late = "the vehicle has moved on: leave out scans that come late"
-    fix = "move to it first, by a part of a step if need be" if stamp > now else late
-    raise refusal("hear", f"the time {stamp} s", f"{now} s, where the vehicle is", fix)
-
-
 def table_of(columns: Mapping[str, Any], callers: Sequence[LogCaller], *, labelled: bool) -> Table:
     """Convert the columns of a scan to a table of a log; raise for missing labels if needed."""
     if unknown := sorted(columns.keys() - {*COLUMNS}):
@@ -579,7 +565,15 @@ def table_of(columns: Mapping[str, Any], callers: Sequence[LogCaller], *, labell
     if labelled and "landmark" not in given:
         raise refusal("hear", "no landmark", LABELS, 'give association__method="marginal"')
     if CALLER in given:
-        given[CALLER] = _numbers_of(given[CALLER], [caller.name for caller in callers])
+        names, known = given[CALLER], [caller.name for caller in callers]
+        whole = [names] if names is None or isinstance(names, str) else names
+        number = {None: nan, "": nan} | {n: float(k) for k, n in enumerate(known, start=OWN + 1)}
+        try:
+            given[CALLER] = [number[name] for name in whole]
+        except (KeyError, TypeError):
+            expected = " or ".join([*map(repr, known), "None, the vehicle itself"])
+            fix = "say the vehicle's callers"
+            raise refusal("hear, caller", shown(names), expected, fix) from None
     column = {name: np.atleast_1d(numbers(values, name)) for name, values in given.items()}
     shapes = {name: values.shape for name, values in column.items()}
     if len({*shapes.values()}) > 1 or any(len(shape) > 1 for shape in shapes.values()):
@@ -587,22 +581,3 @@ def table_of(columns: Mapping[str, Any], callers: Sequence[LogCaller], *, labell
     (size,) = next(iter(shapes.values()), (0,))
     column = {name: column.get(name, np.full(size, nan)) for name in COLUMNS}
     return Table(path="hear", line=np.arange(1, size + 1), unit="row", column=column)
-
-
-def keys_of(table: Table) -> set[tuple[float, ...]]:
-    """Return the identities of simultaneous rows: label and caller, or all measured numbers."""
-    names = ("landmark", CALLER, "bearing", "range", "excess_path")
-    columns = (np.nan_to_num(table.column[name], nan=-1.0).tolist() for name in names)
-    return {row[:2] if row[0] >= 0 else row for row in zip(*columns, strict=True)}
-
-
-def _numbers_of(names: Any, known: Sequence[str]) -> list[float]:
-    """Convert the names of callers to numbers, None (the vehicle) to NaN."""
-    whole = [names] if names is None or isinstance(names, str) else names
-    places = {None: nan, "": nan} | {name: float(n) for n, name in enumerate(known, start=OWN + 1)}
-    try:
-        return [places[name] for name in whole]
-    except (KeyError, TypeError):
-        found = shown(names)
-        expected = " or ".join([*map(repr, known), "None, the vehicle itself"])
-        raise refusal("hear, caller", found, expected, "say the vehicle's callers") from None

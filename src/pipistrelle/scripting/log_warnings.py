@@ -12,13 +12,14 @@ in the numbers of the log, so that units and columns do not matter: half the pri
 that the earlier scan lacks the landmark, and :math:`p_0` is uniform over the recorded numbers.
 """
 
-from collections.abc import Sequence
-from math import ceil, comb, floor, hypot, inf, log10, pi, radians, sqrt, tau
+from collections.abc import Iterator, Sequence
+from math import ceil, floor, hypot, inf, log10, pi, radians, sqrt, tau
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
+from scipy.special import bdtr, bdtrc
 
 from pipistrelle.config import Config
 from pipistrelle.detection.scans import BEARING, NUMBERS, OWN, RANGE, UNLABELLED, WIDEST
@@ -31,6 +32,7 @@ from pipistrelle.experiments.drives import carried
 from pipistrelle.experiments.named_settings import own_config
 from pipistrelle.experiments.runs.replay import motion_of
 from pipistrelle.geometry import range_and_bearing, wrap
+from pipistrelle.scripting.arguments import has_excess_paths
 
 if TYPE_CHECKING:
     from pipistrelle.detection.logs.recording import Log
@@ -49,8 +51,8 @@ UNSURE = {"bearing_std": ("bearings", "rad", WIDEST), "way_std": ("ranges", "m",
 """Settings by which an association discards rows: the measured numbers, their unit, and the largest
 standard deviation for which a larger value is advised."""
 DEGREE = pi / 180.0
-SCANS = 32
-"""Number of scans that are compared with earlier scans, spread over the log."""
+COMPARED = 32
+"""Most scans, and most rows of a scan, that are compared with earlier scans."""
 LAGS = 2 ** np.arange(10)
 """Distances to the earlier scans, in scans."""
 CHANCE = 0.01
@@ -58,15 +60,13 @@ CHANCE = 0.01
 REACH, QUESTIONED = 0.99, 1e-3
 """Quantile of the rows that the sensor's field of view and range reach at least, and probability of
 questioning a correct setting by chance."""
-ROWS = 32
-"""Most rows of a scan that are compared with earlier scans."""
 Question = tuple[str, str]
 """An observation, and the question or advice that follows."""
 
 
-def has_excess_paths(recorded: "Log") -> bool:
-    """Return whether any row of a log has an excess path."""
-    return any((scan.excess_path == scan.excess_path).any() for scan in recorded.scans)
+def labels_of(recorded: "Log") -> set[int]:
+    """Return the labels of all rows."""
+    return {label for scan in recorded.scans for label in scan.landmark.tolist()}
 
 
 def distance_driven(recorded: "Log") -> float:
@@ -78,71 +78,67 @@ def distance_driven(recorded: "Log") -> float:
 
 def log_warnings(recorded: "Log", truth: "Truth", log: Path) -> list[str]:
     """Return warnings on a log before it is solved: doubtful values, ignored rows, jumps."""
+    return [f"{log}: {note}" for note in _doubts(recorded, truth)]
+
+
+def _doubts(recorded: "Log", truth: "Truth") -> Iterator[str]:
+    """Yield the warnings on a log before it is solved."""
     from pipistrelle.detection.logs.text_tables import FORMER_NAMES
 
-    notes = [f"{log}: {doubt}" for doubt in recorded.doubts]
-    if recorded.ignored_rows:
-        reasons = (
-            f"{count} {reason.replace('_', ' ')}" for reason, count in recorded.ignored_rows.items()
-        )
-        notes.append(f"{log}: rows left out: {', '.join(reasons)}")
-    notes += [
-        f"{log}: {name} is read as {FORMER_NAMES[name]}, as it is called now"
-        for name in dict.fromkeys(recorded.former_names)
-    ]
-    headings = {name: getattr(recorded, name)[2] for name in ("initial_pose", "sensor_pose")}
-    notes += [
-        f"{log}: the heading of {name}, {heading:g} rad, is beyond a turn; is it in degrees? "
-        f"{heading:g} degrees are {radians(heading):.4g} rad"
-        for name, heading in headings.items()
-        if abs(heading) > tau
-    ]
-    notes += [*_jumps(recorded, log), *_unheard(recorded, log)]
+    yield from recorded.doubts
+    if ignored := recorded.ignored_rows:
+        reasons = (f"{count} {reason.replace('_', ' ')}" for reason, count in ignored.items())
+        yield f"rows left out: {', '.join(reasons)}"
+    for name in dict.fromkeys(recorded.former_names):
+        yield f"{name} is read as {FORMER_NAMES[name]}, as it is called now"
+    for name in ("initial_pose", "sensor_pose"):
+        heading = getattr(recorded, name)[2]
+        if abs(heading) > tau:
+            yield (
+                f"the heading of {name}, {heading:g} rad, is beyond a turn; is it in degrees? "
+                f"{heading:g} degrees are {radians(heading):.4g} rad"
+            )
+    if recorded.motion == "poses":
+        yield from _jumps(recorded)
+    labels = labels_of(recorded)
+    if labels != {UNLABELLED}:  # else the association finds the callers
+        yield from _unheard(recorded, labels)
     if truth.path is not None:
         steps = len(truth.time) - 1
         known_steps = sum(1 for pose in truth.path[1:] if pose[0] == pose[0])
         if known_steps < steps:
-            notes.append(
-                f"{log}: the truth covers {known_steps} of {steps} steps; only these are scored"
-            )
-    return notes
+            yield f"the truth covers {known_steps} of {steps} steps; only these are scored"
 
 
-def _jumps(recorded: "Log", log: Path) -> list[str]:
+def _jumps(recorded: "Log") -> Iterator[str]:
     """Question odometry poses with steps much larger than the others (a changed frame)."""
-    if recorded.motion != "poses":
-        return []
     from pipistrelle.detection.logs.poses import jumps
 
     far_steps = jumps(recorded.controls, recorded.dt)
-    if not far_steps.size:
-        return []
-    step = int(far_steps[0])
-    ahead, aside, turn = recorded.controls[step, :3].tolist()
-    others = f", and {far_steps.size - 1} more such steps" * (far_steps.size > 1)
-    return [
-        f"{log}: the odometry moves by {hypot(ahead, aside):.3g} m and turns by {turn:.3g} rad "
-        f"in the {recorded.dt[step]:.3g} s from {recorded.time[step]:.15g} s on{others}; "
-        "was its frame begun anew?"
-    ]
+    if far_steps.size:
+        step = int(far_steps[0])
+        ahead, aside, turn = recorded.controls[step, :3].tolist()
+        others = f", and {far_steps.size - 1} more such steps" * (far_steps.size > 1)
+        yield (
+            f"the odometry moves by {hypot(ahead, aside):.3g} m and turns by {turn:.3g} rad "
+            f"in the {recorded.dt[step]:.3g} s from {recorded.time[step]:.15g} s on{others}; "
+            "was its frame begun anew?"
+        )
 
 
-def _unheard(recorded: "Log", log: Path) -> list[str]:
+def _unheard(recorded: "Log", labels: set[int]) -> Iterator[str]:
     """Warn of callers with excess paths but without a position or a row of their landmark."""
-    heard = labels_of(recorded)
-    if heard == {UNLABELLED}:  # the association finds the callers
-        return []
     timed = {
         number
         for scan in recorded.scans
         for number in scan.caller[scan.excess_path == scan.excess_path].tolist()
     }
-    return [
-        f"{log}: no row measures landmark {caller.landmark}, the caller {caller.name!r}, so its "
-        "excess paths say nothing; correct its number, or say its place"
-        for number, caller in enumerate(recorded.callers, start=1)
-        if number in timed and caller.landmark not in heard and caller.place is None
-    ]
+    for number, caller in enumerate(recorded.callers, start=1):
+        if number in timed and caller.landmark not in labels and caller.place is None:
+            yield (
+                f"no row measures landmark {caller.landmark}, the caller {caller.name!r}, so its "
+                "excess paths say nothing; correct its number, or say its place"
+            )
 
 
 def fit_warnings(
@@ -152,29 +148,28 @@ def fit_warnings(
 
     They name the mistake in its columns that explains the misfit, else ask about units and labels.
     """
-    beyond, odd_ranges = _beyond_a_turn(recorded), _out_of_bounds(recorded, "ranges")
-    questions, unmapped, wide = beyond + odd_ranges, [], []
+    odd = _out_of_bounds(recorded)
+    questions, unmapped, wide = odd["bearings"] + odd["ranges"], [], []
     notes = [
-        f"{log}: none of the {rows} rows of {trial.strategy} sensing is of a landmark, so it maps "
-        "nothing"
+        f"none of the {rows} rows of {trial.strategy} sensing is of a landmark, so it maps nothing"
         if (rows := sum(scan.landmark.size for scan in trial.heard))
-        else f"{log}: nothing in it is heard by {trial.strategy} sensing, so it maps nothing"
+        else f"nothing in it is heard by {trial.strategy} sensing, so it maps nothing"
         for trial in trials
         if not any(len(scan.landmark) for scan in trial.scans)
     ]
-    for trial in trials if not beyond else ():
+    for trial in () if odd["bearings"] else trials:
         questions += _rejected(trial, recorded, config)
-        unmapped += _unmapped(trial, recorded)
         if trial.track.labels:
+            unmapped += _unmapped(trial, recorded)
             wide += wide_sight(trial, recorded, own_config(config, trial.filter))
     if questions or unmapped:
         mistake, fits = misreading(recorded)
         questions += [] if fits else unmapped
         if mistake:
             questions = [(questions[0][0], mistake)]
-    questions += wide + _out_of_bounds(recorded, "excess paths")
-    notes += [f"{log}: {found}; {question}" for found, question in questions]
-    return notes + _unsure(trials, log, config)
+    questions += wide + odd["excess paths"]
+    notes += [f"{found}; {question}" for found, question in questions]
+    return [f"{log}: {note}" for note in (*notes, *dict.fromkeys(_unsure(trials, config)))]
 
 
 def _units(recorded: "Log") -> str:
@@ -196,7 +191,7 @@ def _rejected(trial: "TrialResult", recorded: "Log", config: Config) -> list[Que
     if MAX_IGNORED_SHARE * heard < gated:
         found = f"{gated} of {heard} measurements do not fit what was expected ({who})"
         return [(found, _units(recorded))]
-    if strayed := _strayed(trial, who):
+    if not trial.track.labels and (strayed := _strayed(trial, who)):
         return strayed
     expected = 1.0 - gate_of(trial.filter, own_config(config, trial.filter))
     if (MAX_GATED_SHARE + expected) * heard < gated:
@@ -216,12 +211,10 @@ def _strayed(trial: "TrialResult", who: str) -> list[Question]:
     """Question landmarks with successive measurements far from the final map and path."""
     from pipistrelle.evaluation.consistency import strayed_landmarks
 
-    if trial.track.labels:
-        return []
     strayed = strayed_landmarks(trial.track, trial.scans, GATE, MAX_GATED_SHARE + 1.0 - GATE)
     if not strayed:
         return []
-    label, (first, last, count) = max(strayed.items(), key=lambda one: one[1][2])
+    label, (first, last, count) = max(strayed.items(), key=lambda item: item[1][2])
     others = f", and {len(strayed) - 1} more landmarks likewise" * (len(strayed) > 1)
     found = (
         f"{count} measurements of landmark {label} in a row, from {first:.15g} to {last:.15g} s, "
@@ -232,8 +225,6 @@ def _strayed(trial: "TrialResult", who: str) -> list[Question]:
 
 def _unmapped(trial: "TrialResult", recorded: "Log") -> list[Question]:
     """Question an association that assigned fewer than half of the rows to the final map."""
-    if not trial.track.labels:
-        return []
     labels = np.concatenate(trial.track.labels)
     mapped = np.count_nonzero(np.isin(labels, trial.track.landmarks.landmark))
     if 2 * mapped >= labels.size:
@@ -242,30 +233,20 @@ def _unmapped(trial: "TrialResult", recorded: "Log") -> list[Question]:
     return [(f"{found} ({trial.strategy} {short_name(trial.filter)})", _units(recorded))]
 
 
-def _beyond_a_turn(recorded: "Log") -> list[Question]:
-    """Question bearings beyond a full turn."""
-    bearings = recorded.recorded_bearings()
-    turned = int((abs(bearings) > tau).sum())
-    if not turned > MAX_IGNORED_SHARE * bearings.size:
-        return []
-    return [(f"{turned} of {bearings.size} bearings are beyond a turn", "are they in radians?")]
-
-
-def _unsure(trials: "Sequence[TrialResult]", log: Path, config: Config) -> list[str]:
+def _unsure(trials: "Sequence[TrialResult]", config: Config) -> Iterator[str]:
     """Warn if an association discards most rows as uncertain; advise a setting that keeps them."""
-    notes = []
     for trial in trials:
         settings = own_config(config, trial.filter).association
         rows = sum(scan.landmark.size for scan in trial.heard)
         for name, stds in trial.left_out.items():
             if stds.size < (1.0 - MAX_IGNORED_SHARE) * rows:
                 continue
-            what, unit, most = UNSURE[name]
+            measured, unit, most = UNSURE[name]
             limit, taken = getattr(settings, name), stds[stds <= most]
             spread = dict.fromkeys(f"{std:.2g}" for std in (stds.min(), stds.max()))
             note = (
-                f"{log}: {stds.size} rows of {trial.strategy} sensing are left out: the standard "
-                f"deviation of their {what}, {' to '.join(spread)} {unit}, is above "
+                f"{stds.size} rows of {trial.strategy} sensing are left out: the standard "
+                f"deviation of their {measured}, {' to '.join(spread)} {unit}, is above "
                 f"association.{name}, {limit:g} {unit}"
             )
             if taken.size:
@@ -274,8 +255,7 @@ def _unsure(trials: "Sequence[TrialResult]", log: Path, config: Config) -> list[
                 value = ceil(taken.max() / digit) * digit
                 whole = "them" if taken.size == stds.size else f"{taken.size} of them"
                 note += f"; {flag} {value:g} takes {whole}"
-            notes.append(note)
-    return [*dict.fromkeys(notes)]
+            yield note
 
 
 def nis_warning(trial: "TrialResult") -> str:
@@ -290,30 +270,32 @@ def nis_warning(trial: "TrialResult") -> str:
     )
 
 
-def _out_of_bounds(recorded: "Log", name: str) -> list[Question]:
-    """Question ranges or excess paths outside plausible bounds; an excess path is < 2 ranges."""
+def _out_of_bounds(recorded: "Log") -> dict[str, list[Question]]:
+    """Question the values of each column outside plausible bounds; an excess path is < 2 ranges."""
     near, far = recorded.range_bounds
     bounds = f"range_bounds ({near:g} to {far:g} m)"
-    column = name.replace(" ", "_").removesuffix("s")
-    values = np.concatenate([getattr(scan, column) for scan in recorded.scans])
-    values = values[~np.isnan(values)]
-    odd = {
-        "ranges": (((values < near) | (values > far), MAX_IGNORED_SHARE, f"not within {bounds}"),),
-        "excess paths": (
-            (values > 2.0 * far, MAX_IGNORED_SHARE, f"more than twice the far end of {bounds}"),
-            (values < MIN_EXCESS_PATH, 1.0 - MAX_IGNORED_SHARE, f"below {MIN_EXCESS_PATH:g} m"),
-        ),
-    }[name]
-    return [
-        (f"{np.count_nonzero(rows)} of {rows.size} {name} are {where}", f"are {name} in metres?")
-        for rows, share, where in odd
-        if np.count_nonzero(rows) > share * rows.size
-    ]
-
-
-def labels_of(recorded: "Log") -> set[int]:
-    """Return the labels of all rows."""
-    return {label for scan in recorded.scans for label in scan.landmark.tolist()}
+    bearing = recorded.recorded_bearings()
+    distance, excess = (
+        values[~np.isnan(values)]
+        for values in (
+            np.concatenate([getattr(scan, name) for scan in recorded.scans])
+            for name in ("range", "excess_path")
+        )
+    )
+    few, most = MAX_IGNORED_SHARE, 1.0 - MAX_IGNORED_SHARE
+    checks = (
+        ("bearings", abs(bearing) > tau, few, "beyond a turn"),
+        ("ranges", (distance < near) | (distance > far), few, f"not within {bounds}"),
+        ("excess paths", excess > 2.0 * far, few, f"more than twice the far end of {bounds}"),
+        ("excess paths", excess < MIN_EXCESS_PATH, most, f"below {MIN_EXCESS_PATH:g} m"),
+    )
+    questions: dict[str, list[Question]] = {name: [] for name, *_ in checks}
+    for name, rows, share, where in checks:
+        if np.count_nonzero(rows) > share * rows.size:
+            fix = "are they in radians?" if name == "bearings" else f"are {name} in metres?"
+            found = f"{np.count_nonzero(rows)} of {rows.size} {name} are {where}"
+            questions[name].append((found, fix))
+    return questions
 
 
 class Mistake(NamedTuple):
@@ -387,13 +369,9 @@ MISTAKES = (
 """The mistakes that `misreading` tries."""
 
 
-class _Path(NamedTuple):
-    """Poses by dead reckoning, and the noise of each step."""
-
-    sensor: Float[np.ndarray, "t 3"]
-    vehicle: Float[np.ndarray, "t 3"]
-    noise: Float[np.ndarray, "t-1 3 3"]
-    """Covariance of each step's motion, in the axes of the map."""
+_Path = tuple[Float[np.ndarray, "t 3"], Float[np.ndarray, "t 3"], Float[np.ndarray, "t-1 3 3"]]
+"""Poses of sensor and vehicle by dead reckoning, and the covariance of each step's motion in the
+axes of the map."""
 
 
 class _Rows(NamedTuple):
@@ -436,8 +414,8 @@ def misreading(recorded: "Log") -> tuple[str, bool]:
 
 def _sign_test(difference: Float[np.ndarray, " n"]) -> float:
     """Return the probability that at least this many differences are positive by chance."""
-    positive, n = int(np.sum(difference > 0.0)), int(np.sum(difference != 0.0))
-    return sum(comb(n, k) for k in range(positive, n + 1)) / 2**n
+    positive, n = np.count_nonzero(difference > 0.0), np.count_nonzero(difference)
+    return float(bdtrc(positive - 1, n, 0.5))
 
 
 def _fits(recorded: "Log") -> tuple[Int[np.ndarray, " k"], Float[np.ndarray, "k h"]]:
@@ -446,12 +424,16 @@ def _fits(recorded: "Log") -> tuple[Int[np.ndarray, " k"], Float[np.ndarray, "k 
     The fit is the sum over earlier scans of log p(z) / p_0.
     """
     rows = _recorded_rows(recorded)
-    spans = _spans(rows, recorded)
+    spans = []
+    for name, least in (("bearing", recorded.bearing_std), ("range", recorded.range_std)):
+        values = np.concatenate([getattr(scan, name) for scan in rows])
+        values = values[~np.isnan(values)]
+        spans.append(max(float(np.ptp(values)) if values.size else 0.0, least))
     paths = {mistake.rate: _path(recorded, mistake.rate) for mistake in (NONE, *MISTAKES)}
     scans, fits = [], []
-    chosen = np.linspace(1, len(rows) - 1, SCANS if len(rows) > 1 else 0)
+    chosen = np.linspace(1, len(rows) - 1, COMPARED if len(rows) > 1 else 0)
     for n in np.unique(chosen.round().astype(int)):
-        later = _some(rows[n], np.linspace(0, rows[n].label.size - 1, ROWS))
+        later = _some(rows[n], np.linspace(0, rows[n].label.size - 1, COMPARED))
         fit = np.zeros((later.label.size, 1 + len(MISTAKES)))
         for earlier in (rows[n - lag] for lag in LAGS if lag <= n):
             for h, mistake in enumerate((NONE, *MISTAKES)):
@@ -470,12 +452,9 @@ def _recorded_rows(recorded: "Log") -> list[_Rows]:
     moving = [caller.landmark for caller in recorded.callers if caller.moves]
     rows = []
     for scan, bearing in zip(recorded.scans, bearings, strict=True):
-        stds = np.array(
-            [
-                np.where(np.isnan(scan.bearing_std), recorded.bearing_std, scan.bearing_std),
-                np.where(np.isnan(scan.range_std), recorded.range_std, scan.range_std),
-            ]
-        )
+        stated = np.array([scan.bearing_std, scan.range_std])
+        general = np.array([[recorded.bearing_std], [recorded.range_std]])
+        stds = np.where(np.isnan(stated), general, stated)
         step = int(np.searchsorted(recorded.time, scan.time))
         whole = _Rows(bearing, scan.range, stds**2, scan.landmark, step)
         usable = ~np.isnan(bearing) & ~np.isin(scan.landmark, moving)
@@ -488,16 +467,6 @@ def _some(rows: _Rows, chosen: np.ndarray) -> _Rows:
     """Select rows of a scan by their indices, which are rounded."""
     n = np.unique(chosen.round().astype(int)) if rows.label.size else np.empty(0, int)
     return _Rows(rows.bearing[n], rows.range[n], rows.variance[:, n], rows.label[n], rows.step)
-
-
-def _spans(rows: list[_Rows], recorded: "Log") -> tuple[float, float]:
-    """Return the spans of the recorded bearings and ranges."""
-    spans = []
-    for name, least in (("bearing", recorded.bearing_std), ("range", recorded.range_std)):
-        values = np.concatenate([getattr(one, name) for one in rows])
-        values = values[~np.isnan(values)]
-        spans.append(max(float(np.ptp(values)) if values.size else 0.0, least))
-    return spans[0], spans[1]
 
 
 def _path(recorded: "Log", rate: float) -> _Path:
@@ -515,19 +484,8 @@ def _path(recorded: "Log", rate: float) -> _Path:
     axes[:, :2, :2], axes[:, 2, 2] = ahead.transpose(2, 0, 1), 1.0
     x, y, turn = recorded.sensor_pose
     sensor = place + np.column_stack((c * x - s * y, s * x + c * y))
-    return _Path(
-        sensor=np.column_stack((sensor, heading + turn)),
-        vehicle=np.column_stack((place, heading)),
-        noise=axes @ noise @ axes.transpose(0, 2, 1),
-    )
-
-
-def _reckoned(path: _Path, begin: int, end: int) -> Float[np.ndarray, "3 3"]:
-    """Return the covariance of the sensor's pose at step `end`, given its pose at `begin`."""
-    lever = path.sensor[end, :2] - path.vehicle[begin + 1 : end + 1, :2]
-    J = np.tile(np.eye(3), (len(lever), 1, 1))
-    J[:, 0, 2], J[:, 1, 2] = -lever[:, 1], lever[:, 0]
-    return np.einsum("tij,tjk,tlk->il", J, path.noise[begin:end], J)
+    poses = np.column_stack((sensor, heading + turn)), np.column_stack((place, heading))
+    return *poses, axes @ noise @ axes.transpose(0, 2, 1)
 
 
 def _undone(
@@ -541,21 +499,15 @@ def _undone(
     return wrap(bearing), mistake.scale * distance
 
 
-class _Expected(NamedTuple):
-    """Predicted rows of the landmarks of an earlier scan, and the entries of their covariance."""
-
-    bearing: Float[np.ndarray, " n"]
-    range: Float[np.ndarray, " n"]
-    bb: Float[np.ndarray, " n"]
-    rb: Float[np.ndarray, " n"]
-    rr: Float[np.ndarray, " n"]
-
-
 def _expected(
     earlier: _Rows, mistake: Mistake, path: _Path, step: int
-) -> tuple[_Expected, Int[np.ndarray, " n"]]:
-    """Predict the rows of a later step from the ranges of an earlier scan; return their labels."""
-    now, before = path.sensor[step], path.sensor[earlier.step]
+) -> tuple[Float[np.ndarray, "5 n"], Int[np.ndarray, " n"]]:
+    """Predict the rows of a later step from the ranges of an earlier scan; return their labels.
+
+    The prediction is a bearing, a range, and the entries bb, rb and rr of their covariance.
+    """
+    (sensor, vehicle, noise), begin = path, earlier.step
+    now, before = sensor[step], sensor[begin]
     b, r = _undone(earlier, mistake, before[2])
     ranged = np.isfinite(b) & (r > 0.0)
     b, r, variance = b[ranged], r[ranged], earlier.variance[:, ranged]
@@ -568,32 +520,30 @@ def _expected(
     along, across = variance[1], r**2 * variance[0]
     to_range = np.column_stack((-u, np.zeros(len(u))))
     to_bearing = np.column_stack((-normal / distance[:, np.newaxis], -np.ones(len(u))))
-    P = _reckoned(path, earlier.step, step)
+    lever = now[:2] - vehicle[begin + 1 : step + 1, :2]
+    J = np.tile(np.eye(3), (len(lever), 1, 1))
+    J[:, 0, 2], J[:, 1, 2] = -lever[:, 1], lever[:, 0]
+    P = np.einsum("tij,tjk,tlk->il", J, noise[begin:step], J)
 
     def moved(one: np.ndarray, other: np.ndarray) -> np.ndarray:
         return np.einsum("ni,ij,nj->n", one, P, other)
 
-    expected = _Expected(
-        bearing=np.arctan2(off[:, 1], off[:, 0]) - now[2],
-        range=distance,
-        bb=(s * s * along + c * c * across) / distance**2 + moved(to_bearing, to_bearing),
-        rb=c * s * (along - across) / distance + moved(to_range, to_bearing),
-        rr=c * c * along + s * s * across + moved(to_range, to_range),
-    )
-    return expected, earlier.label[ranged]
+    bb = (s * s * along + c * c * across) / distance**2 + moved(to_bearing, to_bearing)
+    rb = c * s * (along - across) / distance + moved(to_range, to_bearing)
+    rr = c * c * along + s * s * across + moved(to_range, to_range)
+    bearing = np.arctan2(off[:, 1], off[:, 0]) - now[2]
+    return np.stack((bearing, distance, bb, rb, rr)), earlier.label[ranged]
 
 
 @np.errstate(over="ignore", under="ignore")
 def _log_ratio(
-    earlier: _Rows, later: _Rows, mistake: Mistake, path: _Path, spans: tuple[float, float]
+    earlier: _Rows, later: _Rows, mistake: Mistake, path: _Path, spans: Sequence[float]
 ) -> Float[np.ndarray, " m"]:
     """Return log p(z) / p_0 of each row given an earlier scan; 0 without a possible partner."""
-    expected, label = _expected(earlier, mistake, path, later.step)
-    bearing, distance = _undone(later, mistake, path.sensor[later.step, 2])
-    db = wrap(bearing[:, np.newaxis] - expected.bearing)
-    dr = distance[:, np.newaxis] - expected.range
-    bb, rr = (var[:, np.newaxis] for var in later.variance)
-    bb, rr, rb = bb + expected.bb, rr + expected.rr, expected.rb
+    (b, r, bb, rb, rr), label = _expected(earlier, mistake, path, later.step)
+    bearing, distance = _undone(later, mistake, path[0][later.step, 2])
+    db, dr = wrap(bearing[:, np.newaxis] - b), distance[:, np.newaxis] - r
+    bb, rr = later.variance[0][:, np.newaxis] + bb, later.variance[1][:, np.newaxis] + rr
     determinant = rr * bb - rb * rb
     squared = (bb * dr * dr - 2.0 * rb * dr * db + rr * db * db) / determinant
     both = mistake.scale * np.exp(-0.5 * squared) / (2.0 * pi * np.sqrt(determinant))
@@ -628,15 +578,11 @@ def wide_sight(trial: "TrialResult", recorded: "Log", config: Config) -> list[Qu
     half, farthest = 0.5 * stated.field_of_view - BEFORE, WITHIN * stated.max_range
     wide, long = np.quantile(np.abs(rows[BEARING]), REACH), np.quantile(rows[RANGE], REACH)
     off = np.abs(bearing)
+    aside = (far <= long) & (wide < off) & (off <= half)
+    ahead = (off <= wide) & (long < far) & (far <= farthest)
     asked = (
-        (
-            "field_of_view",
-            "bearings",
-            (far <= long) & (wide < off) & (off <= half),
-            2.0 * wide,
-            "rad",
-        ),
-        ("max_range", "ranges", (off <= wide) & (long < far) & (far <= farthest), long, "m"),
+        ("field_of_view", "bearings", aside, 2.0 * wide, "rad"),
+        ("max_range", "ranges", ahead, long, "m"),
     )
     return [
         (
@@ -646,14 +592,8 @@ def wide_sight(trial: "TrialResult", recorded: "Log", config: Config) -> list[Qu
             f"the map loses landmarks by that; does {value:.3g} fit?",
         )
         for name, what, beyond, value, unit in asked
-        if _at_most(int((beyond & heard).sum()), int(beyond.sum()), stated.detection) <= QUESTIONED
+        if bdtr((beyond & heard).sum(), beyond.sum(), stated.detection) <= QUESTIONED
     ]
-
-
-def _at_most(heard: int, times: int, probability: float) -> float:
-    """Return the binomial probability of at most `heard` successes in `times` trials."""
-    powers = ((1.0 - probability) ** (times - k) * probability**k for k in range(heard + 1))
-    return sum(comb(times, k) * power for k, power in enumerate(powers))
 
 
 def _expected_rows(

@@ -13,14 +13,13 @@ import numpy as np
 from pipistrelle.acoustics.paths import moves
 from pipistrelle.config import Config, InputError, Strategy
 from pipistrelle.detection.logs.folder import log_files
-from pipistrelle.detection.logs.readers import Robot
 from pipistrelle.detection.logs.recording import Log, LogCaller
 from pipistrelle.detection.noise import unstated
 from pipistrelle.detection.scans import Scan
 from pipistrelle.estimation.association import KNOWN
 from pipistrelle.estimation.catalogue import short_name
 from pipistrelle.experiments.drives import split_at
-from pipistrelle.experiments.hearing.listening import Keep, Progress
+from pipistrelle.experiments.hearing.listening import Progress
 from pipistrelle.experiments.hearing.scenario import ALL_DRAWN, World, caller_labels
 from pipistrelle.experiments.hearing.sound_recorder import SoundRecorder
 from pipistrelle.experiments.hearing.world_folder import kept_world, world_files
@@ -39,11 +38,12 @@ from pipistrelle.experiments.runs.replay import load, log_entry, replay
 from pipistrelle.experiments.runs.trial import Watch, run_mission
 from pipistrelle.experiments.runs.truth_files import truth_files
 from pipistrelle.experiments.runs.validate import checked_scenario, warnings_of
-from pipistrelle.files import LOG, SOUND, WORLD, Kind, OwnFiles, claim, without_links
+from pipistrelle.files import LOG, SOUND, WORLD, OwnFiles, without_links
 from pipistrelle.scripting.arguments import (
     Door,
     check_bag,
     check_open,
+    folder_named,
     frames_named,
     number,
     replayed,
@@ -76,22 +76,11 @@ def simulated(
     strategies: Sequence[Strategy],
     filters: Sequence[str],
     world: World | None = None,
-    *,
-    keep: Keep | None = None,
-    progress: Progress | None = None,
-    watch: Watch | None = None,
+    **conducted: Any,
 ) -> Mission:
     """Simulate a drive and map it by `run_mission`; add warnings to the mission."""
-    config = of_estimators(config, filters)
-    mission = run_mission(
-        config,
-        strategies,
-        filters,
-        world=world or ALL_DRAWN,
-        keep=keep,
-        progress=progress,
-        watch=watch,
-    )
+    config, world = of_estimators(config, filters), world or ALL_DRAWN
+    mission = run_mission(config, strategies, filters, world=world, **conducted)
     assert mission.scenario is not None
     callers = mission.scenario.callers
 
@@ -103,36 +92,31 @@ def simulated(
     return replace(mission, notes=notes)
 
 
-def _far_off(trials: Sequence[TrialResult]) -> list[str]:
-    """Return a warning for each estimate with a position error of many times the bound."""
-    pairs = [
-        (trial, trial.scores.position_rmse_m, trial.scores.position_bound_m) for trial in trials
-    ]
-    return [
-        f"{trial.strategy} {short_name(trial.filter)}: its position error, {error:.3g} m, is "
-        + (f"{error / bound:.1f} times" if bound > 0.0 else "above")
-        + f" the bound, {bound:.3g} m; what serves each estimator is in docs/estimators.md"
-        for trial, error, bound in pairs
-        if error is not None
-        and bound is not None
-        and MAX_TIMES_BOUND * bound + ROUNDING < error < inf
-    ]
+def _far_off(trials: Sequence[TrialResult]) -> Iterator[str]:
+    """Yield a warning for each estimate with a position error of many times the bound."""
+    for trial in trials:
+        error, bound = trial.scores.position_rmse_m, trial.scores.position_bound_m
+        if error is None or bound is None:
+            continue
+        if MAX_TIMES_BOUND * bound + ROUNDING < error < inf:
+            times = f"{error / bound:.1f} times" if bound > 0.0 else "above"
+            yield (
+                f"{trial.strategy} {short_name(trial.filter)}: its position error, {error:.3g} m, "
+                f"is {times} the bound, {bound:.3g} m; what serves each estimator is in "
+                "docs/estimators.md"
+            )
 
 
 def prepare_slam(
-    place: Path,
-    layer: Layer,
-    given: Layer,
-    robot: Robot | None,
-    strategies: Sequence[Strategy],
-    filters: Sequence[str],
-    door: Door,
-) -> tuple[Conduct, list[str], list[str]]:
-    """Read a recorded log and resolve its settings, `layer` overridden by `given`.
+    door: Door, layer: Layer, strategies: Sequence[Strategy], filters: Sequence[str]
+) -> Conduct:
+    """Read a recorded log and resolve its settings; return the function that solves it.
 
-    Returns the function that solves it, notes of its reader, and warnings. Ranges outside the
-    `beamwidth` [deg] of the door about the heading are hidden.
+    The door gets notes of the reader, and warnings. Its flags override `layer`; ranges outside its
+    `beamwidth` [deg] about the heading are hidden.
     """
+    place, robot = folder_named(door.asked["log"], "log"), door.asked["robot"]
+    given = door.flags | door.short()
     check_open(door.flags)
     layer = laid(layer, given)
     check_own(layer)
@@ -147,6 +131,9 @@ def prepare_slam(
     config = of_estimators(config, filters)
     for own, names in each_its_own(config, filters):
         check_memory(names, len(labels_of(recorded)), own, passive=True)
+    for note in recorded.notes:
+        door.note(f"pipistrelle: {place}: {note}")
+    door.warn(*overruled, *log_warnings(recorded, truth, place))
     beam = None if width.value is None else radians(width.value)
 
     def conduct(*, progress: Progress | None = None, watch: Watch | None = None) -> Mission:
@@ -155,8 +142,7 @@ def prepare_slam(
         notes = partial(fit_warnings, recorded, mission.trials, place, config)
         return replace(mission, source=log_entry(place, robot, beam), notes=notes)
 
-    warnings = [*overruled, *log_warnings(recorded, truth, place)]
-    return conduct, [f"{place}: {note}" for note in recorded.notes], warnings
+    return conduct
 
 
 def failures(mission: Mission) -> list[str]:
@@ -260,20 +246,25 @@ class Recordings:
 
     def __init__(self, config: Config, world: World | None, door: Door) -> None:
         self._config, self._world = config, world
-        self._check_apart(door)
-        self._log = self._claimed("save_log", LOG, door)
-        self._drawn = self._claimed("save_world", WORLD, door)
+        seen: dict[Path, str] = {}
+        for name in ("output", "save_log", "save_world", "save_sound"):
+            folder, option = door.folder(name), door.option(name)
+            if folder and (other := seen.setdefault(without_links(folder), option)) != option:
+                raise InputError(f"{option}: {folder} is that of {other}; name another")
+
+        self._log = door.claimed("save_log", LOG)
+        self._drawn = door.claimed("save_world", WORLD)
         self.sound: SoundRecorder | None = None
-        frames, own = door.asked["frames"], self._claimed("save_sound", SOUND, door)
+        frames, own = door.given("frames"), door.claimed("save_sound", SOUND)
         if own is None:
-            if frames is not None:
+            if frames.value is not None:
                 sound = door.option("save_sound")
                 raise InputError(
-                    f"{door.option('frames')}: found {frames}, which is of {sound}; add it"
+                    f"{frames.where}: found {frames.value}, which is of {sound}; add it"
                 )
             return
         count = config.scenario.steps // config.scenario.steps_per_frame
-        chosen = frames_named(frames, count, door.option("frames"))
+        chosen = frames_named(frames, count)
         bits = int(door.asked["sound_bits"])
         self.sound = SoundRecorder(own=own, config=config, frames=chosen, bits=bits)
         self.sound.check_room()
@@ -281,23 +272,6 @@ class Recordings:
             f"{own.folder}: {len(chosen)} frames of {self.sound.channels} channels, "
             f"{self.sound.size / 1e9:.3g} GB"
         )
-
-    @staticmethod
-    def _check_apart(door: Door) -> None:
-        """Raise if two options name the same folder."""
-        seen: dict[Path, str] = {}
-        for name in ("output", "save_log", "save_world", "save_sound"):
-            folder, option = door.folder(name), door.option(name)
-            if folder and (other := seen.setdefault(without_links(folder), option)) != option:
-                raise InputError(f"{option}: {folder} is that of {other}; name another")
-
-    @staticmethod
-    def _claimed(name: str, kind: Kind, door: Door) -> OwnFiles | None:
-        """Claim the folder of an option, if it is given."""
-        folder = door.folder(name)
-        if folder is None:
-            return None
-        return claim(folder, kind, overwrite=door.asked["overwrite"], flags=door.ways_out(name))
 
     def conduct(self, mission_of: Conduct, **watched: Any) -> Mission:
         """Conduct a mission and write its sound meanwhile."""
@@ -315,7 +289,15 @@ class Recordings:
         if self._log is not None:
             self._log.replace(files_of_log(mission))
         if self.sound is not None:
-            self.sound.own.replace(_sound_files(mission, self.sound))
+            assert mission.scenario is not None
+            log = log_files(_log(mission, mission.trials[-1], ()))
+            about = tomllib.loads(log["log.toml"])
+            kept = {name: about[name] for name in about if name not in ("format", "callers")}
+            files: dict[str, Any] = truth_files(mission.drive.truth)
+            files |= {"odometry.csv": log["odometry.csv"]}
+            files |= self.sound.files(mission.scenario, kept)
+            files["recording.toml"] = files.pop("recording.toml")  # written last
+            self.sound.own.replace(files)
 
     def close(self) -> None:
         """Discard the sound that is not yet written as a whole."""
@@ -340,17 +322,6 @@ def files_of_log(mission: Mission) -> dict[str, str]:
     chosen = "fused" if "fused" in strategies else strategies[-1]
     trial = min((t for t in mission.trials if t.strategy == chosen), key=rank)
     return truth_files(mission.drive.truth) | log_files(_log(mission, trial, trial.heard))
-
-
-def _sound_files(mission: Mission, sound: SoundRecorder) -> dict[str, Any]:
-    """Return the files of a recording: the sound, its description, odometry and truth."""
-    log = log_files(_log(mission, mission.trials[-1], ()))
-    about = tomllib.loads(log["log.toml"])
-    kept = {name: value for name, value in about.items() if name not in ("format", "callers")}
-    assert mission.scenario is not None
-    files = sound.files(mission.scenario, kept)
-    last = {"recording.toml": files.pop("recording.toml")}
-    return truth_files(mission.drive.truth) | {"odometry.csv": log["odometry.csv"]} | files | last
 
 
 def _log(mission: Mission, trial: TrialResult, scans: Sequence[Scan]) -> Log:

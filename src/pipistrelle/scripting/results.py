@@ -3,7 +3,7 @@
 import json
 import warnings
 from collections.abc import Callable, Iterable, Sequence
-from contextlib import AbstractContextManager, nullcontext
+from contextlib import AbstractContextManager, closing, nullcontext
 from functools import cached_property, partial
 from io import BytesIO
 from pathlib import Path
@@ -144,10 +144,6 @@ class Results:
         path : Path
             Ends in .gif or .mp4.
 
-        Returns
-        -------
-        Path
-
         Raises
         ------
         InputError
@@ -173,10 +169,6 @@ class Results:
             Replace earlier results in it.
         save_bag : bool
             Write tracks and maps also as a ROS bag, mission.mcap.
-
-        Returns
-        -------
-        Path
 
         Raises
         ------
@@ -305,10 +297,6 @@ def run(
     **settings
         Any other setting.
 
-    Returns
-    -------
-    Results
-
     Raises
     ------
     InputError
@@ -327,15 +315,9 @@ def run(
     if isinstance(landmarks, Iterable) and not isinstance(landmarks, str):
         fix = "places of your own are a world's: write them into one, and name it by world="
         raise refusal("landmarks", shown(landmarks), "the number of landmarks", fix)
-    door = Door(
-        asked=asked,
-        beneath=base_layer(config),
-        flags=from_keywords(settings, run.__kwdefaults__ or ()),
-        default="paper" if isinstance(config, Config) else RUN_NAMES,
-        command="pipistrelle.run(...)",
-        working=lambda *_: nullcontext(progress),
-    )
-    return _announced(run_by, door)
+    flags = from_keywords(settings, run.__kwdefaults__ or ())
+    default = "paper" if isinstance(config, Config) else RUN_NAMES
+    return _called(run_by, asked, flags, command="pipistrelle.run(...)", default=default)
 
 
 def run_by(door: Door) -> Results:
@@ -346,11 +328,8 @@ def run_by(door: Door) -> Results:
     from pipistrelle.scripting.missions import Recordings, simulated
 
     mission_of = partial(simulated, config, strategies, names, world)
-    recordings = Recordings(config, world, door)
-    try:
+    with closing(Recordings(config, world, door)) as recordings:
         return _conducted(mission_of, door, "run", door.working(config, names), recordings)
-    finally:
-        recordings.close()
 
 
 def slam(
@@ -410,41 +389,24 @@ def slam(
     **settings
         Any other setting.
 
-    Returns
-    -------
-    Results
-
     Raises
     ------
     InputError
         For an error in the log, with its line or key; else as `run`.
     """
-    asked = {**locals()}
-    door = Door(
-        asked=asked,
-        beneath=base_layer(config),
-        flags=from_keywords(settings, slam.__kwdefaults__ or ()),
-        command=f"pipistrelle.slam({str(log)!r}, ...)",
-        working=lambda *_: nullcontext(progress),
-    )
-    return _announced(slam_by, door)
+    asked, command = {**locals()}, f"pipistrelle.slam({str(log)!r}, ...)"
+    flags = from_keywords(settings, slam.__kwdefaults__ or ())
+    return _called(slam_by, asked, flags, command=command)
 
 
 def slam_by(door: Door) -> Results:
     """Solve a log as `slam`, called by a door."""
-    asked, place = door.asked, folder_named(door.asked["log"], "log")
     layer, usual = over_named(door.beneath, door.flags)
-    strategies = named_strategies(asked["strategies"])
+    strategies = named_strategies(door.asked["strategies"])
     names = door.estimators(usual or SLAM_TAKES)
     from pipistrelle.scripting.missions import prepare_slam
 
-    given: Layer = door.flags | door.short()
-    mission_of, notes, doubts = prepare_slam(
-        place, layer, given, asked["robot"], strategies, names, door
-    )
-    for note in notes:
-        door.note(f"pipistrelle: {note}")
-    door.warn(*doubts)
+    mission_of = prepare_slam(door, layer, strategies, names)
     return _conducted(mission_of, door, "slam", door.working())
 
 
@@ -457,8 +419,10 @@ def _conducted(
 ) -> Results:
     """Conduct a mission, write its results, and warn; `working` yields the progress function."""
     from pipistrelle.experiments.machine import keep_freed_memory
+    from pipistrelle.experiments.results.writing import result_folder
     from pipistrelle.scripting.missions import filmed, keep
 
+    path, flags = door.folder("output"), door.ways_out("output")
     animate, save_bag, watch = door.asked["animate"], door.asked["save_bag"], None
     if animate:
         from pipistrelle.figures.film import film_writer
@@ -470,7 +434,13 @@ def _conducted(
         from pipistrelle.detection.logs.bag import need_rosbags
 
         need_rosbags(door.option("save_bag"))
-    with _folder(door, name) as own:
+    kept: AbstractContextManager[OwnFiles | None] = nullcontext()
+    if path is not None or door.makes_folder:
+        kept = result_folder(path, name, overwrite=door.asked["overwrite"], flags=flags)
+    elif option := next((one for one in ("animate", "save_bag") if door.asked[one]), None):
+        fix = f"name one by {flags[0]}"
+        raise refusal(option, shown(door.asked[option]), "a result folder for it", fix)
+    with kept as own:
         keep_freed_memory()
         with working as progress:
             asked = {"progress": progress, "watch": watch}
@@ -494,25 +464,20 @@ def _conducted(
     )
 
 
-def _folder(door: Door, name: str) -> AbstractContextManager[OwnFiles | None]:
-    """Return a context that yields the claimed result folder, None if nothing is to be kept."""
-    from pipistrelle.experiments.results.writing import result_folder
-
-    path, flags = door.folder("output"), door.ways_out("output")
-    if path is None and not door.makes_folder:
-        for option in ("animate", "save_bag"):
-            if value := door.asked[option]:
-                fix = f"name one by {flags[0]}"
-                raise refusal(option, shown(value), "a result folder for it", fix)
-        return nullcontext()
-    return result_folder(path, name, overwrite=door.asked["overwrite"], flags=flags)
-
-
-def _announced(conduct_by: Callable[[Door], Results], door: Door) -> Results:
+def _called(
+    conduct_by: Callable[[Door], Results], asked: dict[str, Any], flags: Layer, **more: str
+) -> Results:
     """Conduct a mission from Python: announce the compilation, warn of failed estimates."""
     from pipistrelle.kernel_clock import announce
     from pipistrelle.scripting.missions import failures
 
+    door = Door(
+        asked=asked,
+        beneath=base_layer(asked["config"]),
+        flags=flags,
+        working=lambda *_: nullcontext(asked["progress"]),
+        **more,  # pyrefly: ignore[bad-argument-type]
+    )
     announce()
     results = conduct_by(door)
     door.warn(*failures(results.mission))
@@ -533,10 +498,6 @@ def load(
         folder names runs only if you name it here.
     association : str, optional
         An association of your own, ``module:Class``, under the same condition.
-
-    Returns
-    -------
-    Results or StudyResults
 
     Raises
     ------

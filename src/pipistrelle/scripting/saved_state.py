@@ -13,7 +13,8 @@ checks of bounds, `LAWS` checks the numbers of each record against each other.
 
 import json
 import sys
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import fields, is_dataclass
 from functools import cache
 from hashlib import sha256
@@ -58,6 +59,8 @@ HEAD = b"# Of Pipistrelle: a drive to go on from\n"
 """First line of the file; the second is the checksum of the rest."""
 FORM = 2
 """Version of the file format; 1 was a pickle."""
+ROLES = ("filter", "association")
+"""Keys of the head with the names of estimator and association."""
 OWN = ":"
 """Prefix of the name of a record from a module of the user."""
 DEEPEST = 32
@@ -66,9 +69,7 @@ MOST_SHARED = 1_000_000
 """Largest number of parts that a file may save by sharing. Nodes that repeatedly name each other
 could otherwise have exponentially many parts."""
 _SCALARS = (type(None), bool, int, str)
-_CONTAINERS: dict[str, Callable[..., Any]] = {
-    one.__name__: one for one in (tuple, list, set, frozenset)
-}
+_CONTAINERS = {"tuple": tuple, "list": list, "set": set, "frozenset": frozenset}
 _DTYPES = {
     np.dtype(name).name: np.dtype(name).newbyteorder("<")
     for name in ("?", *np.typecodes["AllInteger"], "e", "f", "d", "F", "D")
@@ -113,29 +114,21 @@ class DriveState(NamedTuple):
     covariances: Float[np.ndarray, "k 3 3"]
 
 
-class Named(NamedTuple):
-    """Names of the estimator and the association of a drive."""
-
-    filter: str
-    association: str
-
-    @property
-    def modules(self) -> set[str]:
-        """Modules of a user's estimator and association."""
-        return {name.partition(":")[0] for name in self if names_class(name)}
+def _modules(names: Sequence[str]) -> set[str]:
+    """Return the modules of a user's estimator and association."""
+    return {name.partition(":")[0] for name in names if names_class(name)}
 
 
-def write_state(path: Path, named: Named, state: DriveState) -> None:
-    """Write the file; replace only a file of `Slam.save`."""
+def write_state(path: Path, names: tuple[str, str], state: DriveState) -> None:
+    """Write the names of estimator and association and the state; replace only such a file."""
+    modules = _modules(names)
     try:
-        nodes = _Nodes(named.modules)
+        nodes = _Nodes(modules)
         nodes.add(state)
-        line = json.dumps(
-            {"form": FORM, "version": find_version(), **named._asdict(), "nodes": nodes.nodes},
-            allow_nan=False,
-        )
+        header = {"form": FORM, "version": find_version(), **dict(zip(ROLES, names, strict=True))}
+        line = json.dumps(header | {"nodes": nodes.nodes}, allow_nan=False)
     except (_UnfitError, RecursionError) as error:
-        own = f" of {' and '.join(sorted(named.modules))}" if named.modules else ""
+        own = f" of {' and '.join(sorted(modules))}" if modules else ""
         expected = f"arrays, numbers, text, containers of them and records{own}"
         fix = "hold it in a dataclass or NamedTuple of that module, or leave it out"
         found = f"a belief or memory with {error}"
@@ -154,44 +147,41 @@ def write_state(path: Path, named: Named, state: DriveState) -> None:
         raise refusal(printable(path), found, "a file", fix) from None
 
 
-def read_state(path: Path, own: Mapping[str, str | None]) -> tuple[Named, DriveState]:
-    """Read the file; return its estimator and association, and its contents.
-
-    ``own``: estimator and association that the caller trusts, by the names of the options.
-    """
-    data = read_named(path, "a file of Slam.save")
-    found = "a file that Slam.save did not write"
-    if data.startswith(HEAD):
-        sum_, _, body = data[len(HEAD) :].partition(b"\n")
-        if sum_ == sha256(body).hexdigest().encode():
-            return _content(path, body, own)
-        found = "a file that has changed since Slam.save wrote it"
-    raise refusal(path, found, "one of Slam.save, as it was written", "name another")
-
-
-def not_saved(path: Path, error: Exception) -> InputError:
-    """Return the error for a file with a right checksum and wrong contents."""
-    found = f"what Slam.save did not write ({type(error).__name__})"
-    return refusal(path, found, "one of Slam.save, as it was written", "name another")
-
-
-def _content(path: Path, body: bytes, own: Mapping[str, str | None]) -> tuple[Named, DriveState]:
-    """Parse the body of the file, which may be forged."""
-    line, _, data = body.partition(b"\n")
+@contextmanager
+def refused_if_forged(path: Path) -> Iterator[None]:
+    """Raise an `InputError` for any failure by a file with a right checksum and wrong contents."""
     try:
-        header = json.loads(line, parse_constant=_no_number)
-        named = _checked_header(path, header, own)
-        state = _Read(data, named.modules).all(header["nodes"])
-        if type(state) is not DriveState:
-            raise TypeError(type(state).__name__)
+        yield
     except InputError:
         raise
     except Exception as error:
-        raise not_saved(path, error) from None
-    return named, state
+        found = f"what Slam.save did not write ({type(error).__name__})"
+        raise refusal(path, found, "one of Slam.save, as it was written", "name another") from None
 
 
-def _checked_header(path: Path, header: Any, own: Mapping[str, str | None]) -> Named:
+def read_state(path: Path, own: Mapping[str, str | None]) -> tuple[tuple[str, str], DriveState]:
+    """Read the file, which may be forged; return the names of `write_state` and the state.
+
+    ``own``: estimator and association that the caller trusts, by the names of the options. Call it
+    within `refused_if_forged`.
+    """
+    data = read_named(path, "a file of Slam.save")
+    sum_, _, body = data[len(HEAD) :].partition(b"\n")
+    if not data.startswith(HEAD) or sum_ != sha256(body).hexdigest().encode():
+        found = "a file that Slam.save did not write"
+        if data.startswith(HEAD):
+            found = "a file that has changed since Slam.save wrote it"
+        raise refusal(path, found, "one of Slam.save, as it was written", "name another")
+    line, _, arrays = body.partition(b"\n")
+    header = json.loads(line, parse_constant=_no_number)
+    names = _checked_names(path, header, own)
+    state = _Read(arrays, _modules(names)).all(header["nodes"])
+    if type(state) is not DriveState:
+        raise TypeError(type(state).__name__)
+    return names, state
+
+
+def _checked_names(path: Path, header: Any, own: Mapping[str, str | None]) -> tuple[str, str]:
     """Raise for a file of another version, or of a user's class that the caller does not name."""
     here, written = find_version(), header["version"]
     if written != here or header.get("form", 1) != FORM:
@@ -199,16 +189,14 @@ def _checked_header(path: Path, header: Any, own: Mapping[str, str | None]) -> N
         found += " in an earlier form" if written == here else ""
         fix = "load it with the Pipistrelle that wrote it, or drive on from a new start"
         raise refusal(path, shown(found)[1:-1], f"one of {here}", fix)
-    named = Named(header["filter"], header["association"])
     ours = (CATALOGUE, (KNOWN, *METHODS))
-    for (key, asked), name, word, known in zip(
-        own.items(), named, Named._fields, ours, strict=True
-    ):
+    for (key, asked), role, known in zip(own.items(), ROLES, ours, strict=True):
+        name = header[role]
         if not isinstance(name, str) or (name != asked if asked else name not in known):
             expected = f"one by {asked}" if asked else "one of this package"
             fix = f"if you trust the file and that class, load(..., {key}={shown(name)})"
-            raise refusal(path, f"a drive by the {word} {shown(name)}", expected, fix)
-    return named
+            raise refusal(path, f"a drive by the {role} {shown(name)}", expected, fix)
+    return header["filter"], header["association"]
 
 
 def _no_number(word: str) -> None:
@@ -278,26 +266,23 @@ class _Read:
     def __init__(self, data: bytes, modules: Collection[str]) -> None:
         self._data, self._at, self._modules = data, 0, modules
         self._dtypes = _DTYPES if modules else _OURS
-        self._values: list[Any] = []
-        self._depths: list[int] = []
-        self._sizes: list[int] = []
-        """Number of parts of each value, including nested ones."""
-        self._parts = self._walked = 0
+        self._nodes: list[tuple[Any, int, int]] = []
+        """Value, depth and number of parts of each node, including nested ones."""
+        self._depth = self._walked = self._most = 0
 
     def all(self, nodes: list[Any]) -> Any:
         """Read all nodes; return the value of the last."""
+        self._most = DEEPEST * (sum(map(len, nodes)) + MOST_SHARED)
         for kind, *rest in nodes:
             self._depth, before = 0, self._walked
-            self._parts += 1 + len(rest)
             self._walked += 1 + len(rest)
-            self._values.append(self._value(kind, rest))
+            value = self._value(kind, rest)
             if self._depth >= DEEPEST:
                 raise ValueError("too deep")
-            self._depths.append(1 + self._depth)
-            self._sizes.append(self._walked - before)
+            self._nodes.append((value, 1 + self._depth, self._walked - before))
         if self._at != len(self._data):
             raise ValueError("bytes of no array")
-        return self._values[-1]
+        return self._nodes[-1][0]
 
     def _value(self, kind: str, rest: list[Any]) -> Any:
         """Return the value of a node."""
@@ -319,13 +304,13 @@ class _Read:
                 raise TypeError(type(part).__name__)
             return part
         (number,) = part
-        if type(number) is not int or not 0 <= number < len(self._values):
+        if type(number) is not int or number < 0:
             raise IndexError(number)
-        self._depth = max(self._depth, self._depths[number])
-        self._walked += self._sizes[number]
-        if self._walked > DEEPEST * (self._parts + MOST_SHARED):
+        value, depth, size = self._nodes[number]
+        self._depth, self._walked = max(self._depth, depth), self._walked + size
+        if self._walked > self._most:
             raise ValueError("too many parts")
-        return self._values[number]
+        return value
 
     def _record(self, name: str, *parts: Any) -> Any:
         """Construct and check a record."""
@@ -384,10 +369,8 @@ def _fields_of(kind: Any) -> tuple[str, ...]:
     return kind._fields
 
 
-@cache
-def _hints_of(kind: Any) -> dict[str, Any]:
-    """Return the annotations of the fields of a record."""
-    return get_type_hints(kind)
+_hints_of = cache(get_type_hints)
+"""Returns the annotations of the fields of a record."""
 
 
 def _check(record: Any, name: str) -> None:
@@ -445,9 +428,8 @@ def check_going_on(start: SessionState, state: SessionState, *, own: bool) -> No
     beliefs += [state.open[0]] if state.open else []
     first = start.belief
     for belief in () if own else beliefs:
-        same = type(belief) is type(first) and getattr(first, "error", 0) == getattr(
-            belief, "error", 0
-        )
+        same = type(belief) is type(first)
+        same = same and getattr(first, "error", 0) == getattr(belief, "error", 0)
         if isinstance(first, SmootherBelief) and same:
             old, new = first.history.calibration, belief.history.calibration
             same = (first.noise, first.rays, old.names) == (belief.noise, belief.rays, new.names)
@@ -455,20 +437,13 @@ def check_going_on(start: SessionState, state: SessionState, *, own: bool) -> No
                 same = same and np.array_equal(getattr(old, name), getattr(new, name))
         if not same:
             raise ValueError("another estimator")
-    memories = [state.memory, *(heard.memory for heard in state.past)]
-    of_ours = (type(None), Memory)
-    if isinstance(start.memory, of_ours) and any(
-        type(m) is not type(start.memory) for m in memories
-    ):
+    kinds = {type(memory) for memory in (state.memory, *(heard.memory for heard in state.past))}
+    if isinstance(start.memory, Memory | None) and kinds != {type(start.memory)}:
         raise ValueError("another association")
 
 
 def within(values: Any, low: Any, high: Any) -> bool:
-    """Return whether all integers are in low <= n < high.
-
-    >>> within(np.array([0, 2]), 0, 3), within([3], 0, 3)
-    (True, False)
-    """
+    """Return whether all integers are in low <= n < high."""
     array = np.asarray(values)
     return bool(np.all((array >= low) & (array < high)))
 
@@ -517,13 +492,13 @@ def _ekf(belief: EkfBelief) -> bool:
 
 
 def _fastslam(belief: FastSlamBelief) -> Any:
-    """Blocks have room for all particles, and particles for all members of landmarks."""
+    """Blocks have room for all particles, particles for all members, which are numbers."""
     blocks, landmarks, lanes = belief.count.shape
     room = np.diff(belief.first)
     if {room.size, belief.landmark.size, belief.best_count.size} != {landmarks}:
         return False
     rows = belief.member.shape[1], len(belief.best_member)
-    return (
+    sound = (
         lanes == LANES
         and blocks == -(-belief.log_weight.size // LANES) > 0
         and (belief.poses.shape, belief.member.shape[2]) == ((blocks, 9 * LANES), 6 * LANES)
@@ -536,13 +511,10 @@ def _fastslam(belief: FastSlamBelief) -> Any:
         and _is_pose(belief.estimate)
         and _finite(belief.poses)
         and not np.isnan(belief.log_weight).any()
-        and _members_are_numbers(belief, room)
     )
-
-
-def _members_are_numbers(belief: FastSlamBelief, room: Any) -> bool:
-    """Return whether all members in use are numbers; the other rows are unwritten."""
-    blocks, c = belief.member.shape[0], int(belief.first[-1])
+    if not sound:
+        return False
+    c = int(belief.first[-1])  # the rows of members that are not in use are unwritten
     place = np.arange(c) - np.repeat(belief.first[:-1], room)
     best = belief.best_member[:c][place < np.repeat(belief.best_count, room)]
     used = place[:, None] < np.repeat(belief.count, room, axis=1)
@@ -590,7 +562,7 @@ def _history(history: History) -> Any:
         and np.array_equal(np.sort(in_chain), POSE + CALLER * np.arange(callers))
         and within(history.latest, -1, history.rows.size)
         and within(history.heard[:, 1], -1, nodes)
-        and np.all((history.heard[:, 0] == NEVER) | within_each(history.heard[:, 0], nodes))
+        and within(history.heard[history.heard[:, 0] != NEVER, 0], 0, nodes)
         and within(history.moves, 0, 2)
         and _has_shapes(history.known, (placed, 2), (placed, 3))
         and (history.leaves.size, history.first.size) == (placed, callers)
@@ -673,11 +645,6 @@ def _stretches(
             return False
         least = w
     return True
-
-
-def within_each(values: Any, high: int) -> Any:
-    """Return the mask of integers in 0 <= n < high."""
-    return (values >= 0) & (values < high)
 
 
 LAWS: dict[Any, Callable[[Any], Any]] = {

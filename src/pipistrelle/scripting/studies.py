@@ -171,10 +171,6 @@ def study(
     **settings
         Settings that override the plan's.
 
-    Returns
-    -------
-    StudyResults
-
     Raises
     ------
     InputError

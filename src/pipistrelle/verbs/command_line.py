@@ -2,7 +2,8 @@
 
 from collections.abc import Sequence
 from errno import ENOSPC
-from inspect import Parameter, signature
+from inspect import Parameter as Argument
+from inspect import signature
 from itertools import pairwise, zip_longest
 from pathlib import Path
 
@@ -10,6 +11,7 @@ from cyclopts import (
     App,
     CycloptsError,
     MissingArgumentError,
+    Parameter,
     UnknownOptionError,
     UnusedCliTokensError,
 )
@@ -37,33 +39,27 @@ app = App(
     print_error=False,
     result_action="return_value",
     suppress_keyboard_interrupt=False,
+    default_parameter=Parameter(
+        negative=(), show_default=lambda value: str(value) if value else None
+    ),
 )
 config = App(name="config", help="Print the settings, or their schema.")
 for parent, name, place, words in (
-    (app, "run", "missions:run", "Simulate a drive through a random world and map it."),
-    (
-        app,
-        "slam",
-        "missions:slam",
-        "Solve a recorded log: a log folder, ROS bag or MRCLAM folder.",
-    ),
-    (app, "hear", "hear:hear", "Detect the echoes in a sound recording, as a log for slam."),
-    (app, "view", "view:view", "Play a mission in a browser, on one page that needs no network."),
-    (app, "study", "study:study", "Run all cases of a plan in many worlds, or continue a study."),
-    (
-        app,
-        "report",
-        "compare:report",
-        "Write a study as one page: answer, figures, claims.",
-    ),
-    (app, "compare", "compare:compare", "Compare the results of runs, logs or studies."),
-    (app, "array", "view:array", "Draw a microphone array; print its ambiguous bearings."),
-    (config, "show", "missions:show", "Print the settings of `run` as TOML."),
-    (config, "schema", "missions:schema", "Print the JSON schema of the settings."),
-    (app, "doctor", "doctor:doctor", "Check the installation, and print the fix of each problem."),
+    (app, "run", "missions", "Simulate a drive through a random world and map it."),
+    (app, "slam", "missions", "Solve a recorded log: a log folder, ROS bag or MRCLAM folder."),
+    (app, "hear", "missions", "Detect the echoes in a sound recording, as a log for slam."),
+    (app, "view", "view", "Play a mission in a browser, on one page that needs no network."),
+    (app, "study", "study", "Run all cases of a plan in many worlds, or continue a study."),
+    (app, "report", "compare", "Write a study as one page: answer, figures, claims."),
+    (app, "compare", "compare", "Compare the results of runs, logs or studies."),
+    (app, "array", "view", "Draw a microphone array; print its ambiguous bearings."),
+    (config, "show", "missions", "Print the settings of `run` as TOML."),
+    (config, "schema", "missions", "Print the JSON schema of the settings."),
+    (app, "doctor", "doctor", "Check the installation, and print the fix of each problem."),
 ):
     epilogue = SPELLINGS if name in ("run", "slam", "hear", "study", "show") else None
-    parent.command(f"pipistrelle.verbs.{place}", name=name, help=words, help_epilogue=epilogue)
+    verb = f"pipistrelle.verbs.{place}:{name}"
+    parent.command(verb, name=name, help=words, help_epilogue=epilogue)
 app.command(config)
 
 
@@ -84,7 +80,11 @@ def obey(words: Sequence[str], heard: Sequence[int] = ()) -> int:
     try:
         _refuse_empty(words)
         _refuse_sections(words)
-        status = app(_completed(words)) or 0
+        completed = [  # a bare --animate is of a GIF
+            "--animate=gif" if word == "--animate" and after not in FILMS else word
+            for word, after in zip_longest(words, words[1:])
+        ]
+        status = app(completed) or 0
         flush_results()
     except SystemExit:  # help, if its reader has left
         return 0
@@ -105,10 +105,11 @@ def _refuse_empty(words: Sequence[str]) -> None:
         if not word or (flag.startswith("-") and given and not value):
             from pipistrelle.config import InputError
 
-            where = flag if given else before
-            raise InputError(
-                f"{where}: found '', expected a value (for the folder that you are in: .)"
+            where, expected = (
+                flag if given else before,
+                "a value (for the folder that you are in: .)",
             )
+            raise InputError(f"{where}: found '', expected {expected}")
 
 
 def _refuse_sections(words: Sequence[str]) -> None:
@@ -134,14 +135,6 @@ def _sections() -> dict[str, list[str]]:
         if rest and section != "filter":
             sections.setdefault(section, []).append(rest[0].replace("_", "-"))
     return sections
-
-
-def _completed(words: Sequence[str]) -> list[str]:
-    """Add the format to a bare ``--animate``."""
-    return [
-        "--animate=gif" if word == "--animate" and after not in FILMS else word
-        for word, after in zip_longest(words, words[1:])
-    ]
 
 
 def _explained(error: Exception, words: Sequence[str]) -> str | None:
@@ -189,7 +182,7 @@ def _too_many(error: UnusedCliTokensError, word: str, words: Sequence[str]) -> s
     if ("--animate", word) in pairwise(words):
         return f"--animate: found {word!r}, expected {' or '.join(FILMS)}"
     verb, kinds = " ".join(error.command_chain or ()), signature(error.target or obey).parameters
-    takes = sum(kind.kind is Parameter.POSITIONAL_ONLY for kind in kinds.values())
+    takes = sum(kind.kind is Argument.POSITIONAL_ONLY for kind in kinds.values())
     if verb == "run" and (what := recording_of(Path(word))):
         return f"run: found {word!r}, {what}; run makes up its own sound, and slam solves a log"
     most = "no arguments" if not takes else "one argument" if takes == 1 else f"{takes} arguments"

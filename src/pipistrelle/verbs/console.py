@@ -34,11 +34,7 @@ def command_line() -> str:
 
 @contextmanager
 def announced(message: str, after: float = 3.0) -> Iterator[None]:
-    """Print a message if the body of the context takes longer than `after` seconds.
-
-    >>> with announced("Drawing mission.gif ..."):
-    ...     pass
-    """
+    """Print a message if the body of the context takes longer than `after` seconds."""
     timer = Timer(after, say, (message,))
     timer.daemon = True
     timer.start()
@@ -49,52 +45,47 @@ def announced(message: str, after: float = 3.0) -> Iterator[None]:
 
 
 @contextmanager
+def bars(quiet: bool, width: int) -> "Iterator[Callable[[str, int, int, str], None] | None]":
+    """Yield a function that draws a bar, given its name, steps done, their total, and a text.
+
+    None if it is `quiet`, or standard error is no terminal. `width` is of the column of names.
+    """
+    if quiet or not sys.stderr.isatty():
+        yield None
+        return
+    from rich.console import Console
+    from rich.progress import BarColumn, Progress, TextColumn
+
+    names, texts = TextColumn(f"{{task.description:<{width}}}"), TextColumn("{task.fields[text]}")
+    tasks = {}
+    with Progress(names, BarColumn(), texts, console=Console(stderr=True)) as shown:
+
+        def draw(name: str, done: int, total: int, text: str) -> None:
+            if name not in tasks:
+                tasks[name] = shown.add_task(name, total=total, text="")
+            shown.update(tasks[name], completed=done, text=text)
+
+        yield draw
+
+
+@contextmanager
 def progress(quiet: bool) -> "Iterator[Progress]":
     """Yield a function that shows a line per stage: its frames done, and frames per second.
 
     It takes the stage, the frames done and their total. On a terminal the line moves; elsewhere it
     is printed at the end of the stage.
-
-    >>> with progress(quiet=True) as show:
-    ...     show("fused ekf", 375, 375)
     """
-    if quiet:
-        yield lambda stage, done, total: None
-    elif sys.stderr.isatty():
-        with _bars() as show:
-            yield show
-    else:
-        yield _lines()
-
-
-def _lines() -> "Progress":
-    """Return a function that prints each stage at its end."""
     elapsed = _stopwatch()
-
-    def show(stage: str, done: int, total: int) -> None:
-        rate = _rate(done, elapsed(stage))
-        if done == total:
-            say(f"{stage:<17}{rate}")
-
-    return show
-
-
-@contextmanager
-def _bars() -> "Iterator[Progress]":
-    """Yield a function that draws a moving bar per stage."""
-    from rich.console import Console
-    from rich.progress import BarColumn, TextColumn
-    from rich.progress import Progress as Bars
-
-    elapsed, tasks = _stopwatch(), {}
-    columns = (TextColumn("{task.description:<17}"), BarColumn(), TextColumn("{task.fields[rate]}"))
-    with Bars(*columns, console=Console(stderr=True)) as bars:
+    with bars(quiet, 17) as draw:
 
         def show(stage: str, done: int, total: int) -> None:
-            rate = _rate(done, elapsed(stage))
-            if stage not in tasks:
-                tasks[stage] = bars.add_task(stage, total=total, rate="")
-            bars.update(tasks[stage], completed=done, rate=rate)
+            time = elapsed(stage)
+            speed = f", {done / time:.0f} frames/s" if time > 0 and done else ""
+            rate = f"{done:>5} frames{speed}"
+            if draw is not None:
+                draw(stage, done, total, rate)
+            elif done == total and not quiet:
+                say(f"{stage:<17}{rate}")
 
         yield show
 
@@ -112,12 +103,6 @@ def _stopwatch() -> Callable[[str], float]:
         return latest - begin
 
     return elapsed
-
-
-def _rate(frames: int, elapsed: float) -> str:
-    """Format the number of frames done and their rate."""
-    speed = f", {frames / elapsed:.0f} frames/s" if elapsed > 0 and frames else ""
-    return f"{frames:>5} frames{speed}"
 
 
 def closing_table(

@@ -22,8 +22,6 @@ def doctor(
         bool,
         Parameter(
             name="--compile",
-            negative=(),
-            show_default=False,
             help="Compile the kernels of all estimators, with and without labels, so that no later "
             "run, slam or study waits for them; some minutes.",
         ),

@@ -1,16 +1,17 @@
-"""`pipistrelle run`, `slam` and `config`: simulated missions, recorded logs, settings."""
+"""`pipistrelle run`, `slam`, `hear` and `config`: missions, recorded logs and sound, settings."""
 
 import json
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, nullcontext
+from functools import partial
 from pathlib import Path
 from typing import Any
 
-from pipistrelle.config import Config
+from pipistrelle.config import Config, InputError
 from pipistrelle.detection.logs.readers import READERS, ROS_BAG
 from pipistrelle.experiments.named_settings import over_named
 from pipistrelle.refusals import refusal
-from pipistrelle.scripting import arguments, results
+from pipistrelle.scripting import arguments, hearing, results
 from pipistrelle.scripting.arguments import GATE_KEY, TIMING, is_open, mission_settings
 from pipistrelle.settings import Layer, resolve
 from pipistrelle.verbs.console import closing_table, progress, text_table
@@ -52,36 +53,31 @@ MISSION = ("config", "beamwidth", "landmarks", "duration", "engine", "particles"
 """Parameters of `run` that affect the settings."""
 
 
+@contextmanager
+def working(quiet: bool, *kernels: Any) -> Iterator[Callable[..., None]]:
+    """Yield the function that shows progress; announce the compilation unless `quiet`.
+
+    `kernels`: the settings and the estimators of kernels to compile first, in two processes.
+    """
+    from pipistrelle.experiments.runs.compiling import in_two_processes
+    from pipistrelle.kernel_clock import announce
+
+    tell = None if quiet else say
+    announce(tell)
+    compiled = in_two_processes(tell, *kernels) if kernels else nullcontext()
+    with compiled, progress(quiet) as show:
+        yield show
+
+
 def _run(asked: dict[str, Any]) -> int:
     """Simulate a mission; print its scores and its folder."""
-
-    @contextmanager
-    def working(config: Config, filters: Sequence[str]) -> Iterator[Callable[..., None]]:
-        from pipistrelle.experiments.runs.compiling import in_two_processes
-        from pipistrelle.kernel_clock import announce
-
-        announce(None if asked["quiet"] else say)
-        with (
-            in_two_processes(None if asked["quiet"] else say, config, filters),
-            progress(asked["quiet"]) as show,
-        ):
-            yield show
-
-    return _delivered(results.run_by(door_of(asked, working=working)), asked["quiet"])
+    door = door_of(asked, working=partial(working, asked["quiet"]))
+    return _delivered(results.run_by(door), asked["quiet"])
 
 
 def _slam(asked: dict[str, Any]) -> int:
     """Solve a log; print its scores and its folder, or the topics of a bag."""
-
-    @contextmanager
-    def working() -> Iterator[Callable[..., None]]:
-        from pipistrelle.kernel_clock import announce
-
-        announce(None if asked["quiet"] else say)
-        with progress(asked["quiet"]) as show:
-            yield show
-
-    door = door_of(asked, working=working)
+    door = door_of(asked, working=partial(working, asked["quiet"]))
     if asked["topics"]:
         return _list_topics(asked["log"], over_named(door.beneath)[0] | door.flags | door.short())
     return _delivered(results.slam_by(door), asked["quiet"])
@@ -128,6 +124,28 @@ def _list_topics(path: Path, layer: Layer) -> int:
     return 0
 
 
+def _hear(asked: dict[str, Any]) -> int:
+    """Detect the echoes of a recording; print the number of rows and the folder of the log."""
+    recording, door = asked["recording"], door_of(asked, working=partial(working, asked["quiet"]))
+    config = hearing.heard_settings(door.flags)
+    if asked["check"]:
+        faults = hearing.faults_of(recording, config)
+        put("\n".join(faults) or "nothing odd was found")
+        if faults:
+            warn(f"{recording}: found {len(faults)} fault{'s' * (len(faults) > 1)}")
+        return 1 if faults else 0
+    hearing.described(recording)
+    if asked["output"] is None:
+        raise InputError("hear: found no folder for the log; name one with -o LOG")
+    heard = hearing.hear_by(door)
+    if outside := heard.log.rows - heard.log.inside:
+        warn(f"{recording}: {outside} rows are before or after the odometry, and left out by slam")
+    if not asked["quiet"]:
+        put(f"{heard.log.rows} rows")
+    put(heard.folder)
+    return 0
+
+
 def _show(asked: dict[str, Any]) -> None:
     """Print the settings of a mission as TOML."""
     import numpy as np
@@ -161,5 +179,19 @@ slam = verb_of(
     extra=[
         switch("topics", "List the topics of a ROS bag and their roles; do nothing else."),
         QUIET,
+    ],
+)
+hear = verb_of(
+    hearing.hear,
+    _hear,
+    settings=setting_flags(hearing.is_heard),
+    options={"frames": ("A:B", "all"), "output": ("LOG", "")},
+    extra=[
+        switch(
+            "check",
+            "Look for faults instead: silent or clipped channels, a wrong sample rate, calls that "
+            "jump, exchanged channels and faces.",
+        ),
+        switch("quiet", "Print only the folder of the log."),
     ],
 )

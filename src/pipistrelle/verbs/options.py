@@ -7,7 +7,6 @@ from inspect import Signature, cleandoc, signature
 from pathlib import Path
 from types import MappingProxyType, NoneType
 from typing import (
-    TYPE_CHECKING,
     Annotated,
     Any,
     Literal,
@@ -43,8 +42,12 @@ OMITTED = ("progress", "settings")
 """Parameters of Python without a flag of their name."""
 OTHER_DEFAULTS = ("shard", "workers")
 """Parameters without the default of Python."""
-FLAGS = {"strategies": "--strategy", "filters": "--filter"}
-"""Flags that are spelt differently from their parameters."""
+FLAGS = {
+    "strategies": ("--strategy",),
+    "filters": ("--filter", "--estimator"),
+    "output": ("--output", "-o"),
+}
+"""Flags that are spelt differently from their parameters, or in several ways."""
 
 
 def _whole(_: Any, tokens: Sequence[Any]) -> int:
@@ -56,11 +59,6 @@ def _whole(_: Any, tokens: Sequence[Any]) -> int:
 
 
 Whole = Annotated[int, Parameter(converter=_whole)]
-
-
-def _as_written(_: Any, tokens: Sequence[Any]) -> Any:
-    """Parse a TOML value on one line."""
-    return from_text(tokens[0].value)
 
 
 def _robot(_: Any, tokens: Sequence[Any]) -> int | str:
@@ -90,16 +88,12 @@ class _Everything:
 EVERYTHING: Any = _Everything()
 """Set by ``--help-all``, read when the help is printed."""
 
-if TYPE_CHECKING:
-    ChosenFilter = str
-else:  # the help lists these names
-    ChosenFilter = Annotated[Literal[(*CATALOGUE, *GROUPS)] | str, Parameter(metavar="CHOICE")]
+_LITERAL: Any = Literal
 NamedSettings = Annotated[
     list[str] | None,
     Parameter(
         name=("--settings", "--config"),
         metavar="NAME|FILE",
-        negative=(),
         help=f"Settings to start from: {', '.join(NAMES)}, or a TOML file as `pipistrelle config "
         "show` prints it. A file overrides a name; give both by two --settings.",
     ),
@@ -107,14 +101,13 @@ NamedSettings = Annotated[
 _KINDS: dict[str, Any] = {
     "config": NamedSettings,
     "strategies": Literal["active", "fused", "passive", "all"],
-    "filters": ChosenFilter | None,
+    "filters": _LITERAL[(*CATALOGUE, *GROUPS)] | str | None,
     "robot": Annotated[int | str | None, Parameter(converter=_robot, n_tokens=1)],
     "shard": str | None,
     "workers": Whole | None,
     "plan": str,
 }
 """Types of parameters on the command line, where they differ from Python's."""
-_ALL_NAMES = {"filters": ("--filter", "--estimator"), "output": ("--output", "-o")}
 
 
 def verb_of(
@@ -129,28 +122,25 @@ def verb_of(
     """Return a verb of the command line with the parameters and the help of a Python function.
 
     `act` receives the arguments by name. `options` gives the placeholder of parameters in the help,
-    the text of their default, and perhaps other help than Python's. `settings` is the type of the
-    flags of settings, `extra` are parameters that only the command line has, and `only` selects
-    parameters of the function.
+    the text of their default, and perhaps other help than Python's; `only` selects parameters.
     """
     hints, arguments = get_type_hints(function), []
     for name, argument in signature(function).parameters.items():
         if name in OMITTED or (only and name not in only):
             continue
         metavar, default, *words = options.get(name, ("", ""))
-        other_help: Any = {"help": words[0]} if words else {}
-        kind, positional = _kind(name, hints[name]), argument.kind is Argument.POSITIONAL_ONLY
-        if name == "config":
-            positional = False
-        else:
-            flag = Parameter(
-                name=None if positional else _ALL_NAMES.get(name, FLAGS.get(name)),
-                **other_help,
-                metavar=metavar or None,
-                negative=(),
-                show_default=default or argument.default not in (None, False),
-            )
-            kind = Annotated[kind, flag]
+        more: dict[str, Any] = {"help": words[0]} if words else {}
+        if default:
+            more["show_default"] = default
+        positional = argument.kind is Argument.POSITIONAL_ONLY and name != "config"
+        kind, kinds = _KINDS.get(name, hints[name]), get_args(hints[name])
+        if name not in _KINDS and Path in kinds:
+            kind = Path | None if NoneType in kinds else Path
+        elif set(kinds) == {int, NoneType}:
+            kind = Whole | None
+        if name != "config":
+            names = None if positional else FLAGS.get(name)
+            kind = Annotated[kind, Parameter(name=names, metavar=metavar or None, **more)]
         value = None if name in OTHER_DEFAULTS else argument.default
         where = Argument.POSITIONAL_ONLY if positional else Argument.KEYWORD_ONLY
         arguments.append(Argument(name, where, default=value, annotation=kind))
@@ -185,19 +175,9 @@ def _rejoined(text: str) -> str:
     return "\n".join(lines)
 
 
-def _kind(name: str, hint: Any) -> Any:
-    """Return the type of a parameter on the command line."""
-    kinds = get_args(hint)
-    if name in _KINDS:
-        return _KINDS[name]
-    if Path in kinds:
-        return Path | None if NoneType in kinds else Path
-    return Whole | None if set(kinds) == {int, NoneType} else hint
-
-
 def switch(name: str, words: str) -> Argument:
     """Return a switch that only the command line has, with its help."""
-    kind = Annotated[bool, Parameter(help=words, negative=(), show_default=False)]
+    kind = Annotated[bool, Parameter(help=words)]
     return Argument(name, Argument.KEYWORD_ONLY, default=False, annotation=kind)
 
 
@@ -207,10 +187,10 @@ def spell(name: str, value: str = "") -> str:
     >>> spell("save_log", "DIR"), spell("overwrite", "True")
     ('--save-log DIR', '--overwrite')
     """
-    flag = FLAGS.get(name, f"--{name.replace('_', '-')}")
+    flag, *short = FLAGS.get(name, (f"--{name.replace('_', '-')}",))
     if value in ("", "True"):
         return flag
-    return f"-o {value}" if name == "output" else f"{flag} {value}"
+    return f"{short[0] if name == 'output' else flag} {value}"
 
 
 def door_of(asked: Mapping[str, Any], **more: Any) -> Door:
@@ -221,7 +201,7 @@ def door_of(asked: Mapping[str, Any], **more: Any) -> Door:
         more |= {"note": say, "drawing": announced}
     return Door(
         asked=asked,
-        beneath=layers(asked["config"], None),
+        beneath=layers(asked["config"], None) if "config" in asked else {},
         flags=from_flags(asked["settings"] or {}),
         command=command_line(),
         option=spell,
@@ -243,7 +223,6 @@ def setting_flags(
     ['air', 'association', 'assumed']
     """
     sections: dict[str, dict[str, Any]] = {}
-    top: dict[str, Any] = {}
     for key, field in known_settings().items():
         if key == SETTINGS:
             continue  # --settings takes files also
@@ -253,23 +232,22 @@ def setting_flags(
         settled = "" if value in (None, ()) else f"[default: {' '.join(texts)}]"
         words = " ".join(f"{field.description or ''} {settled}".split())
         show = shown(key) and (key == ("seed",) or EVERYTHING)
-        flag = Parameter(help=words, show=show, negative=(), consume_multiple=True)
         kind: Any = Whole if field.annotation is int else _unbounded(field.annotation)
-        if key in _METAVARS:
-            metavar = _METAVARS[key]
-            kind = Annotated[Any, Parameter(converter=_as_written, n_tokens=1, metavar=metavar)]
-        elif field.annotation is bool:
-            kind = Annotated[
-                Any, Parameter(converter=_as_written, n_tokens=1, metavar="true|false")
-            ]
-        if len(key) == 1:
-            top[key[0]] = Annotated[kind, flag]
-        else:
-            group = Parameter(group=_section_group(key[0]))
-            sections.setdefault(key[0], {})[key[1]] = Annotated[kind, flag, group]
+        if metavar := "true|false" if field.annotation is bool else _METAVARS.get(key):
+            as_written = Parameter(
+                converter=lambda _, tokens: from_text(tokens[0].value), n_tokens=1, metavar=metavar
+            )
+            kind = Annotated[Any, as_written]
+        flag = Annotated[kind, Parameter(help=words, show=show, consume_multiple=True)]
+        sections.setdefault("".join(key[:-1]), {})[key[-1]] = flag
     record: Any = TypedDict
-    nested = {name: record(name, table, total=False) for name, table in sections.items()}
-    return record("Settings", top | nested, total=False)
+    flags = sections.pop("")
+    for place, (name, table) in enumerate(sections.items()):
+        meaning = " ".join((type(getattr(Config(), name)).__doc__ or "").split())
+        panel = Parameter(group=Group(f"Settings: {name}", help=meaning, sort_key=place))
+        table = {leaf: Annotated[flag, panel] for leaf, flag in table.items()}
+        flags[name] = record(name, table, total=False)
+    return record("Settings", flags, total=False)
 
 
 def _unbounded(kind: Any) -> Any:
@@ -284,20 +262,7 @@ def _unbounded(kind: Any) -> Any:
     return record[tuple(parts)] if get_origin(kind) is tuple else kind
 
 
-def _section_group(section: str) -> Group:
-    """Return the help panel of a section of settings, in the order of `Config`."""
-    order = list(Config.model_fields).index(section)
-    meaning = type(getattr(Config(), section)).__doc__ or ""
-    return Group(f"Settings: {section}", help=" ".join(meaning.split()), sort_key=order)
-
-
-if TYPE_CHECKING:
-    SettingFlags = dict[str, Any]
-else:
-    SettingFlags = setting_flags()
-
-
-def layers(named: Sequence[str] | None, settings: SettingFlags | None) -> Layer:
+def layers(named: Sequence[str] | None, settings: Mapping[str, Any] | None) -> Layer:
     """Merge presets, files, environment variables and flags to settings.
 
     >>> layers(None, {"seed": 3})["seed",].value

@@ -21,8 +21,6 @@ def hold_streams() -> None:
 
     Otherwise the next opened file would get the number of a closed stream, and messages would be
     written into it.
-
-    >>> hold_streams()
     """
     for number in range(3):
         try:
@@ -46,10 +44,7 @@ def _as_bytes(error: UnicodeError) -> tuple[str | bytes, int]:
 
 
 def say(message: str) -> None:
-    """Write a line to standard error if it is open; escape control characters.
-
-    >>> say("Drawing mission.gif ...")
-    """
+    """Write a line to standard error if it is open; escape control characters."""
     text = "".join(c if c.isprintable() or c == "\n" else repr(c)[1:-1] for c in message)
     with suppress(OSError):
         try:
@@ -59,10 +54,7 @@ def say(message: str) -> None:
 
 
 def warn(*messages: str) -> None:
-    """Write warnings to standard error.
-
-    >>> warn("the beam is wider than the world")
-    """
+    """Write warnings to standard error."""
     for message in messages:
         say(f"pipistrelle: warning: {message}")
 
@@ -78,11 +70,7 @@ def flush_results() -> None:
 
 
 def put(*values: object, end: str = "\n") -> None:
-    """Write a result to standard output, unless its reader has left.
-
-    >>> put("runs/one")
-    runs/one
-    """
+    """Write a result to standard output, unless its reader has left."""
     try:
         print(*values, end=end)
     except BrokenPipeError:

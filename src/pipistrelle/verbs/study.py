@@ -1,6 +1,5 @@
 """`pipistrelle study`: all cases of a plan in many worlds."""
 
-import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from inspect import Parameter as Argument
@@ -11,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 from pipistrelle.config import InputError
 from pipistrelle.experiments.named_settings import PLANS
 from pipistrelle.scripting import studies
+from pipistrelle.verbs.console import bars
 from pipistrelle.verbs.options import NamedSettings, layers, setting_flags, switch, verb_of
 from pipistrelle.verbs.streams import put, say, warn
 
@@ -19,8 +19,6 @@ if TYPE_CHECKING:
     from pipistrelle.experiments.studies.study import StudyProgress
 
 Show = Callable[["StudyProgress"], None]
-PROGRESS_INTERVAL = 10.0
-"""Minimum time between two lines of progress [s]."""
 
 
 def _study(asked: dict[str, Any]) -> int:
@@ -98,59 +96,29 @@ def _compiled_first(plan: "Plan", show: Show, quiet: bool) -> Show:
 
 @contextmanager
 def _progress(quiet: bool) -> Iterator[Show]:
-    """Yield a function that shows progress: bars on a terminal, else lines."""
-    if quiet:
-        yield lambda _: None
-    elif sys.stderr.isatty():
-        with _bars() as show:
-            yield show
-    else:
-        yield _lines()
+    """Yield a function that shows progress: bars on a terminal, else lines.
 
-
-def _lines() -> Show:
-    """Return a function that prints a line first, last and every few seconds."""
+    A line is printed first, last and every ten seconds.
+    """
     pace, due = _pace(), 0.0
-
-    def show(so_far: "StudyProgress") -> None:
-        nonlocal due
-        left = pace(so_far)
-        if perf_counter() >= due or so_far.done == so_far.worlds:
-            due = perf_counter() + PROGRESS_INTERVAL
-            trials = [
-                f"{name} {ended}/{so_far.trials[name]}{_failures(so_far.failed[name])}"
-                for name, ended in so_far.ended.items()
-            ]
-            worlds = f"{so_far.done}/{so_far.worlds} worlds"
-            say(", ".join([worlds, *([left] if left else [])]) + "; trials: " + ", ".join(trials))
-
-    return show
-
-
-@contextmanager
-def _bars() -> Iterator[Show]:
-    """Yield a function that draws a bar for the worlds and a bar per strategy."""
-    from rich.console import Console
-    from rich.progress import BarColumn, Progress, TextColumn
-
-    columns = (
-        TextColumn("{task.description:<8}"),
-        BarColumn(),
-        TextColumn("{task.completed}/{task.total}{task.fields[words]}"),
-    )
-    pace, tasks = _pace(), {}
-    with Progress(*columns, console=Console(stderr=True)) as bars:
-
-        def draw(name: str, done: int, total: int, words: str) -> None:
-            if name not in tasks:
-                tasks[name] = bars.add_task(name, total=total, words="")
-            bars.update(tasks[name], completed=done, words=words)
+    with bars(quiet, 8) as draw:
 
         def show(so_far: "StudyProgress") -> None:
+            nonlocal due
             left = pace(so_far)
-            draw("worlds", so_far.done, so_far.worlds, f", {left}" if left else "")
-            for name, ended in so_far.ended.items():
-                draw(name, ended, so_far.trials[name], _failures(so_far.failed[name]))
+            worlds, rest = f"{so_far.done}/{so_far.worlds}", f", {left}" if left else ""
+            trials = {
+                name: f"{ended}/{so_far.trials[name]}{_failures(so_far.failed[name])}"
+                for name, ended in so_far.ended.items()
+            }
+            if draw is not None:
+                draw("worlds", so_far.done, so_far.worlds, worlds + rest)
+                for name, text in trials.items():
+                    draw(name, so_far.ended[name], so_far.trials[name], text)
+            elif not quiet and (perf_counter() >= due or so_far.done == so_far.worlds):
+                due = perf_counter() + 10.0
+                ended = ", ".join(f"{name} {text}" for name, text in trials.items())
+                say(f"{worlds} worlds{rest}; trials: {ended}")
 
         yield show
 

@@ -29,17 +29,11 @@ from pipistrelle.verbs.streams import put, say, warn
 
 if TYPE_CHECKING:
     from pipistrelle.arrays.beamforming import Pattern
+    from pipistrelle.arrays.layout import Scattered
     from pipistrelle.figures.player.playback import Playback
 
 PAGE = "view.html"
 """Name of the page in a result folder."""
-FRAMES_PER_MAP = 3
-"""Frames per map of a smoother, as each map takes an optimisation."""
-
-
-def _switch(words: str) -> Parameter:
-    """Return the parameter of a switch, with its help."""
-    return Parameter(help=words, negative=(), show_default=False)
 
 
 def view(
@@ -55,19 +49,13 @@ def view(
         ),
     ] = None,
     log: Annotated[
-        Path | None,
-        Parameter(
-            metavar="DIR",
-            help="The solved log, if it was moved.",
-        ),
+        Path | None, Parameter(metavar="DIR", help="The solved log, if it was moved.")
     ] = None,
     estimator: Annotated[
         tuple[str, ...],
         Parameter(
             name=("--filter", "--estimator"),
             metavar="MODULE:CLASS",
-            negative=(),
-            show_default=False,
             help="Run this code, an estimator of your own that the mission was conducted with. "
             "Code that a folder names runs only if you name it here.",
         ),
@@ -80,15 +68,15 @@ def view(
             help="Run this code, an association of your own that the mission was conducted with.",
         ),
     ] = None,
-    overwrite: Annotated[bool, _switch("Replace an existing FILE.")] = False,
-    quiet: Annotated[bool, _switch("Print only the path of the page.")] = False,
+    overwrite: Annotated[bool, Parameter(help="Replace an existing FILE.")] = False,
+    quiet: Annotated[bool, Parameter(help="Print only the path of the page.")] = False,
 ) -> None:
     """Write a page that plays a mission, which is conducted again from its result folder."""
     from pipistrelle.experiments.results.reading import read_summary
 
     read_summary(folder)
     target = folder / PAGE if output is None else output
-    check_place(target, folder, ".html", "-o", overwrite)
+    check_place(target, folder, ".html", overwrite)
     from pipistrelle.figures.player.playback import page
     from pipistrelle.scripting.arguments import named_filters
 
@@ -111,7 +99,7 @@ def _play_again(
 
     keep_freed_memory()
     announce(None if quiet else say)
-    watch = MissionRecorder(rest=FRAMES_PER_MAP)
+    watch = MissionRecorder(rest=3)  # frames per map of a smoother, which takes an optimisation
     with progress(quiet) as show:
         mission = rerun(folder, log=log, trusted=trusted, progress=show, watch=watch)
     if mission.difference:
@@ -119,11 +107,11 @@ def _play_again(
     return playback(mission, watch.snapshots)
 
 
-def check_place(path: Path, folder: Path | None, ending: str, option: str, overwrite: bool) -> None:
+def check_place(path: Path, folder: Path | None, ending: str, overwrite: bool) -> None:
     """Raise if a file cannot be written at this path, before it is made."""
-    fix = f"name another with {option} FILE{ending}"
+    fix = f"name another with -o FILE{ending}"
     if path.suffix.lower() != ending:
-        raise InputError(f"{option}: found {path}, expected a name that ends in {ending}")
+        raise InputError(f"-o: found {path}, expected a name that ends in {ending}")
     if path.is_dir():
         raise InputError(f"{path}: found a folder, expected a file; {fix}")
     if folder is not None and _is_in(path, folder):
@@ -178,18 +166,14 @@ def array(
     named: NamedSettings = None,
     output: Annotated[
         Path | None,
-        Parameter(
-            name=("--output", "-o"),
-            metavar="FILE.png",
-            help="The picture.",
-        ),
+        Parameter(name=("--output", "-o"), metavar="FILE.png", help="The picture."),
     ] = None,
-    overwrite: Annotated[bool, _switch("Replace an existing FILE.png.")] = False,
-    quiet: Annotated[bool, _switch("Print only the path of the picture.")] = False,
+    overwrite: Annotated[bool, Parameter(help="Replace an existing FILE.png.")] = False,
+    quiet: Annotated[bool, Parameter(help="Print only the path of the picture.")] = False,
 ) -> None:
     """Draw a microphone array; print its aperture, beam widths and ambiguous bearings."""
     if output is not None:
-        check_place(output, None, ".png", "-o", overwrite)
+        check_place(output, None, ".png", overwrite)
     from pipistrelle.arrays.beamforming import pattern_of
     from pipistrelle.arrays.layout import read_array, scattered, square_microphones
 
@@ -206,9 +190,15 @@ def array(
         for g in range(layout.normal.size)
     )
     if not quiet:
-        put(_table(layout.name, layout.normal.tolist(), patterns))
-        for line in _cannot(layout.name, patterns):
-            put(line)
+        put(_table(layout, patterns))
+        for name, pattern in zip(layout.name, patterns, strict=True):
+            if pattern.alike > 0.0:
+                this, that = (f"{math.degrees(angle):.0f}°" for angle in pattern.worst)
+                put(
+                    f"{pattern.alike:.0%} of the bearings have a double, as {this} and {that}: to "
+                    f"{f'face {name}' if name else 'these microphones'} they sound nearly or quite "
+                    "the same; the deviations of rows say so."
+                )
     if output is not None:
         from pipistrelle.figures.sound import draw_array
 
@@ -221,14 +211,11 @@ def array(
         put(output)
 
 
-def _table(
-    names: tuple[str, ...],
-    normals: list[float],
-    patterns: "tuple[Pattern, ...]",
-) -> str:
+def _table(layout: "Scattered", patterns: "tuple[Pattern, ...]") -> str:
     """Format the properties of each group of microphones in a column."""
     hears = [
-        "all around" if math.isnan(n) else f"around {round(math.degrees(n))}°" for n in normals
+        "all around" if math.isnan(n) else f"around {round(math.degrees(n))}°"
+        for n in layout.normal.tolist()
     ]
     rows = {
         "microphones": [str(p.microphones) for p in patterns],
@@ -241,7 +228,7 @@ def _table(
         "bearings with a double": [f"{p.alike:.0%}" for p in patterns],
         "least deviation at 20 dB [deg]": [_between(*p.std) for p in patterns],
     }
-    heads = [["", *(name or "free" for name in names)]]
+    heads = [["", *(name or "free" for name in layout.name)]]
     return text_table("", heads, [[key, *cells] for key, cells in rows.items()])
 
 
@@ -249,17 +236,3 @@ def _between(least: float, most: float) -> str:
     """Format two angles [rad] as a range in degrees."""
     low, high = f"{math.degrees(least):.3g}", f"{math.degrees(most):.3g}"
     return low if low == high else f"{low} to {high}"
-
-
-def _cannot(names: tuple[str, ...], patterns: "tuple[Pattern, ...]") -> list[str]:
-    """Format the ambiguous bearings of each group, a line each."""
-    lines = []
-    for name, pattern in zip(names, patterns, strict=True):
-        if pattern.alike > 0.0:
-            this, that = (f"{math.degrees(angle):.0f}°" for angle in pattern.worst)
-            whose = f"face {name}" if name else "these microphones"
-            lines.append(
-                f"{pattern.alike:.0%} of the bearings have a double, as {this} and {that}: to "
-                f"{whose} they sound nearly or quite the same; the deviations of rows say so."
-            )
-    return lines
