@@ -3,37 +3,19 @@
 import numpy as np
 import pytest
 
-from pipistrelle.acoustics.arrivals import Arrivals
-from pipistrelle.acoustics.paths import callers_of
 from pipistrelle.arithmetic.random_stream import stream_key
 from pipistrelle.arrays.beamforming import bearing_bound
-from pipistrelle.arrays.layout import Layout, square_of_four
+from pipistrelle.arrays.layout import Layout
 from pipistrelle.arrays.receiver import add_echo_blocks, noise_blocks
-from pipistrelle.arrays.sampling import sampling
 from pipistrelle.config import BLOCK, Config, DetectionConfig
-from pipistrelle.detection.matched import filter_blocks
-from pipistrelle.detection.snapshots import detect, detector
+from pipistrelle.detection.snapshots import detector
 from pipistrelle.geometry import wrap
+from reference.echoes import CONFIG, SETTLED, SQUARE, START, filtered, found_in, sounds
 
-CONFIG = Config()
-CALLERS = callers_of(CONFIG, np.zeros(2))
 UNCUT = Config(detection=DetectionConfig(angle_limit_deg=89.0))
-SETTLED, SQUARE = sampling(CONFIG, CALLERS), square_of_four(CONFIG.receiver)
 BLOCKS, LATE = 28, 7
 COUNT = 5000  # an rms of so many is good to 1 %: a tenth is 6 such off the largest ratio, 1.04
 FAR = 6.0  # bounds: beyond it a side lobe, not noise, decides
-
-
-def echo(face, angle, tone, snr_db):
-    """Return an echo off one face's normal that starts with a block and keeps its frequency."""
-    return Arrivals(
-        delay=np.array([(SETTLED.pulse + LATE) * BLOCK]),
-        level_db=np.array([snr_db - 10.0 * np.log10(SETTLED.pulse * SETTLED.block)]),
-        bearing=wrap(np.array([angle + SQUARE.normal[face]])),
-        frequency=SETTLED.tones[[tone]],
-        caller=np.array([tone], dtype=np.int8),
-        landmark=np.array([1]),
-    )
 
 
 def errors(face, angle, tone, snr_db, count=COUNT, *, config=CONFIG, ears=SQUARE):
@@ -43,19 +25,12 @@ def errors(face, angle, tone, snr_db, count=COUNT, *, config=CONFIG, ears=SQUARE
     """
     finder = detector(config, SQUARE, SETTLED.tones)
     clean = np.zeros((BLOCKS, SQUARE.normal.size, 2, SQUARE.position.size), dtype=complex)
-    add_echo_blocks(clean, echo(face, angle, tone, snr_db), ears, SETTLED)
+    echo = sounds(START + LATE * BLOCK, wrap(angle + SQUARE.normal[face]), snr_db, tone)
+    add_echo_blocks(clean, echo, ears, SETTLED)
     off = np.full(count, np.nan)
     for i in range(count):
         key = stream_key(7, i, f"bearing {face} {angle} {tone} {snr_db}")
-        matched = filter_blocks(
-            clean + noise_blocks(BLOCKS, SQUARE, SETTLED, key),
-            pulse=SETTLED.pulse,
-            block=SETTLED.block,
-            noise_std=1.0,
-        )
-        found = detect(
-            matched, finder, start=SETTLED.pulse * BLOCK, interval=BLOCK, pulse=SETTLED.pulse
-        )
+        found = found_in(filtered(clean + noise_blocks(BLOCKS, SQUARE, SETTLED, key)), finder)
         heard = np.flatnonzero((found.face == face) & (found.caller == tone))
         if heard.size:
             off[i] = found.angle[heard[found.power[heard].argmax()]] - angle

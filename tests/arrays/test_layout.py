@@ -20,12 +20,6 @@ from pipistrelle.config import Config, InputError, ReceiverConfig
 LAYOUT = square_of_four(ReceiverConfig())
 
 
-def test_four_faces_look_to_the_front_left_back_and_right():
-    facing = np.column_stack((np.cos(LAYOUT.normal), np.sin(LAYOUT.normal)))
-    np.testing.assert_allclose(facing, [[1, 0], [0, 1], [-1, 0], [0, -1]], atol=1e-15)
-    assert np.all((LAYOUT.normal >= -np.pi) & (LAYOUT.normal < np.pi))
-
-
 def test_ten_centred_elements_are_spaced_by_half_the_vehicles_wavelength():
     config = Config()
     half = config.air.sound_speed / config.emitter.frequency / 2.0

@@ -1,3 +1,5 @@
+"""Recordings: block sums against samples, noise, sampling, and real samples of block sums."""
+
 from dataclasses import replace
 
 import numpy as np
@@ -5,38 +7,32 @@ import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
-from pipistrelle.acoustics.arrivals import Arrivals, arrivals_of_emission
+from pipistrelle.acoustics.arrivals import arrivals_of_emission
 from pipistrelle.acoustics.paths import VEHICLE, Caller, callers_of
 from pipistrelle.arrays.layout import square_of_four
-from pipistrelle.arrays.receiver import add_echo_blocks, noise_blocks, record_samples
+from pipistrelle.arrays.receiver import (
+    add_echo_blocks,
+    noise_blocks,
+    real_samples,
+    record_samples,
+)
 from pipistrelle.arrays.sampling import blocks_to_hear, sampling
 from pipistrelle.config import (
-    BLOCK,
     BeaconConfig,
     Config,
     EmitterConfig,
     InputError,
     ReceiverConfig,
 )
+from reference.echoes import BEACON, CALLERS, CONFIG, SAMPLES, SETTLED, SQUARE, sounds
 
 law = settings(deadline=None, max_examples=40)
-CONFIG = Config()
-CALLERS = callers_of(CONFIG, np.zeros(2))
-LAYOUT, SETTLED = square_of_four(CONFIG.receiver), sampling(CONFIG, CALLERS)
-BEACON = 1
 SIGMAS = 4.9  # chance: one in a million
 
 
 def one(delay, bearing=0.3, shift=1.0, source=BEACON, level_db=0.0):
     """Return a single arrival, its frequency shifted by a factor."""
-    return Arrivals(
-        delay=np.array([delay]),
-        level_db=np.array([level_db]),
-        bearing=np.array([bearing]),
-        frequency=np.array([SETTLED.tones[source] * shift]),
-        caller=np.array([source], dtype=np.int8),
-        landmark=np.array([1]),
-    )
+    return sounds(delay, bearing, level_db + 10.0 * np.log10(SAMPLES), source, shift)
 
 
 def block_sums(samples, settled=SETTLED):
@@ -51,7 +47,7 @@ def block_sums(samples, settled=SETTLED):
     return np.stack([each.reshape(shape).sum(axis=1) for each in turned], axis=2)
 
 
-def both(arrivals, blocks, layout=LAYOUT, settled=SETTLED):
+def both(arrivals, blocks, layout=SQUARE, settled=SETTLED):
     dense = block_sums(record_samples(blocks, arrivals, layout, settled, None), settled)
     fast = np.zeros_like(dense)
     add_echo_blocks(fast, arrivals, layout, settled)
@@ -90,7 +86,7 @@ def test_block_sums_of_a_whole_world_match_its_samples(seed):
 @pytest.mark.parametrize("shift", [0.8, 1.0, 1.25])
 def test_a_call_received_at_a_higher_frequency_is_shorter(shift, source):
     heard = one(4e-3, bearing=0.0, shift=shift, source=source)
-    samples = record_samples(28, heard, LAYOUT, SETTLED, None)
+    samples = record_samples(28, heard, SQUARE, SETTLED, None)
     count = np.count_nonzero(samples[:, 0, 0])
     called = CONFIG.emitter.pulse * SETTLED.tones[source] / heard.frequency[0]  # T f / f'
     assert count == pytest.approx(called * SETTLED.rate, abs=1.0)
@@ -119,7 +115,7 @@ def test_other_settings_keep_the_engines_equal():
 def test_a_face_receives_only_arrivals_within_90_degrees_of_its_normal(bearing):
     fast, _ = both(one(5e-3, bearing), 28)
     hears = np.abs(fast).max(axis=(0, 2, 3)) > 0.0
-    assert hears.tolist() == (np.cos(bearing - LAYOUT.normal) >= 0.0).tolist()
+    assert hears.tolist() == (np.cos(bearing - SQUARE.normal) >= 0.0).tolist()
     assert hears.sum() in (2, 3)  # 3 where it comes from straight before a face
 
 
@@ -137,7 +133,7 @@ def test_the_recording_ends_with_the_last_arrival(delay, shift):
     heard = one(delay, shift=shift)
     blocks = blocks_to_hear(heard, SETTLED)
     longer = np.zeros((blocks + 5, 4, 2, 10), dtype=complex)
-    add_echo_blocks(longer, heard, LAYOUT, SETTLED)
+    add_echo_blocks(longer, heard, SQUARE, SETTLED)
     assert not longer[blocks:].any()
     assert longer[blocks - 3 :].any() or blocks == 2 * SETTLED.pulse
 
@@ -151,17 +147,17 @@ def test_levels_are_amplitudes_in_decibels_and_arrivals_add():
     loud, soft = both(one(5e-3, level_db=20.0), 28)[0], both(one(5e-3), 28)[0]
     np.testing.assert_allclose(loud, 10.0 * soft, rtol=1e-12)
     signal = loud.copy()
-    add_echo_blocks(signal, one(5e-3), LAYOUT, SETTLED)
+    add_echo_blocks(signal, one(5e-3), SQUARE, SETTLED)
     np.testing.assert_allclose(signal, 11.0 * soft, rtol=1e-12)
 
 
 def test_block_noise_has_forty_times_the_variance_of_a_sample_in_each_tone():
     config = Config(receiver=ReceiverConfig(noise_level_db=6.0))
     settled = sampling(config, callers_of(config, np.zeros(2)))
-    noise = noise_blocks(5000, LAYOUT, settled, key=3)
+    noise = noise_blocks(5000, SQUARE, settled, key=3)
     variance = np.mean(np.abs(noise) ** 2, axis=(0, 3)) / (40.0 * 10.0**0.6)
     assert np.abs(variance - 1.0).max() < SIGMAS / np.sqrt(5000 * 10)
-    samples = record_samples(2000, one(0.0), LAYOUT, settled, np.random.default_rng(3))
+    samples = record_samples(2000, one(0.0), SQUARE, settled, np.random.default_rng(3))
     sums = block_sums(samples, settled)
     variance = np.mean(np.abs(sums) ** 2, axis=(0, 3)) / (40.0 * 10.0**0.6)
     assert np.abs(variance - 1.0).max() < SIGMAS / np.sqrt(2000 * 10)
@@ -181,7 +177,7 @@ def test_sampled_and_drawn_noise_have_independent_block_sums():
 
 def test_only_tones_on_whole_bins_are_uncorrelated():
     # 32 kHz is no whole bin of a block: its sums would carry part of 30 kHz's noise.
-    samples = record_samples(1500, one(0.0), LAYOUT, SETTLED, np.random.default_rng(5))
+    samples = record_samples(1500, one(0.0), SQUARE, SETTLED, np.random.default_rng(5))
     n = np.arange(samples.shape[0])
     parts = [
         (samples[:, 0, 0] * np.exp(-2j * np.pi * f * n / 200e3)).reshape(-1, 40).sum(axis=1)
@@ -196,14 +192,8 @@ def test_only_tones_on_whole_bins_are_uncorrelated():
 @given(short=st.integers(1, 30), more=st.integers(0, 30))
 @law
 def test_a_blocks_noise_does_not_depend_on_how_many_are_drawn(short, more):
-    one_, two = (noise_blocks(n, LAYOUT, SETTLED, key=9) for n in (short, short + more))
+    one_, two = (noise_blocks(n, SQUARE, SETTLED, key=9) for n in (short, short + more))
     assert one_.tobytes() == two[:short].tobytes()
-
-
-def test_blocks_are_a_fifth_of_a_millisecond_and_the_call_fourteen_of_them():
-    assert (BLOCK, SETTLED.block, SETTLED.pulse) == (2e-4, 40, 14)
-    assert SETTLED.tones.tolist() == [35e3, 30e3]
-    assert SETTLED.noise_std == 1.0
 
 
 @pytest.mark.parametrize(
@@ -251,8 +241,8 @@ def test_every_sample_is_recorded_where_blocks_do_not_hold_the_calls(settings, d
     [
         ({"receiver": {"sample_rate": 2e6, "engine": "auto"}, "emitter": {"pulse": 2.81e-3}},
          "receiver.sample_rate: found 2e.06 Hz, expected a multiple of 5000 Hz, or 8000 to 1e.06"),
-        ({"receiver": {"sample_rate": 44.1e3}}, "emitter: found a call of .* of 44100 Hz"),
-        ({"emitter": {"call": "sweep", "band": (90e3, 120e3)}}, "emitter: found a call of"),
+        ({"receiver": {"sample_rate": 44.1e3}}, "emitter: found a tone of .* of 44100 Hz"),
+        ({"emitter": {"call": "sweep", "band": (90e3, 120e3)}}, "emitter: found a sweep of"),
         ({"emitter": {"call": "sweep", "band": (31e3, 29e3)}}, "beacon: found a call that is"),
         ({"beacon": {"frequency": 35.1e3}}, "beacon: found a call that is 77% the vehicle's"),
     ],
@@ -287,15 +277,8 @@ def test_block_sums_of_two_fixed_and_one_moving_caller_match_their_samples(seed)
     again = sampling(CONFIG, turned)
     other = arrivals_of_emission(pose, np.array([0.5, 0.5]), landmarks, turned, CONFIG)
     sums = np.zeros_like(fast)
-    add_echo_blocks(sums, other, LAYOUT, again)
+    add_echo_blocks(sums, other, SQUARE, again)
     assert np.abs(sums[:, :, [0, 2, 1]] - fast).max() <= 1e-12 * np.abs(fast).max()
-
-
-def test_noise_of_three_tones_has_the_same_variance_in_each():
-    noise = noise_blocks(5000, LAYOUT, sampling(CONFIG, THREE), key=3)
-    variance = np.mean(np.abs(noise) ** 2, axis=(0, 3)) / 40.0
-    assert variance.shape == (4, 3)
-    assert np.abs(variance - 1.0).max() < SIGMAS / np.sqrt(5000 * 10)
 
 
 @pytest.mark.parametrize(
@@ -327,3 +310,46 @@ def test_eight_callers_are_heard_and_a_ninth_is_refused():
     assert sampling(CONFIG, [*CALLERS, *chorus[:6]]).tones.size == 8
     with pytest.raises(InputError, match="callers: found 9, expected 1 to 8"):
         sampling(CONFIG, [*CALLERS, *chorus])
+
+
+# Real samples
+
+LENGTH = 20_000
+
+
+def recorded(level_db=30.0):
+    sums = noise_blocks(300, SQUARE, SETTLED, key=5)
+    arrivals = one(0.0123, 0.3, 35_070.0 / 35e3, VEHICLE, level_db)
+    add_echo_blocks(sums, arrivals, SQUARE, SETTLED)
+    rng = np.random.default_rng(3)
+    return sums, real_samples(sums, arrivals, SQUARE, SETTLED, LENGTH, rng, leak=50.0)
+
+
+def fourier(samples, tone, first=560):
+    """Twice the transform of each block, by its definition."""
+    blocks = samples[first : first + (len(samples) - first) // 40 * 40].astype(float)
+    wave = np.exp(-2j * np.pi * tone * np.arange(40) / 200e3)
+    return 2.0 * np.einsum("bnm,n->bm", blocks.reshape(-1, 40, samples.shape[1]), wave)
+
+
+def test_twice_the_transform_of_each_block_is_its_block_sum():
+    sums, samples = recorded()
+    for c, tone in enumerate(SETTLED.tones):
+        found = fourier(samples, tone)[:300].reshape(300, 4, 10)
+        np.testing.assert_allclose(found, sums[:, :, c], atol=1e-3 * abs(sums).max() / 100)
+
+
+def test_noise_is_white_at_all_frequencies_and_after_the_last_block():
+    _, samples = recorded(level_db=-300.0)
+    noise = 40 * SETTLED.noise_std**2  # of a sum
+    for tone in (10e3, 30e3, 35e3, 60e3):
+        for part in (slice(0, 300), slice(300, None)):
+            power = np.abs(fourier(samples, tone)[part]) ** 2
+            assert abs(power.mean() / noise - 1.0) < 5.0 / np.sqrt(power.size)
+
+
+def test_a_microphone_receives_only_the_call_while_it_lasts():
+    _, samples = recorded()
+    wave = 50.0 * np.cos(2.0 * np.pi * 35e3 * np.arange(560) / 200e3)
+    rest = samples[:560] - wave[:, None]
+    assert abs(rest.std() / (0.5 * SETTLED.noise_std) - 1.0) < 5.0 / np.sqrt(2 * rest.size)

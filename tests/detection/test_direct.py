@@ -6,17 +6,12 @@ from functools import cache
 import numpy as np
 import pytest
 
-from pipistrelle.acoustics.arrivals import Arrivals
-from pipistrelle.acoustics.paths import callers_of
 from pipistrelle.arithmetic.random_stream import stream_key
-from pipistrelle.arrays.layout import square_of_four
-from pipistrelle.arrays.receiver import add_echo_blocks, noise_blocks
-from pipistrelle.arrays.sampling import sampling
 from pipistrelle.config import BLOCK, Config, MatchingConfig
 from pipistrelle.detection.direct import (
     MIN_EDGE_ENERGY,
     DirectCalls,
-    direct_calls,
+    Lags,
     front_edge,
     loudest_first,
 )
@@ -24,39 +19,24 @@ from pipistrelle.detection.front_end import average_faces
 from pipistrelle.detection.matched import filter_blocks
 from pipistrelle.detection.noise import EXCESS_PATH_FLOOR
 from pipistrelle.detection.scans import with_columns
-from pipistrelle.detection.snapshots import Detections, detect, detector
+from pipistrelle.detection.snapshots import (
+    Columns,
+    Detections,
+    direct_of_faces,
+)
 from pipistrelle.experiments.hearing.listening import listen
 from pipistrelle.experiments.hearing.oracle import label_detections
 from pipistrelle.experiments.hearing.scenario import caller_labels, world_of
+from reference.echoes import BEACON, CONFIG, OWN, SAMPLED, SETTLED, C, found_in, matched_of, sounds
 
-CONFIG = Config()
-SETTLED, SQUARE = sampling(CONFIG, callers_of(CONFIG, np.zeros(2))), square_of_four(CONFIG.receiver)
-FINDER = detector(CONFIG, SQUARE, SETTLED.tones)
-C, PULSE = CONFIG.air.sound_speed, CONFIG.emitter.pulse
-GAIN_DB = 10.0 * np.log10(SETTLED.pulse * SETTLED.block)
-OWN, BEACON = 0, 1
-SAMPLED = BLOCK / SETTLED.block / np.sqrt(3.0)
-"""What a delay is late by [s], rms: a call is heard from the next sample on."""
+CALL = CONFIG.emitter.pulse
 
 
-def detected(*sounds, key=1, noisy=True, blocks=200):
+def detected(*heard, key=1, blocks=200):
     """Detect sounds (delay [s], bearing [rad], tone, SNR of a call at one element [dB])."""
-    delay, bearing, tone, snr_db = map(np.array, zip(*sounds, strict=True))
-    arrivals = Arrivals(
-        delay=delay,
-        level_db=snr_db - GAIN_DB,
-        bearing=bearing,
-        frequency=SETTLED.tones[tone],
-        caller=tone.astype(np.int8),
-        landmark=np.arange(1, delay.size + 1),
-    )
-    heard = noise_blocks(blocks, SQUARE, SETTLED, stream_key(7, key, "direct"))
-    if not noisy:
-        heard *= 1e-6
-    add_echo_blocks(heard, arrivals, SQUARE, SETTLED)
-    matched = filter_blocks(heard, pulse=SETTLED.pulse, block=SETTLED.block, noise_std=1.0)
-    timing = {"start": SETTLED.pulse * BLOCK, "interval": BLOCK, "pulse": SETTLED.pulse}
-    return detect(matched, FINDER, **timing)
+    delay, bearing, tone, snr_db = map(np.array, zip(*heard, strict=True))
+    arrivals = sounds(delay, bearing, snr_db, tone)
+    return found_in(matched_of(arrivals, key=stream_key(7, key, "direct"), blocks=blocks))
 
 
 def off_by(found, delay):
@@ -149,7 +129,7 @@ def test_rows_contain_excess_paths_with_deviations():
 def test_an_excess_path_is_as_unsure_as_echo_and_direct_call_together():
     one, nan = np.ones(1), np.nan
     direct = DirectCalls(
-        detection=np.array([-1, -1]), pulse=PULSE,
+        detection=np.array([-1, -1]), pulse=CALL,
         delay=np.array([nan, 0.02]), delay_std=np.array([nan, 4e-5]),
     )  # fmt: skip
     echo = Detections(
@@ -163,7 +143,7 @@ def test_an_excess_path_is_as_unsure_as_echo_and_direct_call_together():
 
 
 def test_an_echo_during_the_direct_call_has_no_excess_path():
-    for apart, heard_apart in ((0.8 * PULSE, False), (1.3 * PULSE, True)):
+    for apart, heard_apart in ((0.8 * CALL, False), (1.3 * CALL, True)):
         found = detected((0.02, 0.0, BEACON, 26.0), (0.02 + apart, 3.1, BEACON, 20.0))
         late = found.delay > 0.02 + 0.5 * apart
         label = np.where(late, 4, 51)
@@ -177,7 +157,7 @@ BLOCKS, BEGIN, M, ELEMENTS = 110, 60, 14, 10
 FACE, TONE = 1, 2
 
 
-def planted(*sounds, pulse=M, noise_std=0.0, rng=None):
+def planted(*bursts, pulse=M, noise_std=0.0, rng=None):
     """Matched outputs of sounds: first block, number of blocks, amplitude.
 
     The square of the amplitude is the energy of a block over the mean of the noise that front edges
@@ -185,7 +165,7 @@ def planted(*sounds, pulse=M, noise_std=0.0, rng=None):
     """
     x = np.zeros((BLOCKS, FACE + 1, TONE + 1, ELEMENTS), dtype=complex)
     phase, edges = np.exp(0.7j * np.arange(ELEMENTS)), np.arange(BLOCKS + 1)
-    for begin, lasts, amplitude in sounds:
+    for begin, lasts, amplitude in bursts:
         share = np.diff(np.clip(edges, begin, begin + lasts))
         x[:, FACE, TONE] += amplitude * np.sqrt(2.0) * share[:, None] * phase
     if rng is not None:
@@ -193,11 +173,10 @@ def planted(*sounds, pulse=M, noise_std=0.0, rng=None):
     return filter_blocks(x, pulse=pulse, block=1, noise_std=1.0)
 
 
-def edge(*sounds, b=BEGIN, **more):
+def edge(*bursts, b=BEGIN, **more):
     """Lag and standard deviation of the first edge up to lag b."""
-    return front_edge(
-        planted(*sounds, **more), b, FACE, TONE, more.get("pulse", M), MIN_EDGE_ENERGY
-    )
+    matched, pulse = planted(*bursts, **more), more.get("pulse", M)
+    return front_edge(matched, b, FACE, TONE, pulse, MIN_EDGE_ENERGY)
 
 
 def told_std(share, amplitude):
@@ -320,9 +299,11 @@ START, INTERVAL = 0.5, 1e-4
 def calls_of(*detections, sounds=((BEGIN, M, 5.0),)):
     """Direct calls among detections: caller, lag, power and standard deviation of the lag."""
     caller, lag, power, std = np.array(detections).T
-    numbers = np.array([START + INTERVAL * lag, 0.0 * lag, power, 0.0 * lag, INTERVAL * std])
-    whole = np.array([np.full(lag.size, FACE), caller]).astype(np.int64)
-    return direct_calls(planted(*sounds), whole, numbers, TONE + 1, (START, INTERVAL, M))
+    face, none = np.full(lag.size, FACE), np.zeros(lag.size)
+    delay, delay_std = START + INTERVAL * lag, INTERVAL * std
+    found = Columns(face, caller.astype(np.int64), none, none, delay, power, none, delay_std)
+    direct = direct_of_faces(planted(*sounds), found, Lags(START, INTERVAL, M))
+    return direct.detection, (direct.delay, direct.delay_std)
 
 
 def test_the_first_that_is_a_tenth_as_loud_as_the_loudest_of_its_tone_is_the_direct_call():
@@ -367,13 +348,6 @@ def test_only_a_tone_200_times_louder_within_a_call_may_leak():
         for times in (190.0, 210.0):
             found, _ = calls_of((TONE, BEGIN, 1.0, 7.0), (OWN, BEGIN + apart, times, 7.0))
             assert found[TONE] == (-1 if abs(apart) < M and times > 200.0 else 0)
-
-
-def test_a_louder_call_of_another_tone_ten_milliseconds_away_changes_nothing():
-    faint = (0.0200, 0.3, BEACON, 22.0)
-    for apart in (-0.010, 0.010):
-        beside = detected(faint, (0.0200 + apart, 0.35, OWN, 46.0))
-        assert abs(off_by(beside, 0.0200)) < 0.06
 
 
 # In the paper's worlds

@@ -6,25 +6,16 @@ from functools import cache
 import numpy as np
 import pytest
 
-from pipistrelle.acoustics.arrivals import Arrivals
-from pipistrelle.acoustics.paths import callers_of
 from pipistrelle.arithmetic.random_stream import stream_key
-from pipistrelle.arrays.layout import square_of_four
-from pipistrelle.arrays.receiver import add_echo_blocks, noise_blocks
-from pipistrelle.arrays.sampling import sampling
-from pipistrelle.config import BLOCK, Config
+from pipistrelle.config import BLOCK
 from pipistrelle.detection.front_end import average_faces
-from pipistrelle.detection.matched import filter_blocks
 from pipistrelle.detection.noise import EXCESS_PATH_FLOOR
 from pipistrelle.detection.scans import UNLABELLED
-from pipistrelle.detection.snapshots import detect, detector
 from reference.delays import cramer_rao, least_mean_square
+from reference.echoes import BEACON, PULSE, SETTLED, SQUARE, C, found_in, matched_of, sounds
 
-CONFIG = Config()
-SETTLED, SQUARE = sampling(CONFIG, callers_of(CONFIG, np.zeros(2))), square_of_four(CONFIG.receiver)
-FINDER = detector(CONFIG, SQUARE, SETTLED.tones)
-C, PULSE, ELEMENTS = CONFIG.air.sound_speed, SETTLED.pulse, SQUARE.position.size
-CALLER, DIRECT, ECHO = 1, 51, 4
+ELEMENTS = SQUARE.position.size
+DIRECT, ECHO = 51, 4
 FIRST, APART, BLOCKS = 32, 34, 75
 """Blocks until the direct call, from it to the echo, and of the recording."""
 OVER_DB = 25.0
@@ -36,19 +27,6 @@ SIGMAS, SPREAD = 3.5, 2.2
 """Of the mean of so many squares, each of them with that deviation: a normal one has 1.4."""
 
 
-def sounds(delays, snr_db, angles):
-    """The direct call and what comes after it, echoes of one level."""
-    level = np.full(len(delays), snr_db) + OVER_DB * (np.arange(len(delays)) == 0)
-    return Arrivals(
-        delay=np.array(delays),
-        level_db=level - 10.0 * np.log10(PULSE * SETTLED.block),
-        bearing=np.array(angles) + SQUARE.normal[0],
-        frequency=np.full(len(delays), SETTLED.tones[CALLER]),
-        caller=np.full(len(delays), CALLER, dtype=np.int8),
-        landmark=np.arange(len(delays)),
-    )
-
-
 def excess_path_off(snr_db, key, heels=None):
     """How much too long an excess path is thought, and its told deviation [m]; NaN of none.
 
@@ -58,11 +36,10 @@ def excess_path_off(snr_db, key, heels=None):
     direct = (FIRST + rng.random()) * BLOCK
     echo = direct + (APART + rng.random()) * BLOCK
     times = [direct, echo] if heels is None else [direct, echo, echo + heels * BLOCK]
-    heard = noise_blocks(BLOCKS, SQUARE, SETTLED, stream_key(7, key, f"excess_paths {snr_db}"))
-    arrivals = sounds(times, snr_db, rng.uniform(-0.15, 0.15, len(times)))
-    add_echo_blocks(heard, arrivals, SQUARE, SETTLED)
-    matched = filter_blocks(heard, pulse=PULSE, block=SETTLED.block, noise_std=1.0)
-    found = detect(matched, FINDER, start=PULSE * BLOCK, interval=BLOCK, pulse=PULSE)
+    key = stream_key(7, key, f"excess_paths {snr_db}")
+    levels = snr_db + OVER_DB * (np.arange(len(times)) == 0)
+    arrivals = sounds(times, rng.uniform(-0.15, 0.15, len(times)), levels, BEACON)
+    found = found_in(matched_of(arrivals, key=key, blocks=BLOCKS))
     here = (found.face == 0) & (np.abs(found.delay - echo) < 0.5 * PULSE * BLOCK)
     label = np.where(here, ECHO, np.where(found.delay < direct + BLOCK, DIRECT, UNLABELLED))
     frame = average_faces(0.5, found, label, averaging="plain", speed_of_sound=C)

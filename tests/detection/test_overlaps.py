@@ -10,21 +10,17 @@ from hypothesis import strategies as st
 from scipy.optimize import minimize
 from scipy.stats import binom
 
-from pipistrelle.acoustics.arrivals import Arrivals
-from pipistrelle.acoustics.paths import callers_of
 from pipistrelle.arithmetic.random_stream import stream_key
-from pipistrelle.arrays.layout import square_of_four
-from pipistrelle.arrays.receiver import add_echo_blocks, noise_blocks
-from pipistrelle.arrays.sampling import sampling
 from pipistrelle.config import BLOCK, Config, DetectionConfig, ScenarioConfig
-from pipistrelle.detection.matched import filter_blocks
 from pipistrelle.detection.noise import EDGE_FLOOR, NOISE_QUANTILE, bearing_std
 from pipistrelle.detection.overlaps import MOST, deviation, most_left, resolve, room_for
 from pipistrelle.detection.scans import UNLABELLED
-from pipistrelle.detection.snapshots import Detections, detect, detector
+from pipistrelle.detection.snapshots import Detections, detector
 from pipistrelle.experiments.hearing.listening import listen
 from pipistrelle.experiments.hearing.scenario import world_of
 from pipistrelle.geometry import wrap
+from reference.echoes import BEACON, PULSE, SETTLED, SQUARE, found_in, matched_of, sounds
+from reference.echoes import FINDER as MERGING
 
 N, EVEN = 10, np.empty(0)
 SCAN = np.linspace(-3.1, 3.1, 63)
@@ -33,10 +29,7 @@ SPLIT = 1.0 - NOISE_QUANTILE
 PAIRS = [(0.6, 20.0), (0.4, 26.0), (1.2, 13.0)]
 """Distance of two sources in u [rad], and SNR of each at one element [dB]."""
 RESOLVING = Config(detection=DetectionConfig(overlaps="resolve"))
-SETTLED = sampling(RESOLVING, callers_of(RESOLVING, np.zeros(2)))
-SQUARE, PULSE = square_of_four(RESOLVING.receiver), SETTLED.pulse
 FINDER = detector(RESOLVING, SQUARE, SETTLED.tones)
-MERGING = detector(Config(), SQUARE, SETTLED.tones)
 ROWS = [f.name for f in fields(Detections) if f.name != "direct"]
 
 
@@ -198,20 +191,11 @@ def test_few_elements_resolve_few_sources(elements, most):
 def heard(echoes, finder=FINDER, key=1, mirror=False):
     """Return detections of echoes (delay [s], angle [deg], SNR [dB]) at the front face."""
     delay, angle, snr_db = np.array(echoes, float).T
-    arrivals = Arrivals(
-        delay=delay,
-        level_db=snr_db - 10.0 * np.log10(PULSE * SETTLED.block),
-        bearing=wrap(np.radians(angle) + SQUARE.normal[0]),
-        frequency=np.full(len(delay), SETTLED.tones[1]),
-        caller=np.ones(len(delay), dtype=np.int8),
-        landmark=np.arange(len(delay)),
-    )
-    sums = noise_blocks(90, SQUARE, SETTLED, stream_key(7, key, "overlaps"))
-    add_echo_blocks(sums, arrivals, SQUARE, SETTLED)
-    matched = filter_blocks(sums, pulse=PULSE, block=SETTLED.block, noise_std=1.0)
+    arrivals = sounds(delay, wrap(np.radians(angle) + SQUARE.normal[0]), snr_db, BEACON)
+    matched = matched_of(arrivals, key=stream_key(7, key, "overlaps"), blocks=90)
     if mirror:
         matched = matched[..., ::-1].copy()
-    return detect(matched, finder, start=PULSE * BLOCK, interval=BLOCK, pulse=PULSE)
+    return found_in(matched, finder)
 
 
 def front(found):

@@ -13,54 +13,42 @@ from pipistrelle.acoustics.arrivals import Arrivals, arrivals_of_emission, throu
 from pipistrelle.acoustics.paths import Caller, callers_of
 from pipistrelle.arithmetic.random_stream import complex_noise, stream_key
 from pipistrelle.arrays.beamforming import beamscan
-from pipistrelle.arrays.layout import Layout, square_of_four
+from pipistrelle.arrays.layout import Layout
 from pipistrelle.arrays.receiver import add_echo_blocks, noise_blocks, record_samples
 from pipistrelle.arrays.sampling import blocks_to_hear, sampling
 from pipistrelle.config import BLOCK, Config, DetectionConfig
-from pipistrelle.detection.matched import filter_blocks, filter_samples
+from pipistrelle.detection.matched import filter_samples
 from pipistrelle.detection.snapshots import Detections, _scan_power, detect, detector
 from pipistrelle.geometry import wrap
+from reference.echoes import (
+    BEACON,
+    CALLERS,
+    CONFIG,
+    FINDER,
+    LAGS,
+    OWN,
+    SAMPLES,
+    SETTLED,
+    SQUARE,
+    START,
+    filtered,
+    found_in,
+    matched_of,
+    sounds,
+)
 
 law = settings(deadline=None, max_examples=40)
-CONFIG = Config()
-CALLERS = callers_of(CONFIG, np.zeros(2))
-LAYOUT, SETTLED = square_of_four(CONFIG.receiver), sampling(CONFIG, CALLERS)
-FINDER = detector(CONFIG, LAYOUT, SETTLED.tones)
-SAMPLES = SETTLED.pulse * SETTLED.block
-START = SETTLED.pulse * BLOCK
 CHANCE, SIGMAS = 1e-6, 4.9
-OWN, BEACON = 0, 1
 
 
-def finder_of(layout=LAYOUT, **changes):
+def finder_of(layout=SQUARE, **changes):
     return detector(Config(detection=DetectionConfig(**changes)), layout, SETTLED.tones)
 
 
 def echoes(*rows):
     """Return arrivals of rows (delay, bearing [deg], source, SNR of one element [dB], shift)."""
     delay, bearing, source, snr_db, shift = map(np.array, zip(*rows, strict=True))
-    return Arrivals(
-        delay=delay.astype(float),
-        level_db=snr_db - 10.0 * np.log10(SAMPLES),
-        bearing=np.radians(bearing),
-        frequency=SETTLED.tones[source] * shift,
-        caller=source.astype(np.int8),
-        landmark=np.arange(1, len(rows) + 1),
-    )
-
-
-def matched_of(arrivals, blocks=60, key=None):
-    """Return the matched filter's outputs of the block engine, with noise if there is a key."""
-    if key is None:
-        sums = np.zeros((blocks, 4, 2, 10), dtype=complex)
-    else:
-        sums = noise_blocks(blocks, LAYOUT, SETTLED, key)
-    add_echo_blocks(sums, arrivals, LAYOUT, SETTLED)
-    return filter_blocks(sums, pulse=SETTLED.pulse, block=SETTLED.block, noise_std=1.0)
-
-
-def found_in(matched, finder=FINDER):
-    return detect(matched, finder, start=START, interval=BLOCK, pulse=SETTLED.pulse)
+    return sounds(delay, np.radians(bearing), snr_db, source, shift)
 
 
 def snapshots(found, tone):
@@ -161,7 +149,7 @@ def assert_same(found, rows, interval):
     np.testing.assert_allclose(found.angle, angle, atol=1e-9)
     np.testing.assert_allclose(found.power, power, rtol=1e-9)
     np.testing.assert_allclose(found.delay, delay, atol=2e-4 * interval)
-    np.testing.assert_allclose(found.bearing, wrap(angle + LAYOUT.normal[face]), atol=1e-9)
+    np.testing.assert_allclose(found.bearing, wrap(angle + SQUARE.normal[face]), atol=1e-9)
 
 
 @pytest.mark.parametrize("frame", [10, 60])
@@ -177,11 +165,10 @@ def assert_same(found, rows, interval):
 def test_detections_match_a_slow_second_version(frame, changes):
     config = Config(detection=DetectionConfig(**changes))
     heard, blocks, key = mission_frame(frame=frame)
-    matched = matched_of(heard, blocks, key)
-    timing = {"start": START, "interval": BLOCK, "pulse": SETTLED.pulse}
-    found = detect(matched, detector(config, LAYOUT, SETTLED.tones), **timing)
+    matched = matched_of(heard, key=key, blocks=blocks)
+    found = detect(matched, detector(config, SQUARE, SETTLED.tones), **LAGS)
     assert found.face.size > 10
-    assert_same(found, slow_detect(matched, config, **timing), BLOCK)
+    assert_same(found, slow_detect(matched, config, **LAGS), BLOCK)
 
 
 @pytest.mark.parametrize("pulse", [1, 2, 3])
@@ -189,14 +176,14 @@ def test_detections_of_very_short_calls_match_a_slow_second_version(pulse):
     noise = complex_noise((400, 4, 2, 10), 1.0, stream_key(7, pulse, "short calls"))
     config = Config(detection=DetectionConfig(false_alarm=0.02, leakage_db=-60.0))
     timing = {"start": START, "interval": BLOCK, "pulse": pulse}
-    found = detect(noise, detector(config, LAYOUT, SETTLED.tones), **timing)
+    found = detect(noise, detector(config, SQUARE, SETTLED.tones), **timing)
     assert found.face.size > 50
     assert_same(found, slow_detect(noise, config, **timing), BLOCK)
 
 
 def test_detections_at_the_full_rate_match_a_slow_second_version():
     heard = echoes((5.01e-3, 20, OWN, 9, 1.0), (6.8e-3, -30, BEACON, 6, 1.0))
-    samples = record_samples(44, heard, LAYOUT, SETTLED, np.random.default_rng(7))
+    samples = record_samples(44, heard, SQUARE, SETTLED, np.random.default_rng(7))
     matched = filter_samples(samples, calls=SETTLED.calls, rate=200e3, noise_std=1)
     timing = {"start": START, "interval": 5e-6, "pulse": SAMPLES}
     found = detect(matched, FINDER, **timing)
@@ -209,7 +196,7 @@ def test_detections_at_the_full_rate_match_a_slow_second_version():
 def test_the_scan_by_lag_sums_is_the_conventional_beamscan_to_rounding(key, tone):
     matched, power = complex_noise((5, 4, 2, 10), 1.0, key), np.empty(FINDER.scan.shape[1])
     _scan_power(matched, (1, 4), 3, tone, FINDER.table[tone], power)
-    ears = {"position": LAYOUT.position, "frequency": SETTLED.tones[tone], "speed_of_sound": 343.0}
+    ears = {"position": SQUARE.position, "frequency": SETTLED.tones[tone], "speed_of_sound": 343.0}
     angle = np.arcsin(FINDER.scan[tone] / FINDER.wave[tone])
     exact = np.sum([beamscan(row, angle, **ears) for row in matched[1:4, 3, tone]], axis=0)
     np.testing.assert_allclose(power, exact, atol=1e-12 * exact.max())
@@ -224,11 +211,11 @@ def test_the_threshold_is_the_quantile_of_ten_outputs_energy_in_noise():
 def test_pure_noise_passes_each_test_as_often_as_asked():
     # Many faces and a single lag: every face and tone is one independent test.
     faces, batches, alarm = 2000, 50, 1e-3
-    wide = Layout(normal=np.zeros(faces), position=LAYOUT.position)
+    wide = Layout(normal=np.zeros(faces), position=SQUARE.position)
     finder, passed, shown = finder_of(wide, false_alarm=alarm), 0, 0
     for batch in range(batches):
         sums = noise_blocks(SETTLED.pulse, wide, SETTLED, stream_key(7, batch, "false alarms"))
-        matched = filter_blocks(sums, pulse=SETTLED.pulse, block=SETTLED.block, noise_std=1.0)
+        matched = filtered(sums)
         passed += np.count_nonzero(np.sum(np.abs(matched) ** 2, axis=-1) > finder.threshold)
         found = found_in(matched, finder)
         shown += len(set(zip(found.face.tolist(), found.caller.tolist(), strict=True)))
@@ -245,7 +232,7 @@ def test_pure_noise_is_detected_in_hardly_any_frame():
     silence = echoes((0.0, 0, OWN, -400, 1.0))
     seen = 0
     for frame in range(frames):
-        found = found_in(matched_of(silence, blocks, stream_key(7, frame, "silence")))
+        found = found_in(matched_of(silence, key=stream_key(7, frame, "silence"), blocks=blocks))
         seen += snapshots(found, OWN) + snapshots(found, BEACON)
     assert seen <= binom.isf(CHANCE, tests, 1e-6)
 
@@ -287,7 +274,7 @@ def test_the_vehicles_doppler_shift_costs_three_decibels_and_a_centimetre_at_mos
 
 def test_a_turn_by_a_quarter_moves_an_echo_to_the_next_face():
     for face in range(4):
-        bearing = 23.0 + np.degrees(LAYOUT.normal[face])
+        bearing = 23.0 + np.degrees(SQUARE.normal[face])
         found = found_in(matched_of(echoes((6e-3, bearing, BEACON, 20, 1.0))))
         row = found.face == face
         assert found.angle[row][0] == pytest.approx(np.radians(23.0), abs=1e-3)
@@ -416,10 +403,10 @@ def found_of_trio(leakage_db, *rows):
         landmark=np.arange(1, len(rows) + 1),
     )
     sums = np.zeros((60, 4, 3, 10), dtype=complex)
-    add_echo_blocks(sums, heard, LAYOUT, TRIO)
-    matched = filter_blocks(sums, pulse=TRIO.pulse, block=TRIO.block, noise_std=1.0)
+    add_echo_blocks(sums, heard, SQUARE, TRIO)
+    matched = filtered(sums, TRIO)
     config = Config(detection=DetectionConfig(leakage_db=leakage_db))
-    return found_in(matched, detector(config, LAYOUT, TRIO.tones))
+    return found_in(matched, detector(config, SQUARE, TRIO.tones))
 
 
 @pytest.mark.parametrize("caller", [0, 1, 2])

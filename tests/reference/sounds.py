@@ -23,6 +23,15 @@ def record(folder, *words, drive=FEW):
     return Path(folder)
 
 
+def with_samples(folder, change, name="tape.wav", subtype="FLOAT"):
+    """Change the samples of a recording in place, or replace them by the returned ones."""
+    import soundfile
+
+    samples, rate = soundfile.read(folder / name, dtype="float32")
+    changed = change(samples)
+    soundfile.write(folder / name, samples if changed is None else changed, rate, subtype=subtype)
+
+
 ABOUT = """format = 1
 speed_of_sound = {speed}
 start = 10.0

@@ -43,7 +43,7 @@ _DEEPEST_NULL = 1e-12
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Arrivals:
-    """Echoes and calls that reach the vehicle after one emission."""
+    """Echoes and calls that reach the vehicle after an emission."""
 
     delay: Float[np.ndarray, " a"]
     """Since the emission [s]."""
@@ -159,18 +159,14 @@ def arrivals_of_emissions(
             emissions[-1] = emissions[-1][sent]
     emission = np.concatenate(emissions)
     order = np.argsort(emission, kind="stable")
-    columns = {
-        name: np.concatenate([getattr(part, name) for part in parts]).take(order)
-        for name in Arrivals.__slots__
-        if name != "departure"
-    }
     if any(part.departure is not None for part in parts):
-        alike = [np.full(part.delay.size, np.nan) for part in parts]
-        left = [
-            a if p.departure is None else p.departure for a, p in zip(alike, parts, strict=True)
+        unknown = [np.full(part.delay.size, np.nan) for part in parts]
+        parts = [
+            replace(part, departure=nan) if part.departure is None else part
+            for part, nan in zip(parts, unknown, strict=True)
         ]
-        columns["departure"] = np.concatenate(left).take(order)
-    return Arrivals(**columns), np.bincount(emission, minlength=len(poses))
+    heard = arrivals_at(arrivals_together(parts), order)
+    return heard, np.bincount(emission, minlength=len(poses))
 
 
 def through_piston(
@@ -216,17 +212,12 @@ def through_piston(
     return replace(arrivals, level_db=level_db)
 
 
-def arrivals_at(arrivals: Arrivals, rows: Bool[np.ndarray, " a"] | slice) -> Arrivals:
+def arrivals_at(
+    arrivals: Arrivals, rows: Bool[np.ndarray, " a"] | Int[np.ndarray, " k"] | slice
+) -> Arrivals:
     """Select rows of the arrivals."""
-    return Arrivals(
-        delay=arrivals.delay[rows],
-        level_db=arrivals.level_db[rows],
-        bearing=arrivals.bearing[rows],
-        frequency=arrivals.frequency[rows],
-        caller=arrivals.caller[rows],
-        landmark=arrivals.landmark[rows],
-        departure=None if arrivals.departure is None else arrivals.departure[rows],
-    )
+    names = [name for name in Arrivals.__slots__ if getattr(arrivals, name) is not None]
+    return Arrivals(**{name: getattr(arrivals, name)[rows] for name in names})
 
 
 def arrivals_together(parts: Sequence[Arrivals]) -> Arrivals:

@@ -34,7 +34,9 @@ III (1971), Sec. 10.2, for the bound.
 """
 
 import math
-from collections.abc import Sequence
+import os
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple, Protocol
@@ -160,11 +162,12 @@ def coupling(call: Call) -> float:
 
 if TYPE_CHECKING:
     from scipy.interpolate import CubicSpline
+    from soundfile import SoundFile
 
 FINER = 8
 """Interpolation factor of a recorded call."""
 LEAST_SAMPLES = 10
-"""Fewest samples of a recorded call."""
+"""Fewest samples of a call."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -261,13 +264,18 @@ def with_calls(layer: Layer) -> Layer:
 
 
 def read_call(path: Path, frequency: float, duration: float, where: str) -> RecordedCall:
-    """Read a call from a sound file of one channel; raise if it is not suitable.
+    """Read a call from a sound file of a single channel; raise if it is not suitable.
 
     `frequency`: centre of its band [Hz]; `duration`: longest allowed [s]; `where`: the setting that
     names the file, for errors.
     """
-    rate, samples = _samples(path, where)
-    place, longest = f"{where}: {path}", round(duration * rate)
+    place = f"{where}: {path}"
+    with opened_sound(path, place) as file, sound_faults(place):
+        if file.channels != 1 or not LEAST_SAMPLES <= file.frames <= 10 * file.samplerate:
+            found = f"{file.channels} channels and {file.frames} samples"
+            raise refusal(place, found, "a sound file of a single call", "save one call alone")
+        rate, samples = float(file.samplerate), file.read(dtype="float64")
+    longest = round(duration * rate)
     if not LEAST_SAMPLES <= samples.size <= longest:
         fix = "cut it, or set emitter.pulse, which all calls last"
         expected = f"{LEAST_SAMPLES} to {longest} ({duration:g} s)"
@@ -284,30 +292,43 @@ def read_call(path: Path, frequency: float, duration: float, where: str) -> Reco
     return RecordedCall(str(path), frequency, duration, rate, samples)
 
 
-def _samples(path: Path, where: str) -> tuple[float, Float[np.ndarray, " n"]]:
-    """Return rate and samples of a sound file of one channel; raise if it cannot be read."""
+def opened_sound(path: Path, where: str) -> "SoundFile":
+    """Open a sound file; raise if it is missing, empty or cannot be read; `where`: for errors."""
     try:
         import soundfile
     except ImportError:
         raise InputError(
-            f"{where}: {path} is read by the package soundfile, which is not installed; install it "
-            "by python -m pip install 'pipistrelle[sound]'"
+            f"{where}: is read by the package soundfile, which is not installed; install it by "
+            "python -m pip install 'pipistrelle[sound]'"
         ) from None
-    expected = f"{TONE!r}, {SWEEP!r}, or a sound file of one channel"
     check_ordinary(path)
     if not path.exists():
-        raise refusal(where, f"{str(path)!r}, no such file", expected, "check the path")
+        found = "a link to no file" if path.is_symlink() else "no such file"
+        raise refusal(where, found, "a sound file", "add it, or correct its name")
+    with sound_faults(where):
+        if not path.stat().st_size:
+            raise refusal(where, "an empty file", "a sound file", "copy it again")
+        name: Any = os.fsencode(path)  # bytes, as text that is not UTF-8 is refused
+        return soundfile.SoundFile(name)
+
+
+@contextmanager
+def sound_faults(where: str) -> Iterator[None]:
+    """Turn failures of soundfile into errors that name the file."""
+    from soundfile import SoundFileError
+
     try:
-        with soundfile.SoundFile(path) as file:
-            if file.channels != 1 or not LEAST_SAMPLES <= file.frames <= 10 * file.samplerate:
-                found = f"{path} with {file.channels} channels and {file.frames} samples"
-                raise refusal(where, found, expected, "save one call alone")
-            return float(file.samplerate), file.read(dtype="float64")
-    except (soundfile.SoundFileError, OSError, ValueError, TypeError) as error:
-        if isinstance(error, InputError):
-            raise
-        found = f"{path}, no sound that can be read"
-        raise refusal(where, found, expected, "convert it to WAV") from None
+        yield
+    except InputError:
+        raise
+    except PermissionError:
+        fix = "give yourself the permission to read it"
+        raise refusal(where, "a file that may not be read", "a sound file", fix) from None
+    except (SoundFileError, OSError, ValueError, TypeError, OverflowError) as error:
+        what: Any = str(error).strip().splitlines() or [type(error).__name__]
+        found = what[-1].removeprefix("Error opening ").strip(" .")
+        raise refusal(where, f"no sound that can be read ({found[-120:]})", "a sound file",
+                      "convert it to WAV or FLAC") from None  # fmt: skip
 
 
 ENERGY = 0.995
@@ -365,6 +386,37 @@ def extent_of(call: Call, rate: float) -> tuple[float, float]:
     band = band_of(call, rate)
     ends = (call.start, call.end) if isinstance(call, Sweep) else (call.frequency,)
     return min(band.low, *ends), max(band.high, *ends)
+
+
+def is_whole(count: float) -> bool:
+    """Return whether a number is an integer from 1, up to rounding."""
+    return round(count) >= 1 and abs(count - round(count)) <= 1e-6
+
+
+def check_sampled(
+    call: Call, rate: float, *, where: str, duration: str, named: str = "sample rate"
+) -> None:
+    """Raise if a sample rate [Hz] is too low for a call.
+
+    For errors: `where`, the caller's section; `duration`, the setting of the call's duration;
+    `named`, the name of the rate.
+    """
+    if call.duration * rate < LEAST_SAMPLES:
+        found = f"{call.duration:g} s, {call.duration * rate:.3g} samples at {rate:g} Hz"
+        raise refusal(duration, found, f"{LEAST_SAMPLES} or more", "correct one of them")
+    low, high = extent_of(call, rate)
+    if not 0.0 < low <= high < rate / 2.0:
+        found = f"a call of {low:.0f} to {high:.0f} Hz, the edges of its spectrum included"
+        expected = f"one between 0 and half the {named} of {rate:g} Hz"
+        fix = "correct one of them"
+        if isinstance(call, ToneBurst):
+            found = f"a tone of {call.frequency:g} Hz"
+        elif isinstance(call, Sweep):
+            begin, end = sorted((call.start, call.end))
+            found = f"a sweep of {begin:g} to {end:g} Hz, whose edges reach from {low:.0f} to"
+            found += f" {high:.0f} Hz"
+            fix += ", or fade the call's ends in and out ('taper')"
+        raise refusal(where, found, expected, fix)
 
 
 def cross_talk(calls: Sequence[Call], rate: float) -> Float[np.ndarray, "c c"]:

@@ -135,7 +135,7 @@ def spread_towards(
 
     Weighted by the squared weights. Times the wavenumber squared it is :math:`\kappa`, the squared
     slope of the phases in the bearing in the Cramer-Rao bound
-    (`pipistrelle.detection.full_circle`).
+    (`pipistrelle.detection.beams`).
 
     >>> pair, equal = np.array([[0.0, 0.1], [0.0, -0.1]]), np.full(2, 0.5**0.5)
     >>> spread_towards(np.array([0.0, np.pi / 2]), pair, equal).round(9)

@@ -86,7 +86,7 @@ def add_echo_blocks(
         _add_scattered_blocks(signal[:, 0], sounds, grid, *each)
         return
     ears = layout.normal, layout.position, sampling.speed_of_sound
-    _add_echo_blocks(signal.view(np.float64), sounds, grid, ears)
+    _add_echo_blocks(signal.view(np.float64), sounds, grid, *ears)
 
 
 def _heard_by_each(
@@ -119,17 +119,25 @@ def record_samples(
     """
     shape = (blocks * sampling.block, *layout.shape)
     signal = _noise(shape, sampling, rng, single=single)
-    duration = _durations(arrivals, sampling)
+    c, duration = sampling.speed_of_sound, _durations(arrivals, sampling)
     if isinstance(layout, Scattered):
-        _add_scattered_samples(signal[:, 0], arrivals, duration, layout, sampling)
+        early, gain = _heard_by_each(arrivals, layout, c)
+        for a, e in np.argwhere(gain > 0.0):
+            n, wave = _wave(len(signal), arrivals, a, early[a, e], duration[a], sampling)
+            wave = gain[a, e] * wave
+            signal[n, 0, e] += wave.real if sampling.real else wave
         return signal
-    for a in range(arrivals.delay.size):
-        call = sampling.calls[arrivals.caller[a]]
-        for f in range(layout.normal.size):
-            angle = arrivals.bearing[a] - layout.normal[f]
-            if math.cos(angle) >= 0.0:
-                add = _add_tone if isinstance(call, ToneBurst) else _add_wave
-                add(signal[:, f], arrivals, a, duration[a], angle, layout, sampling)
+    angles = arrivals.bearing[:, np.newaxis] - layout.normal
+    for a, f in np.argwhere(np.cos(angles) >= 0.0):
+        if isinstance(sampling.calls[arrivals.caller[a]], ToneBurst):
+            n, wave = _wave(len(signal), arrivals, a, 0.0, duration[a], sampling)
+            phases = layout.phases(angles[a, f], arrivals.frequency[a], c)
+            wave = np.outer(wave, np.exp(1j * phases))
+            signal[n, f] += wave.real if sampling.real else wave
+            continue
+        for e, early in enumerate(layout.position * math.sin(angles[a, f]) / c):
+            n, wave = _wave(len(signal), arrivals, a, early, duration[a], sampling)
+            signal[n, f, e] += wave.real if sampling.real else wave
     return signal
 
 
@@ -147,68 +155,16 @@ def _noise(
     return signal
 
 
-def _add_tone(
-    heard: Complex[np.ndarray, "t e"] | Float[np.ndarray, "t e"],
-    arrivals: Arrivals,
-    a: int,
-    duration: float,
-    angle: float,
-    layout: Layout,
-    sampling: Sampling,
-) -> None:
-    """Add an arrival with the same envelope at all elements of a face."""
-    n, pulse = _sound(heard, arrivals, a, arrivals.delay[a], duration, sampling)
-    phases = layout.phases(angle, arrivals.frequency[a], sampling.speed_of_sound)
-    wave = np.outer(pulse, np.exp(1j * phases))
-    heard[n] += wave.real if sampling.real else wave
-
-
-def _add_wave(
-    heard: Complex[np.ndarray, "t e"] | Float[np.ndarray, "t e"],
-    arrivals: Arrivals,
-    a: int,
-    duration: float,
-    angle: float,
-    layout: Layout,
-    sampling: Sampling,
-) -> None:
-    """Add an arrival to the elements of a face, each with its time of arrival."""
-    for e, early in enumerate(layout.position * math.sin(angle) / sampling.speed_of_sound):
-        n, pulse = _sound(heard, arrivals, a, arrivals.delay[a] - early, duration, sampling)
-        heard[n, e] += pulse.real if sampling.real else pulse
-
-
-def _sound(
-    heard: Complex[np.ndarray, "t e"] | Float[np.ndarray, "t e"],
-    arrivals: Arrivals,
-    a: int,
-    delay: float,
-    duration: float,
-    sampling: Sampling,
+def _wave(
+    length: int, arrivals: Arrivals, a: int, early: float, duration: float, sampling: Sampling
 ) -> tuple[slice, Complex[np.ndarray, " n"]]:
-    """Return the range of samples of an arrival with a delay [s], and its waveform there."""
-    first, rate = sampling.pulse * sampling.block, sampling.rate
+    """Return the samples of an arrival with a lead [s] in a record of a length, and its wave."""
+    first, rate, delay = sampling.pulse * sampling.block, sampling.rate, arrivals.delay[a] - early
     start = max(math.ceil(delay * rate), first)
-    stop = max(min(math.ceil((delay + duration) * rate), first + len(heard)), start)
+    stop = max(min(math.ceil((delay + duration) * rate), first + length), start)
     call = sampling.calls[arrivals.caller[a]]
     sound = call.waveform(np.arange(start, stop) / rate - delay, arrivals.frequency[a])
     return slice(start - first, stop - first), 10.0 ** (arrivals.level_db[a] / 20.0) * sound
-
-
-def _add_scattered_samples(
-    signal: Complex[np.ndarray, "t e"] | Float[np.ndarray, "t e"],
-    arrivals: Arrivals,
-    duration: Float[np.ndarray, " a"],
-    layout: Scattered,
-    sampling: Sampling,
-) -> None:
-    """Add every sample of arrivals to a recording by microphones in any positions."""
-    early, gain = _heard_by_each(arrivals, layout, sampling.speed_of_sound)
-    for a, e in np.argwhere(gain > 0.0):
-        delay = arrivals.delay[a] - early[a, e]
-        n, pulse = _sound(signal, arrivals, a, delay, duration[a], sampling)
-        pulse = gain[a, e] * pulse
-        signal[n, e] += pulse.real if sampling.real else pulse
 
 
 def _durations(arrivals: Arrivals, sampling: Sampling) -> Float[np.ndarray, " a"]:
@@ -237,24 +193,6 @@ class _Grid(NamedTuple):
     """Samples per block."""
     blank: int
     """Blocks before the first that is recorded."""
-
-
-class _Ears(NamedTuple):
-    """A layout of arrays, and the speed of sound around it."""
-
-    normal: Float[np.ndarray, " f"]
-    position: Float[np.ndarray, " e"]
-    speed_of_sound: float
-
-
-class _Room(NamedTuple):
-    """Work arrays of an arrival, overwritten by the next."""
-
-    sums: Complex[np.ndarray, "c b"]
-    """Block sums of its envelope, per tone."""
-    direct: Float[np.ndarray, " i"]
-    turned: Float[np.ndarray, " i"]
-    """`direct` and `turned`: its steering vector and i times that, as real and imaginary pairs."""
 
 
 @kernel
@@ -291,9 +229,15 @@ def _envelope(
 
 
 @no_alloc
-def _steer(room: _Room, phasor: complex, wave: float, position: Float[np.ndarray, " e"]) -> None:
+def _steer(
+    direct: Float[np.ndarray, " i"],
+    turned: Float[np.ndarray, " i"],
+    phasor: complex,
+    wave: float,
+    position: Float[np.ndarray, " e"],
+) -> None:
     """Write a phasor times each element's phase, and i times that, parts interleaved."""
-    elements, direct, turned = position.size, room.direct, room.turned
+    elements = position.size
     for e in range(elements):
         mirror = elements - 1 - e
         if mirror < e and position[e] == -position[mirror]:
@@ -310,38 +254,34 @@ def _steer(room: _Room, phasor: complex, wave: float, position: Float[np.ndarray
 
 @no_alloc
 def _add_echo(
-    heard: Float[np.ndarray, "b f c i"],
-    room: _Room,
-    phasor: complex,
-    bearing: float,
-    frequency: float,
-    ears: _Ears,
+    heard: Float[np.ndarray, "b c i"],
+    sums: Complex[np.ndarray, "c b"],
+    direct: Float[np.ndarray, " i"],
+    turned: Float[np.ndarray, " i"],
 ) -> None:
-    """Add an arrival's envelope, times its steering vector, to its blocks."""
-    sums, direct, turned = room.sums, room.direct, room.turned
-    for f in range(ears.normal.size):
-        angle = bearing - ears.normal[f]
-        if math.cos(angle) < 0.0:
-            continue
-        wave = 2.0 * math.pi * frequency * math.sin(angle) / ears.speed_of_sound
-        _steer(room, phasor, wave, ears.position)
-        for b in range(heard.shape[0]):
-            for p in range(heard.shape[2]):
-                re, im, parts = sums[p, b].real, sums[p, b].imag, heard[b, f, p]
-                for i in range(parts.size):
-                    parts[i] += re * direct[i] + im * turned[i]
+    """Add an arrival's envelope, times its steering vector, to the blocks of a face."""
+    for b in range(heard.shape[0]):
+        for p in range(heard.shape[1]):
+            re, im, parts = sums[p, b].real, sums[p, b].imag, heard[b, p]
+            for i in range(parts.size):
+                parts[i] += re * direct[i] + im * turned[i]
 
 
 @kernel
 def _add_echo_blocks(
-    signal: Float[np.ndarray, "b f c i"], sounds: tuple, grid: tuple, ears: tuple
+    signal: Float[np.ndarray, "b f c i"],
+    sounds: tuple,
+    grid: tuple,
+    normal: Float[np.ndarray, " f"],
+    position: Float[np.ndarray, " e"],
+    speed_of_sound: float,
 ) -> None:
     """Add every arrival to interleaved block sums, with real and imaginary parts as neighbours."""
-    sound, on, array = _Sounds(*sounds), _Grid(*grid), _Ears(*ears)
+    sound, on = _Sounds(*sounds), _Grid(*grid)
     blocks, _, tones, parts = signal.shape
     rate, block, blank = on.rate, on.block, on.blank
     sums = np.empty((tones, blocks), dtype=np.complex128)
-    room = _Room(sums, np.empty(parts), np.empty(parts))
+    direct, turned = np.empty(parts), np.empty(parts)
     for a in range(sound.delay.size):
         delay, frequency = sound.delay[a], sound.frequency[a]
         start = max(math.ceil(delay * rate), blank * block)
@@ -355,8 +295,13 @@ def _add_echo_blocks(
         turns = -2.0 * math.pi * frequency * delay
         phasor = sound.amplitude[a] * complex(math.cos(turns), math.sin(turns))
         first = start // block - blank
-        touched = signal[first : first + count]
-        _add_echo(touched, room, phasor, sound.bearing[a], frequency, array)
+        for f in range(normal.size):
+            angle = sound.bearing[a] - normal[f]
+            if math.cos(angle) < 0.0:
+                continue
+            wave = 2.0 * math.pi * frequency * math.sin(angle) / speed_of_sound
+            _steer(direct, turned, phasor, wave, position)
+            _add_echo(signal[first : first + count, f], sums, direct, turned)
 
 
 @kernel

@@ -8,7 +8,14 @@ import numpy as np
 from jaxtyping import Float
 
 from pipistrelle.acoustics.arrivals import Arrivals
-from pipistrelle.acoustics.call import MAX_CROSS_TALK, Call, ToneBurst, cross_talk, extent_of
+from pipistrelle.acoustics.call import (
+    MAX_CROSS_TALK,
+    Call,
+    ToneBurst,
+    check_sampled,
+    cross_talk,
+    is_whole,
+)
 from pipistrelle.acoustics.paths import MAX_CALLERS, Caller, check_caller
 from pipistrelle.acoustics.propagation import Medium, medium_of
 from pipistrelle.arrays.layout import Layout, Scattered
@@ -16,8 +23,6 @@ from pipistrelle.config import BLOCK, SQUARE, Config, InputError
 
 LEAST_RATE, LARGEST_RATE = 8e3, 1e6
 """Rates of real samples [Hz]."""
-LEAST_SAMPLES = 10
-"""Fewest samples of a call."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -76,7 +81,7 @@ def sampling(
         raise InputError(
             f"callers: found {len(callers)}, expected 1 to {MAX_CALLERS}; leave some out"
         )
-    whole = _is_whole(rate * BLOCK) and _is_whole(pulse / BLOCK)
+    whole = is_whole(rate * BLOCK) and is_whole(pulse / BLOCK)
     length = round(pulse / BLOCK) * BLOCK if whole else pulse
     calls = tuple(caller.sound or call(caller.frequency, length) for caller in callers)
     tones, odd = all(isinstance(one, ToneBurst) for one in calls), off_raster(config, callers)
@@ -119,16 +124,11 @@ def off_raster(config: Config, callers: Sequence[Caller]) -> str | None:
         *((key, one.frequency, "Hz", one.frequency * BLOCK) for key, one in tones),
         ("emitter.pulse", pulse, "s", pulse / BLOCK),
     ):
-        if not _is_whole(count):
+        if not is_whole(count):
             step = f"{BLOCK:g} s" if unit == "s" else f"{1 / BLOCK:g} Hz"
             free = free_tones(config, callers, value) if key in keys else ""
             return f"{key}: found {value:g} {unit}, expected a multiple of {step}{free}"
     return None
-
-
-def _is_whole(count: float) -> bool:
-    """Return whether a number is an integer from 1, up to rounding."""
-    return round(count) >= 1 and abs(count - round(count)) <= 1e-6
 
 
 def _keys(callers: Sequence[Caller]) -> list[str]:
@@ -145,18 +145,8 @@ def _refuse_undersampled(config: Config, callers: Sequence[Caller], calls: Seque
             f"{LEAST_RATE:g} to {LARGEST_RATE:g} Hz"
         )
     for caller, call in zip(callers, calls, strict=True):
-        where = caller.key or caller.name
-        if call.duration * rate < LEAST_SAMPLES:
-            raise InputError(
-                f"emitter.pulse: found {call.duration:g} s, {call.duration * rate:.3g} samples at "
-                f"{rate:g} Hz; expected {LEAST_SAMPLES} or more"
-            )
-        low, high = extent_of(call, rate)
-        if not 0.0 < low <= high < rate / 2.0:
-            raise InputError(
-                f"{where}: found a call of {low:.0f} to {high:.0f} Hz, expected one between 0 and "
-                f"half the receiver.sample_rate of {rate:g} Hz; correct one of them"
-            )
+        named = {"duration": "emitter.pulse", "named": "receiver.sample_rate"}
+        check_sampled(call, rate, where=caller.key or caller.name, **named)
     share = cross_talk(calls, rate)
     np.fill_diagonal(share, 0.0)
     j, i = divmod(int(share.argmax()), len(callers))

@@ -20,6 +20,7 @@ the level of these blocks and the residual of the fit:
 """
 
 import math
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -196,36 +197,38 @@ def _fitted(gain: Complex[np.ndarray, "k e"], k: Whole, noise: float) -> tuple[f
     return best, std
 
 
-@kernel
 def direct_calls(
-    matched: Complex[np.ndarray, "l f c e"],
-    whole: Int[np.ndarray, "2 d"],
-    numbers: Float[np.ndarray, "5 d"],
-    tones: Whole,
+    heard: tuple[Int[np.ndarray, " d"], Float[np.ndarray, " d"], Float[np.ndarray, " d"]],
+    powers: Sequence[Float[np.ndarray, " d"]],
     lags: Lags,
-) -> tuple[Int[np.ndarray, " c"], Float[np.ndarray, "2 c"]]:
+    edge: Callable[[int, int, int], tuple[float, float]],
+    lead: Float[np.ndarray, " d"] | None = None,
+) -> DirectCalls:
     """Find the direct call of every other caller, by loudness and order, and its beginning.
 
-    ``whole``: face and caller of each detection; ``numbers``: delay, sine of the angle, power, and
-    the standard deviations of bearing and delay. Returns the columns of `DirectCalls`; if the call
-    began before the record, or its edge is too faint, the time of the best fit of a whole call.
+    `heard`: caller, delay and the delay's standard deviation of each detection; `powers`: for each
+    caller, of the detections of its kind of call; `edge`: finds the beginning of the call of a
+    detection, a caller and a lag (`front_edge`); `lead`: of the microphones of each detection over
+    the vehicle's centre [s]. If the call began before the record, or its edge is too faint, its
+    time is that of the best fit of a whole call.
     """
-    start, interval, pulse = lags
-    found = np.full(tones, -1, dtype=np.int64)
-    when = np.full((2, tones), np.nan)
-    for p in range(1, tones):
-        d = loudest_first(whole[1], numbers[0], numbers[2], p)
-        if d < 0 or may_leak(numbers[0], numbers[2], d, pulse * interval):
+    (caller, delay, std), length = heard, lags.pulse * lags.interval
+    detection, when = np.full(len(powers), -1), np.full((2, len(powers)), np.nan)
+    for p, power in enumerate(powers[1:], start=1):
+        d = int(loudest_first(caller, delay, power, p))
+        if d < 0 or may_leak(delay, power, d, length):
             continue
-        b = int((numbers[0, d] - start) / interval + 0.5)
-        lag, std = math.nan, math.nan
-        if b > pulse + reach_of(pulse):
-            lag, std = front_edge(matched, b, whole[0, d], p, pulse, MIN_EDGE_ENERGY)
-        if std != math.inf:
-            found[p], when[0, p], when[1, p] = d, start + interval * lag, interval * std
-        if math.isnan(std):
-            when[0, p], when[1, p] = numbers[0, d], numbers[4, d]
-    return found, when
+        ahead = 0.0 if lead is None else lead[d]
+        b = int((delay[d] - ahead - lags.start) / lags.interval + 0.5)
+        lag, lag_std = math.nan, math.nan
+        if b > lags.pulse + reach_of(lags.pulse):
+            lag, lag_std = edge(d, p, b)
+        if lag_std != math.inf:
+            detection[p] = d
+            when[:, p] = lags.start + lags.interval * lag + ahead, lags.interval * lag_std
+        if math.isnan(lag_std):
+            when[:, p] = delay[d], std[d]
+    return DirectCalls(detection=detection, delay=when[0], delay_std=when[1], pulse=length)
 
 
 @no_alloc

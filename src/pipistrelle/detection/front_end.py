@@ -1,23 +1,24 @@
 """The front end: detects calls in matched-filter outputs, and averages faces into measurements.
 
-For a `Layout` of equal lines on faces, `snapshots` detects calls. For microphones anywhere
+For a `Layout` of equal lines on faces, `snapshots` detects tones. For microphones anywhere
 (`Scattered`), each group is searched separately: a line on a face by `snapshots`, any other by
-`full_circle`; bearings and delays are then relative to the vehicle's centre.
+`beams`; bearings and delays are then relative to the vehicle's centre. Calls that are not tones are
+found over their whole band, each separately (`beams`). The leakage of a call into the matched
+filter of another is `acoustics.call.cross_talk`; a detection of no more than twice the leakage of a
+louder call is dropped.
 
-Calls that are not tones are found over their whole band, each separately (`wideband`). The leakage
-of a call into the matched filter of another is `acoustics.call.cross_talk`; a detection of no more
-than twice the leakage of a louder one is dropped.
-
-Several faces may detect one echo. Detections are averaged per label and caller; the label is a
+Several faces may detect the same echo. Detections are averaged per label and caller; the label is a
 landmark's or, without labels, the number of the echo: detections of one call, time and direction
 (`same_echo`). In a scan without labels, the direct calls of other callers are found by
 `pipistrelle.detection.direct`.
 """
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
-from functools import cache, partial
+from functools import cache
+from itertools import product
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Complex, Float, Int
@@ -25,17 +26,24 @@ from jaxtyping import Bool, Complex, Float, Int
 from pipistrelle.acoustics.call import Call, ToneBurst, cross_talk
 from pipistrelle.arrays.layout import Layout, Scattered, along_line
 from pipistrelle.config import Config, InputError
+from pipistrelle.detection.beams import (
+    MARGIN,
+    Circle,
+    Wide,
+    circle_of,
+    edge_around,
+    find_around,
+    find_wide,
+    wide_of,
+)
 from pipistrelle.detection.direct import (
     MIN_EDGE_ENERGY,
     DirectCalls,
     Lags,
+    direct_calls,
     front_edge,
-    loudest_first,
-    may_leak,
     without_calls,
 )
-from pipistrelle.detection.full_circle import Circle, circle_of, edge_around, find_around
-from pipistrelle.detection.matched import reach_of
 from pipistrelle.detection.noise import (
     BEARING_FLOOR,
     DIRECT_FLOOR,
@@ -71,7 +79,6 @@ from pipistrelle.detection.snapshots import (
     direct_of_faces,
     joined,
 )
-from pipistrelle.detection.wideband import MARGIN, Wide, find_wide, wide_of
 from pipistrelle.geometry import wrap_angle
 from pipistrelle.jit import Whole, kernel
 
@@ -126,13 +133,18 @@ def average_faces(
     >>> np.degrees(rows.bearing).round(6), rows.range.round(6)
     (array([41.]), array([3.43]))
     """
-    labels, clutter = _distinct(label)
-    found, direct = tuple(columns_of(detections)), tuple(detections.direct or _NO_DIRECT)
+    direct = detections.direct or DirectCalls(np.empty(0, np.int64), np.empty(0), np.empty(0), 0.0)
+    found, known = tuple(columns_of(detections)), label != UNLABELLED
     landmark, caller, numbers = _average(
-        labels, label, found, direct, averaging == "weighted", speed_of_sound
+        np.unique(label[known]),
+        label,
+        found,
+        tuple(direct),
+        averaging == "weighted",
+        speed_of_sound,
     )
     rows = Scan(time=time, landmark=landmark, caller=caller, numbers=numbers, callers=callers)
-    return FrameMeasurements(rows=rows, clutter=int(clutter))
+    return FrameMeasurements(rows=rows, clutter=int(label.size - known.sum()))
 
 
 def same_echo(
@@ -153,31 +165,7 @@ def same_echo(
     array([0, 0, 1])
     """
     order = np.argsort(-detections.power, kind="stable")
-    found = columns_of(detections)
-    return _number(order, found, delay_gate, bearing_gate)
-
-
-_NO_DIRECT = DirectCalls(np.empty(0, np.int64), np.empty(0), np.empty(0), 0.0)
-
-
-@kernel
-def _distinct(label: Int[np.ndarray, " d"]) -> tuple[Int[np.ndarray, " n"], Whole]:
-    """Return the sorted distinct labels, and the number of detections without a label."""
-    labels, count, clutter = np.empty_like(label), 0, 0
-    for d in range(label.size):
-        if label[d] == UNLABELLED:
-            clutter += 1
-            continue
-        place = count
-        while place > 0 and labels[place - 1] > label[d]:
-            place -= 1
-        if place > 0 and labels[place - 1] == label[d]:
-            continue
-        for i in range(count, place, -1):
-            labels[i] = labels[i - 1]
-        labels[place] = label[d]
-        count += 1
-    return labels[:count].copy(), clutter
+    return _number(order, columns_of(detections), delay_gate, bearing_gate)
 
 
 @kernel
@@ -220,31 +208,18 @@ def _average(
                 floor = BEARING_FLOOR[0] if p == OWN else BEARING_FLOOR[1]
                 numbers[BEARING_STD, row] = math.hypot(math.sqrt(across) / total, floor)
                 delay, spread = late / total, math.sqrt(along) / total
-                delay = _after(direct, p, delay, spread) if p != OWN else (delay, spread)
-                _write_way(numbers, row, p == OWN, delay, speed_of_sound)
+                if p == OWN:
+                    metres = 0.5 * speed_of_sound
+                    numbers[RANGE, row] = metres * delay
+                    numbers[RANGE_STD, row] = math.hypot(metres * spread, RANGE_FLOOR)
+                elif p < direct.delay.size and delay - direct.delay[p] >= direct.pulse:
+                    spread = speed_of_sound * math.hypot(spread, direct.delay_std[p])
+                    numbers[EXCESS_PATH, row] = speed_of_sound * (delay - direct.delay[p])
+                    numbers[EXCESS_PATH_STD, row] = math.hypot(spread, EXCESS_PATH_FLOOR)
                 numbers[SLOPE, row] = slope / total
                 numbers[LEVEL, row] = 10.0 * math.log10(loudest)
                 row += 1
     return landmark[:row], caller[:row], numbers[:, :row].copy()
-
-
-@kernel
-def _write_way(
-    numbers: Float[np.ndarray, "8 m"],
-    row: Whole,
-    own: bool,
-    delay: tuple[float, float],
-    speed_of_sound: float,
-) -> None:
-    """Write the range from the delay of the vehicle's own call, else the excess path."""
-    late, spread = delay
-    if own:
-        metres = 0.5 * speed_of_sound
-        numbers[RANGE, row] = metres * late
-        numbers[RANGE_STD, row] = math.hypot(metres * spread, RANGE_FLOOR)
-    else:
-        numbers[EXCESS_PATH, row] = speed_of_sound * late
-        numbers[EXCESS_PATH_STD, row] = math.hypot(speed_of_sound * spread, EXCESS_PATH_FLOOR)
 
 
 @kernel
@@ -262,14 +237,6 @@ def _take_strongest(
             best = strongest[found.face[d]]
             if best < 0 or found.power[d] > found.power[best]:
                 strongest[found.face[d]] = d
-
-
-@kernel
-def _after(direct: DirectCalls, caller: Whole, delay: float, std: float) -> tuple[float, float]:
-    """Return an echo's delay after its caller's direct call [s], and its deviation; else NaN."""
-    if caller >= direct.delay.size or not delay - direct.delay[caller] >= direct.pulse:
-        return math.nan, math.nan
-    return delay - direct.delay[caller], math.hypot(std, direct.delay_std[caller])
 
 
 @kernel
@@ -332,53 +299,53 @@ def unlabelled_scan(
         averaging=config.detection.averaging,
         speed_of_sound=config.assumed_sound_speed,
     )
-    return _with_unsure_calls(without_labels(averaged.rows, callers)), echo
-
-
-def _with_unsure_calls(scan: Scan) -> Scan:
-    """Add `DIRECT_FLOOR` to the bearing standard deviation of direct calls."""
+    scan = without_labels(averaged.rows, callers)
     rows, numbers = scan.direct[scan.direct >= 0], scan.numbers.copy()
     numbers[BEARING_STD, rows] = np.hypot(numbers[BEARING_STD, rows], DIRECT_FLOOR)
-    return replace(scan, numbers=numbers)
+    return replace(scan, numbers=numbers), echo
+
+
+class Finder(NamedTuple):
+    """A detector of some callers' calls at some of the microphones."""
+
+    callers: Int[np.ndarray, " c"]
+    group: int
+    """Number of the face or group; 0 for all faces of a layout at once."""
+    faces: slice
+    members: Int[np.ndarray, " k"] | slice
+    """`faces` and `members`: rows and indices of its microphones in a recording."""
+    detector: Detector | Circle | Wide
+    """Detector of tones on faces, of tones at omnidirectional microphones, or of another call."""
+    lead: Float[np.ndarray, "2"]
+    """Phase centre of a line, over the speed of sound [s]; 0 for other groups."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Groups:
-    """Detectors of microphones anywhere, for each group."""
+class Finders:
+    """Detectors of microphones anywhere, or of calls that are not all tones."""
 
-    members: tuple[Int[np.ndarray, " k"], ...]
-    """Microphones of each group."""
-    finders: tuple[Detector | Circle, ...]
-    """Detector of each group: a `Detector` for a line on a face, else a `Circle`."""
-    centre: Float[np.ndarray, "f 2"]
-    """Phase centre of each line; the origin for other groups [m]."""
-    speed_of_sound: float
+    finders: tuple[Finder, ...]
+    narrow: Int[np.ndarray, " n"]
+    """Callers of tones, and the vehicle."""
+    silent: bool
+    """Whether the vehicle's call is not a tone."""
+    talk: Float[np.ndarray, "c c"]
+    """Share of a call's power (column) in the filter of another (row), unless all are tones."""
     least_snr: float
     """Least signal-to-noise ratio of an output of gain 0 dB for a detection, as a power ratio."""
     from_start: bool
     """Whether outputs keep the phase of the record's start, not of a call at their lag."""
 
+    def of(self, caller: int, group: int) -> Finder:
+        """Return the detector of a caller's calls in a group.
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Mixed:
-    """Detectors of calls that are not all tones."""
-
-    tones: "FrontEnd"
-    """Detector of the tones; its caller 0 is the vehicle, even if that sends no tone."""
-    narrow: Int[np.ndarray, " n"]
-    """Callers of the tones, and the vehicle."""
-    silent: bool
-    """Whether the vehicle's call is not a tone."""
-    wide: tuple[tuple[int, int, Wide], ...]
-    """Detectors of the other calls: caller, group, detector."""
-    layout: Layout | Scattered
-    talk: Float[np.ndarray, "c c"]
-    """Share of a call's power (column) in the filter of another (row); 0 on the diagonal."""
-    least_snr: float
-    """Least signal-to-noise ratio of an output of gain 0 dB for a detection, as a power ratio."""
+        The detectors of tones come first, and include the vehicle even if it is silent.
+        """
+        heard = (one for one in reversed(self.finders) if caller in one.callers)
+        return next(one for one in heard if one.group == group or isinstance(one.members, slice))
 
 
-FrontEnd = Detector | Groups | Mixed
+FrontEnd = Detector | Finders
 
 
 def front_end(
@@ -398,41 +365,64 @@ def front_end(
     >>> from pipistrelle.arrays.layout import scattered
     >>> cross = [(0.02, 0.0), (0.0, 0.02), (-0.02, 0.0), (0.0, -0.02)]
     >>> layout = scattered(microphones_of([(x, y, 0.0, 0.0, "") for x, y in cross]))
-    >>> found = front_end(Config(), layout, np.array([35e3, 30e3]))
-    >>> round(found.finders[0].threshold, 1), found.finders[0].beams
+    >>> found = front_end(Config(), layout, np.array([35e3, 30e3])).finders[0].detector
+    >>> round(found.threshold, 1), found.beams.bearing.size
     (18.8, 143)
     """
-    if not all(isinstance(call, ToneBurst) for call in calls):
-        return _mixed(config, layout, tones, where, calls)
-    config = _leaking(config, calls)
-    if isinstance(layout, Layout):
-        return detector(config, layout, tones)
-    members, finders, snrs = [], [], []
-    centre = np.zeros((layout.normal.size, 2))
-    for g, normal in enumerate(layout.normal):
-        if math.isnan(normal):
-            members.append(layout.members(g)[1])
-            position, gain = layout.places(g)
-            _refuse_lines_own(config, where)
-            wavelength = config.assumed_sound_speed / tones.max()
-            _refuse_far_apart(position, wavelength, where)
-            finders.append(circle_of(config, layout, g, tones))
-            snrs.append((finders[-1].threshold - 1.0) / np.sum(gain**2))
-        else:
-            line, alone = along_line(layout, g)
-            members.append(line)
-            finders.append(detector(config, alone, tones))
-            centre[g] = layout.position[line].mean(axis=0)
-            gain = np.sum(layout.amplitude[line] ** 2)
-            snrs.append((finders[-1].threshold - line.size) / gain)
-    return Groups(
-        members=tuple(members),
+    wide = [p for p, call in enumerate(calls) if not isinstance(call, ToneBurst)]
+    narrow = np.unique(np.append(0, np.setdiff1d(np.arange(tones.size), wide)))
+    lines = _leaking(config, [call for call in calls if isinstance(call, ToneBurst)])
+    if isinstance(layout, Layout) and not wide:
+        return detector(lines, layout, tones)
+    found = list(_tone_finders(lines, layout, tones[narrow], narrow, where))
+    snrs, finders = [snr for snr, _ in found], [finder for _, finder in found]
+    talk, silent = np.zeros((tones.size, tones.size)), 0 in wide
+    if wide:
+        talk, snrs = cross_talk(calls, config.receiver.sample_rate), []
+        np.fill_diagonal(talk, 0.0)
+        finders = finders if len(narrow) > silent else []
+    for caller, g in product(wide, range(layout.normal.size)):
+        row, members = layout.members(g)
+        one = wide_of(config, layout, g, calls, caller)
+        faces, alone = slice(row, row + 1), np.array([caller])
+        finders.append(Finder(alone, g, faces, members, one, np.zeros(2)))
+        snrs.append((one.threshold - 1.0) / one.beams.weight.size)
+    return Finders(
         finders=tuple(finders),
-        centre=centre,
-        speed_of_sound=config.assumed_sound_speed,
+        narrow=narrow,
+        silent=silent,
+        talk=talk,
         least_snr=float(min(snrs)),
         from_start=bool(calls),
     )
+
+
+def _tone_finders(
+    config: Config,
+    layout: Layout | Scattered,
+    tones: Float[np.ndarray, " n"],
+    callers: Int[np.ndarray, " n"],
+    where: str,
+) -> Iterator[tuple[float, Finder]]:
+    """Yield the detectors of tones, each with its least signal-to-noise ratio."""
+    if isinstance(layout, Layout):
+        of_all = detector(config, layout, tones)
+        yield math.nan, Finder(callers, 0, slice(None), slice(None), of_all, np.zeros(2))
+        return
+    for g, normal in enumerate(layout.normal):
+        if math.isnan(normal):
+            members, lead = layout.members(g)[1], np.zeros(2)
+            position, gain = layout.places(g)
+            _refuse_lines_own(config, where)
+            _refuse_far_apart(position, config.assumed_sound_speed / tones.max(), where)
+            one = circle_of(config, layout, g, tones)
+            snr = (one.threshold - 1.0) / np.sum(gain**2)
+        else:
+            members, line = along_line(layout, g)
+            one = detector(config, line, tones)
+            lead = layout.position[members].mean(axis=0) / config.assumed_sound_speed
+            snr = (one.threshold - members.size) / np.sum(layout.amplitude[members] ** 2)
+        yield snr, Finder(callers, g, slice(1), members, one, lead)
 
 
 def find_calls(
@@ -447,15 +437,19 @@ def find_calls(
     """Detect bearings and delays of all calls that exceed the noise, as in `detect`.
 
     `around`: returns the outputs also at lags at which a call is only partly in the record, equally
-    many at each end (`BandFilters.around`); without it, such calls are not considered.
+    many at each end (`BandFilters.around`); without it, such calls are not considered, and with it
+    they merely mask fainter ones.
     """
     lags = Lags(start, interval, pulse)
     if isinstance(end, Detector):
         return detect(matched, end, **lags._asdict())
-    if isinstance(end, Mixed):
-        return _of_mixed(matched, end, lags, around and cache(around))
-    found = joined([_of_group(matched, end, g, lags) for g in range(len(end.finders))])
-    return replace(found, direct=_direct_of_groups(matched, end, found, lags))
+    around = around and cache(around)
+    parts, whole = zip(
+        *(_found(matched, end, one, lags, around) for one in end.finders), strict=True
+    )
+    found = joined(parts)
+    found = detections_at(found, np.concatenate(whole) & ~_cross_talk_in(found, end, lags))
+    return replace(found, direct=_direct_of(matched, end, found, lags))
 
 
 def call_in(
@@ -478,8 +472,8 @@ def call_in(
     inside = (begin <= found.delay) & (found.delay < until)
     near = detections_at(found, inside | (found.caller != caller))  # others may leak
     if found.direct is not None:
-        lags = Lags(start, interval, pulse)
-        near = replace(near, direct=_direct_of(matched, end, near, lags))
+        direct = _direct_of(matched, end, near, Lags(start, interval, pulse))
+        near = replace(near, direct=direct)
     return detections_at(near, near.caller == caller)
 
 
@@ -495,95 +489,69 @@ def _leaking(config: Config, tones: Sequence[Call]) -> Config:
     return config.model_copy(update={"detection": found})
 
 
-def _mixed(
-    config: Config,
-    layout: Layout | Scattered,
-    tones: Float[np.ndarray, " c"],
-    where: str,
-    calls: Sequence[Call],
-) -> Mixed:
-    """Build the detectors of calls that are not all tones."""
-    is_tone = np.array([isinstance(call, ToneBurst) for call in calls])
-    narrow = np.unique(np.append(0, np.flatnonzero(is_tone)))
-    talk = cross_talk(calls, config.receiver.sample_rate)
-    np.fill_diagonal(talk, 0.0)
-    wide, snrs = [], []
-    for caller in np.flatnonzero(~is_tone):
-        for g in range(layout.normal.size):
-            finder = wide_of(config, layout, g, calls, int(caller))
-            wide.append((int(caller), g, finder))
-            snrs.append((finder.threshold - 1.0) / finder.weight.size)
-    config = _leaking(config, [call for call in calls if isinstance(call, ToneBurst)])
-    tones_end = front_end(config, layout, tones[narrow], where)
-    if isinstance(tones_end, Groups):
-        tones_end = replace(tones_end, from_start=True)
-    return Mixed(
-        tones=tones_end,
-        narrow=narrow,
-        silent=not is_tone[0],
-        wide=tuple(wide),
-        layout=layout,
-        talk=talk,
-        least_snr=float(min(snrs)),
-    )
-
-
-def _tones_of(matched: Complex[np.ndarray, "l f c e"], end: Mixed) -> Complex[np.ndarray, "..."]:
-    """Select the tones' matched-filter outputs; zero the vehicle's if it sends no tone."""
-    outputs = np.ascontiguousarray(matched[:, :, end.narrow])
+def _outputs(
+    matched: Complex[np.ndarray, "l f c e"], end: Finders, finder: Finder, lags: Lags
+) -> Complex[np.ndarray, "l g n k"]:
+    """Return the outputs of a detector; around a circle, with the phase of a call at their lag."""
+    outputs = np.ascontiguousarray(matched[:, finder.faces, finder.callers][..., finder.members])
+    if isinstance(finder.detector, Wide):
+        return outputs
     if end.silent:
         outputs[:, :, 0] = 0.0
+    if end.from_start and isinstance(finder.detector, Circle):
+        turns = finder.detector.tones * lags.interval
+        if np.abs(turns - np.rint(turns)).max() > 1e-6:
+            phase = np.exp(2j * np.pi * np.outer(np.arange(len(outputs)), turns))
+            outputs = outputs * phase[:, np.newaxis, :, np.newaxis]
     return outputs
 
 
-def _of_mixed(
+def _ahead(finder: Finder, bearing: Float[np.ndarray, "*m"]) -> Float[np.ndarray, "*m"]:
+    """Return the lead of a line over the vehicle's centre for sound from a bearing [s]."""
+    x, y = finder.lead
+    return x * np.cos(bearing) + y * np.sin(bearing)
+
+
+def _found(
     matched: Complex[np.ndarray, "l f c e"],
-    end: Mixed,
+    end: Finders,
+    finder: Finder,
     lags: Lags,
     around: Callable[[], Complex[np.ndarray, "l f c e"]] | None,
-) -> Detections:
-    """Detect tones and other calls; calls only partly in the record merely mask fainter ones."""
-    parts, whole = [], []
-    if len(end.narrow) > end.silent:
-        found = find_calls(_tones_of(matched, end), end.tones, **lags._asdict())
-        parts.append(replace(found, caller=end.narrow[found.caller]))
-        whole.append(np.ones(found.caller.size, dtype=bool))
-    for caller, g, finder in end.wide:
-        row, members = end.layout.members(g)
-        outputs = _of_members(lambda: matched, row, caller, members)
-        more = around and partial(_of_members, around, row, caller, members)
-        numbers, heard = find_wide(outputs, finder, lags, more)
-        delay, bearing, power, across, late, angle = numbers
-        whole.append(heard)
-        parts.append(
-            Detections(
-                face=np.full(delay.size, g),
-                caller=np.full(delay.size, caller),
-                angle=angle,
-                bearing=bearing,
-                delay=delay,
-                power=power,
-                bearing_std=across,
-                delay_std=late,
-            )
+) -> tuple[Detections, Bool[np.ndarray, " m"]]:
+    """Detect calls at a group; also return a mask of the calls that are wholly in the record."""
+    outputs = _outputs(matched, end, finder, lags)
+    if isinstance(finder.detector, Detector):
+        found = detect(outputs, finder.detector, **lags._asdict())
+        found = replace(
+            found,
+            face=finder.group + found.face,
+            caller=finder.callers[found.caller],
+            delay=found.delay + _ahead(finder, found.bearing),
+            direct=None,
         )
-    found = joined(parts)
-    kept = np.concatenate(whole) & ~_cross_talk_in(found, end, lags)
-    found = detections_at(replace(found, direct=None), kept)
-    return replace(found, direct=_direct_of(matched, end, found, lags))
+        return found, np.ones(found.caller.size, dtype=bool)
+    if isinstance(finder.detector, Circle):
+        caller, numbers = find_around(outputs[:, 0], finder.detector, lags)
+        whole = np.ones(caller.size, dtype=bool)
+    else:
+        more = around and (lambda: _outputs(around(), end, finder, lags)[:, 0, 0])
+        numbers, whole = find_wide(outputs[:, 0, 0], finder.detector, lags, more)
+        caller = np.zeros(whole.size, dtype=np.int64)
+    delay, bearing, power, bearing_std, delay_std, angle = numbers
+    return Detections(
+        face=np.full(caller.size, finder.group),
+        caller=finder.callers[caller],
+        angle=angle,
+        bearing=bearing,
+        delay=delay,
+        power=power,
+        bearing_std=bearing_std,
+        delay_std=delay_std,
+    ), whole
 
 
-def _of_members(
-    outputs: Callable[[], Complex[np.ndarray, "l f c e"]],
-    row: int,
-    caller: int,
-    members: Int[np.ndarray, " k"],
-) -> Complex[np.ndarray, "l k"]:
-    """Return a caller's outputs at the microphones of a group."""
-    return np.ascontiguousarray(outputs()[:, row, caller, members])
-
-
-def _cross_talk_in(found: Detections, end: Mixed, lags: Lags) -> Bool[np.ndarray, " m"]:
+def _cross_talk_in(found: Detections, end: Finders, lags: Lags) -> Bool[np.ndarray, " m"]:
     """Return a mask of the detections that may be leakage of a louder call of another caller."""
     near = np.abs(found.delay[:, np.newaxis] - found.delay) <= lags.pulse * lags.interval
     share = end.talk[found.caller[:, np.newaxis], found.caller]
@@ -597,23 +565,25 @@ def _direct_of(
     """Find the direct calls among detections; the time of a wideband call is its peak's."""
     if isinstance(end, Detector):
         return direct_of_faces(matched, found, lags)
-    if isinstance(end, Groups):
-        return _direct_of_groups(matched, end, found, lags)
-    callers, length = len(end.talk), lags.pulse * lags.interval
-    detection, when = np.full(callers, -1), np.full((2, callers), np.nan)
-    rows = np.flatnonzero(np.isin(found.caller, end.narrow))
-    if len(end.narrow) > end.silent:
-        tones = detections_at(replace(found, direct=None), np.isin(found.caller, end.narrow))
-        tones = replace(tones, caller=np.searchsorted(end.narrow, tones.caller))
-        direct = _direct_of(_tones_of(matched, end), end.tones, tones, lags)
-        heard = direct.detection >= 0
-        detection[end.narrow] = np.where(heard, np.append(rows, -1)[direct.detection], -1)
-        when[:, end.narrow] = direct.delay, direct.delay_std
-    for p in range(1, callers):
-        d = -1 if p in end.narrow else int(loudest_first(found.caller, found.delay, found.power, p))
-        if d >= 0 and not may_leak(found.delay, found.power, d, length):
-            detection[p], when[0, p], when[1, p] = d, found.delay[d], found.delay_std[d]
-    return DirectCalls(detection=detection, delay=when[0], delay_std=when[1], pulse=length)
+    tones = np.where(np.isin(found.caller, end.narrow), found.power, 0.0)
+    powers = [tones if p in end.narrow else found.power for p in range(len(end.talk))]
+    whose = zip(found.caller.tolist(), found.face.tolist(), strict=True)
+    finders = [end.of(caller, group) for caller, group in whose]
+
+    def edge(d: int, p: int, b: int) -> tuple[float, float]:
+        finder = finders[d]
+        if isinstance(finder.detector, Wide) or b >= len(matched):
+            return math.nan, math.nan
+        number = int(np.searchsorted(finder.callers, p))
+        outputs, face = _outputs(matched, end, finder, lags), int(found.face[d]) - finder.group
+        if isinstance(finder.detector, Circle):
+            bearing = float(found.bearing[d])
+            return edge_around(outputs[:, 0], finder.detector, lags, b, number, bearing)
+        return front_edge(outputs, b, face, number, lags.pulse, MIN_EDGE_ENERGY)
+
+    bearings = found.bearing.tolist()
+    lead = np.array([_ahead(one, bearing) for one, bearing in zip(finders, bearings, strict=True)])
+    return direct_calls((found.caller, found.delay, found.delay_std), powers, lags, edge, lead)
 
 
 def _refuse_lines_own(config: Config, where: str) -> None:
@@ -635,89 +605,3 @@ def _refuse_far_apart(place: Float[np.ndarray, "k 2"], wavelength: float, where:
             f"{where}: found a microphone {gap:g} m, {gap / wavelength:.0f} waves, from the "
             f"next; expected at most {MAX_SPACING}; if x, y, z are millimetres, divide by 1000"
         )
-
-
-def _outputs(
-    matched: Complex[np.ndarray, "l 1 c e"], end: Groups, g: int, lags: Lags
-) -> Complex[np.ndarray, "l c k"]:
-    """Return a group's outputs; for a circle, with the phase of a call that starts at their lag."""
-    outputs, finder = matched[:, 0, :, end.members[g]].transpose(1, 2, 0), end.finders[g]
-    if end.from_start and isinstance(finder, Circle):
-        turns = finder.tones * lags.interval
-        if np.abs(turns - np.rint(turns)).max() > 1e-6:
-            phase = np.exp(2j * np.pi * np.outer(np.arange(len(outputs)), turns))
-            outputs = outputs * phase[:, :, np.newaxis]
-    return np.ascontiguousarray(outputs)
-
-
-def _of_group(
-    matched: Complex[np.ndarray, "l 1 c e"], end: Groups, g: int, lags: Lags
-) -> Detections:
-    """Detect the calls at one group of microphones."""
-    outputs, finder = _outputs(matched, end, g, lags), end.finders[g]
-    if isinstance(finder, Circle):
-        caller, (delay, bearing, power, bearing_std, delay_std, angle) = find_around(
-            outputs, finder, lags
-        )
-    else:
-        found = detect(outputs[:, np.newaxis], finder, **lags._asdict())
-        caller, bearing, power, angle = found.caller, found.bearing, found.power, found.angle
-        delay, bearing_std = found.delay + _ahead(end, g, bearing), found.bearing_std
-        delay_std = found.delay_std
-    return Detections(
-        face=np.full(caller.size, g),
-        caller=caller,
-        angle=angle,
-        bearing=bearing,
-        delay=delay,
-        power=power,
-        bearing_std=bearing_std,
-        delay_std=delay_std,
-    )
-
-
-def _ahead(
-    end: Groups, g: int, bearing: Float[np.ndarray, "*m"] | float
-) -> Float[np.ndarray, "*m"]:
-    """Return the lead of a line over the vehicle's centre for sound from a bearing [s]."""
-    x, y = end.centre[g] / end.speed_of_sound
-    return x * np.cos(bearing) + y * np.sin(bearing)
-
-
-def _direct_of_groups(
-    matched: Complex[np.ndarray, "l 1 c e"], end: Groups, found: Detections, lags: Lags
-) -> DirectCalls:
-    """Find the direct call of every other caller, and its beginning, as in `direct_calls`."""
-    start, interval, pulse = lags
-    tones, length = matched.shape[2], pulse * interval
-    detection, when = np.full(tones, -1), np.full((2, tones), np.nan)
-    for p in range(1, tones):
-        d = int(loudest_first(found.caller, found.delay, found.power, p))
-        if d < 0 or may_leak(found.delay, found.power, d, length):
-            continue
-        g, bearing = int(found.face[d]), float(found.bearing[d])
-        early = float(_ahead(end, g, bearing))
-        b = int((found.delay[d] - early - start) / interval + 0.5)
-        lag, std = math.nan, math.nan
-        if pulse + reach_of(pulse) < b < len(matched):
-            lag, std = _edge(matched, end, g, lags, (b, p, bearing))
-        if std != math.inf:
-            detection[p] = d
-            when[:, p] = start + interval * lag + early, interval * std
-        if math.isnan(std):
-            when[:, p] = found.delay[d], found.delay_std[d]
-    return DirectCalls(detection=detection, delay=when[0], delay_std=when[1], pulse=length)
-
-
-def _edge(
-    matched: Complex[np.ndarray, "l 1 c e"],
-    end: Groups,
-    g: int,
-    lags: Lags,
-    at: tuple[int, int, float],
-) -> tuple[float, float]:
-    """Return the first lag of a tone's first call in a group, and its standard deviation."""
-    outputs, finder = _outputs(matched, end, g, lags), end.finders[g]
-    if isinstance(finder, Circle):
-        return edge_around(outputs, finder, lags, at)
-    return front_edge(outputs[:, np.newaxis], at[0], 0, at[1], lags.pulse, MIN_EDGE_ENERGY)

@@ -7,8 +7,8 @@ filter's outputs with K echoes is
           u = \frac{2\pi f d}{c} \sin\theta ,
 
 with arbitrary amplitudes s, and noise n of unit variance. A scanned beam has lobes some
-:math:`2\pi / N` wide in u: two closer echoes show one peak between them, and others are displaced
-by each other's lobes.
+:math:`2\pi / N` wide in u: two closer echoes show a single peak between them, and others are
+displaced by each other's lobes.
 
 **Directions.** The most likely minimise the residual,
 
@@ -87,7 +87,7 @@ SAME_SINE = 0.1
 def most_left(elements: int) -> Float[np.ndarray, " k"]:
     """Return the residual energy of 1, 2, ... sources that noise exceeds with probability 0.001.
 
-    In units of the noise of one output; fewer than `MOST` entries if the elements are too few.
+    In units of an output's noise; fewer than `MOST` entries if the elements are too few.
 
     >>> most_left(10).round(1)
     array([20.4, 18.1, 15.6])

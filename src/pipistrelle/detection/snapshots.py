@@ -24,11 +24,17 @@ from dataclasses import dataclass, field
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Bool, Complex, Float, Int, Shaped
+from jaxtyping import Bool, Complex, Float, Int
 
 from pipistrelle.arrays.layout import Layout
 from pipistrelle.config import Config, InputError
-from pipistrelle.detection.direct import DirectCalls, Lags, direct_calls
+from pipistrelle.detection.direct import (
+    MIN_EDGE_ENERGY,
+    DirectCalls,
+    Lags,
+    direct_calls,
+    front_edge,
+)
 from pipistrelle.detection.matched import arrival_lag, reach_of, steer, steering_phases
 from pipistrelle.detection.noise import (
     MIN_POWER_OVER_NOISE,
@@ -61,7 +67,7 @@ MAX_SPACING = 100
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Detections:
-    """Calls detected in a frame; one row per face, caller, snapshot and peak."""
+    """Calls detected in a frame; a row per face, caller, snapshot and peak."""
 
     face: Int[np.ndarray, " m"]
     caller: Int[np.ndarray, " m"]
@@ -112,16 +118,16 @@ class Detector(NamedTuple):
     """Thresholds and tables of the detection stage (`detector`)."""
 
     threshold: float
-    """Least energy of a face and tone, in units of the noise of one output."""
+    """Least energy of a face and tone, in units of an output's noise."""
     runs: bool
-    """Whether a run of lags above the threshold is one snapshot."""
+    """Whether a run of lags above the threshold is a single snapshot."""
     leakage: float
     peak: float
     """`leakage` and `peak` are power ratios."""
     sine_limit: float
     """Sine of the largest angle off the normal that counts."""
     loudest_noise: float
-    """0.999 quantile of the residual power of noise, in units of the noise of one output."""
+    """0.999 quantile of the residual power of noise, in units of an output's noise."""
     normal: Float[np.ndarray, " f"]
     wave: Float[np.ndarray, " c"]
     """Phase between neighbours at 90 degrees, 2 pi f d / c, per tone [rad]."""
@@ -210,10 +216,10 @@ def detect(
     energy = energy_of(matched.reshape(-1).view(matched.real.dtype), matched.shape[3])
     lags = Lags(start, interval, pulse)
     find = _find_sources if detector.most_left.size else _find_peaks
-    whole, numbers = find(matched, energy, tuple(detector), lags)
-    (face, caller), (delay, sine, power, bearing_std, delay_std) = whole, numbers
+    (face, caller), numbers = find(matched, energy, tuple(detector), lags)
+    delay, sine, power, bearing_std, delay_std = numbers
     angle = np.arcsin(sine)
-    return Detections(
+    found = Columns(
         face=face,
         caller=caller,
         angle=angle,
@@ -222,30 +228,20 @@ def detect(
         power=power,
         bearing_std=bearing_std,
         delay_std=delay_std,
-        direct=_direct(matched, whole, numbers, lags),
     )
+    return Detections(**found._asdict(), direct=direct_of_faces(matched, found, lags))
 
 
 def direct_of_faces(
-    matched: Complex[np.ndarray, "l f c e"], found: Detections, lags: Lags
+    matched: Complex[np.ndarray, "l f c e"], found: Columns | Detections, lags: Lags
 ) -> DirectCalls:
-    """Find the direct calls among detections."""
-    whole = np.stack((found.face, found.caller))
-    stds = found.bearing_std, found.delay_std
-    numbers = np.stack((found.delay, found.angle, found.power, *stds))
-    return _direct(matched, whole, numbers, lags)
+    """Find the direct calls among detections of tones by faces."""
 
+    def edge(d: int, p: int, b: int) -> tuple[float, float]:
+        return front_edge(matched, b, found.face[d], p, lags.pulse, MIN_EDGE_ENERGY)
 
-def _direct(
-    matched: Complex[np.ndarray, "l f c e"],
-    whole: Int[np.ndarray, "2 m"],
-    numbers: Float[np.ndarray, "5 m"],
-    lags: Lags,
-) -> DirectCalls:
-    """Find the direct calls among detections, with the arguments of `direct_calls`."""
-    found, (began, began_std) = direct_calls(matched, whole, numbers, matched.shape[2], lags)
-    pulse = lags.pulse * lags.interval
-    return DirectCalls(detection=found, delay=began, delay_std=began_std, pulse=pulse)
+    heard = found.caller, found.delay, found.delay_std
+    return direct_calls(heard, [found.power] * matched.shape[2], lags, edge)
 
 
 def detections_at(found: Detections, rows: Bool[np.ndarray, " m"]) -> Detections:
@@ -355,16 +351,6 @@ def _peaks(power: Float[np.ndarray, " n"], ratio: float, place: Int[np.ndarray, 
 
 
 @kernel
-def _grown(columns: Shaped[np.ndarray, "k m"]) -> Shaped[np.ndarray, "k 2*m"]:
-    """Return a copy of columns with twice the capacity."""
-    wide = np.empty((columns.shape[0], 2 * columns.shape[1]), dtype=columns.dtype)
-    for k in range(columns.shape[0]):
-        for i in range(columns.shape[1]):
-            wide[k, i] = columns[k, i]
-    return wide
-
-
-@kernel
 def _find_peaks(
     matched: Complex[np.ndarray, "l f c e"],
     energy: Float[np.ndarray, " t"],
@@ -404,8 +390,9 @@ def _find_peaks(
                 b, top = _loudest_lag(matched, within, f, p, phases, beam)
                 if is_leakage(energy, b * row + test % row, row, tones, pulse, rule.leakage):
                     continue
-            if count == whole.shape[1]:
-                whole, numbers = _grown(whole), _grown(numbers)
+            if count == whole.shape[1]:  # twice the room
+                whole = np.concatenate((whole, whole), axis=1)
+                numbers = np.concatenate((numbers, numbers), axis=1)
             whole[0, count], whole[1, count] = f, p
             late = arrival_lag(matched, b, f, p, phases, pulse, beam)
             sine, top = u / wave[p], top / elements
@@ -428,10 +415,12 @@ def _find_sources(
     """Find every source of every snapshot (`overlaps`); returns the columns of `_find_peaks`."""
     _, faces, tones, elements = matched.shape
     rule, pulse, row, count = Detector(*rules), lag.pulse, faces * tones, 0
-    whole, numbers = np.empty((3, 128), dtype=np.int64), np.empty((5, 128))
+    tests = candidates(energy, rule.threshold, row if pulse > 1 else energy.size)
+    most = tests.size * rule.most_left.size
+    whole, numbers = np.empty((3, most), dtype=np.int64), np.empty((5, most))
     found = room_for(rule.most_left.size, elements)
     beam = np.empty(pulse + 5, dtype=np.complex128)
-    for test in candidates(energy, rule.threshold, row if pulse > 1 else energy.size):
+    for test in tests:
         b, end = snapshot(energy, test, row, tones, pulse, False, rule.threshold, rule.leakage)
         if b == end:
             continue
@@ -445,8 +434,6 @@ def _find_sources(
             sine, std = found.u[k] / rule.wave[p], deviation(x, found, k, noise)
             if not (abs(sine) <= rule.sine_limit and std < math.inf):
                 continue
-            if count == whole.shape[1]:
-                whole, numbers = _grown(whole), _grown(numbers)
             loudest, power = _loudest_lag(matched, within, f, p, found.beam[k], beam)
             late = arrival_lag(matched, loudest, f, p, found.beam[k], pulse, beam)
             over = max(power / noise - 1.0, MIN_POWER_OVER_NOISE)

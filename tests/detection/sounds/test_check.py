@@ -10,7 +10,7 @@ import soundfile
 from pipistrelle.config import Config
 from pipistrelle.detection.sounds.check import check_recording
 from pipistrelle.detection.sounds.sound_file import read_description
-from reference.sounds import foreign, record
+from reference.sounds import foreign, record, with_samples
 
 DRIVE = ("--landmarks", "20", "--duration", "4", "--seed", "7")
 SWEEPS = ("--emitter.call", "sweep", "--emitter.level-db", "65", "--beacon.call", "sweep")
@@ -41,10 +41,10 @@ def with_rows(folder, name, change):
     (folder / name).write_text("\n".join([head, *(",".join(row) for row in rows), ""]))
 
 
-def with_samples(folder, change):
-    samples, rate = soundfile.read(folder / "recording.wav", dtype="float32")
-    change(samples)
-    soundfile.write(folder / "recording.wav", samples, rate, subtype="PCM_16")
+def spoilt(folder, change):
+    """Change the samples of our own recording; return its faults."""
+    with_samples(folder, change, "recording.wav", "PCM_16")
+    return checked(folder)
 
 
 def exchanged(rows, pairs):
@@ -97,8 +97,10 @@ def test_faces_that_are_swapped_are_seen(tape):
 
 
 def test_a_channel_of_the_other_sign_is_named(tape):
-    with_samples(tape, lambda samples: np.negative(samples[:, 5], out=samples[:, 5]))
-    (fault,) = checked(tape)
+    def turn(samples):
+        samples[:, 5] *= -1.0
+
+    (fault,) = spoilt(tape, turn)
     assert "turn the sign of channel 6 round" in fault
 
 
@@ -108,16 +110,14 @@ def test_channels_that_are_dead_clipped_or_off_zero_are_named(tape):
         samples[:, 6] = samples[:, 6].clip(-2e-3, 2e-3)
         samples[:, 9] += 0.01
 
-    with_samples(tape, spoil)
-    faults = checked(tape)
+    faults = spoilt(tape, spoil)
     for words in ("channel 3 is dead", "channel 7 is clipped", "channel 10 is off zero"):
         assert sum(fault.startswith(words) for fault in faults) == 1
     assert len(faults) == 4  # and that the order was not looked at
 
 
 def test_silence_gives_no_warning_of_the_sample_rate(tape):
-    with_samples(tape, lambda samples: samples.fill(0.0))
-    faults = checked(tape)
+    faults = spoilt(tape, lambda samples: samples.fill(0.0))
     assert any("dead" in fault for fault in faults)
     assert not any("sample rate" in fault for fault in faults)
 
@@ -148,16 +148,14 @@ def test_a_clock_jump_is_reported_with_its_call(tape):
 
 
 def respelled(folder, change, subtype="PCM_16"):
-    samples, rate = soundfile.read(folder / "tape.wav", dtype="float32")
-    samples = change(samples)
-    soundfile.write(folder / "tape.wav", samples, rate, subtype=subtype)
+    """Change the samples of another program's recording; return its faults."""
+    with_samples(folder, change, subtype=subtype)
     return checked(folder)
 
 
 def copied(source, target, scale=1.0, late=0):
     def change(samples):
         samples[:, target] = scale * np.roll(samples[:, source], late)
-        return samples
 
     return change
 
@@ -212,7 +210,6 @@ def test_noise_that_all_microphones_hear_is_no_copy(tmp_path):
 def test_the_check_names_a_channel_that_is_constant_as_dead(tmp_path, value):
     def constant(samples):
         samples[:, 3:5] = value
-        return samples
 
     faults = respelled(foreign(tmp_path / "tape"), constant, "FLOAT")
     assert [fault[:17] for fault in faults[:2]] == ["channel 4 is dead", "channel 5 is dead"]

@@ -3,6 +3,7 @@
 import shutil
 import time
 import tracemalloc
+from contextlib import nullcontext
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -11,6 +12,7 @@ import pytest
 import soundfile
 
 import pipistrelle
+from pipistrelle.acoustics.call import Sweep
 from pipistrelle.config import Config, DetectionConfig, InputError
 from pipistrelle.detection.logs.folder import RowsHeard, read_log
 from pipistrelle.detection.sounds.calls import _loudest_around, calls_of
@@ -21,11 +23,13 @@ from pipistrelle.experiments.hearing.listening import listen
 from pipistrelle.experiments.hearing.scenario import world_of
 from pipistrelle.scripting.arguments import Door, base_layer, mission_settings
 from pipistrelle.settings import from_flags
-from reference.sounds import FEW, UNLABELLED, foreign, record
+from reference.sounds import FEW, UNLABELLED, foreign, record, swept, with_samples
+
+SLOW = pytest.mark.slow
 
 
 def heard(folder, config=None):
-    """Hear all of a recording; return the log, its rows alone, and the frames' detections."""
+    """Hear all of a recording; return the scans and the detections of its frames."""
     found, scans, folder = [], [], Path(folder)
     about = read_description(folder)
     rows = RowsHeard(folder, about.log, log_callers(about))
@@ -37,7 +41,7 @@ def heard(folder, config=None):
 
     hear_recording(folder, about, config or Config(), range, look)
     rows.files()
-    return SimpleNamespace(scans=scans), found
+    return scans, found
 
 
 @pytest.fixture(scope="module")
@@ -46,12 +50,25 @@ def own(tmp_path_factory):
     return record(tmp_path_factory.mktemp("own") / "tape")
 
 
-def frames_of_run(named=None, emitter=None):
-    """Rows without labels of the run that was recorded, perhaps with settings of its own."""
-    settings = {"receiver": {"elements": 4}, "emitter": emitter or {}}
+def words(settings):
+    """Format settings as command-line flags."""
+    return [
+        word
+        for section, table in settings.items()
+        for key, value in table.items()
+        for word in (
+            f"--{section}.{key.replace('_', '-')}",
+            *map(str, value if isinstance(value, tuple) else (value,)),
+        )
+    ]
+
+
+def frames_of_run(settings=None, named=None):
+    """Return the rows without labels of the run that was recorded, perhaps with other settings."""
+    given = dict(settings or {})
+    given["receiver"] = {"elements": 4} | given.get("receiver", {})
     asked = {"duration": 4.0, "landmarks": 20}
-    base = base_layer(named and named[0])
-    door = Door(asked=asked, beneath=base, flags=from_flags(settings), command="")
+    door = Door(asked=asked, beneath=base_layer(named), flags=from_flags(given), command="")
     config, _, _ = mission_settings(door)
     assert FEW[1] == "4"
     (frames,) = listen(world_of(config), config, (config.emitter.radius,), labels=False)
@@ -73,43 +90,71 @@ def agreeing(scan, run, bearing, way):
 def test_detections_of_a_recording_equal_the_runs(own):
     log, _ = heard(own)
     run = frames_of_run()
-    assert [scan.time for scan in log.scans] == [scan.time for scan in run]
+    assert [scan.time for scan in log] == [scan.time for scan in run]
     rows = sum(scan.bearing.size for scan in run)
-    found = sum(agreeing(a, b, 1e-6, 1e-6) for a, b in zip(log.scans, run, strict=True))
+    found = sum(agreeing(a, b, 1e-6, 1e-6) for a, b in zip(log, run, strict=True))
     assert rows > 100
     assert found >= rows - 2  # next to the threshold the measured noise may decide otherwise
-    for mine, his in zip(log.scans, run, strict=True):
+    for mine, his in zip(log, run, strict=True):
         for caller, row in enumerate(his.direct.tolist()):
             assert (mine.direct[caller] < 0) == (row < 0)
-    assert agreeing(log.scans[0], run[1], 1e-6, 1e-6) == 0, "another frame is another"
+    assert agreeing(log[0], run[1], 1e-6, 1e-6) == 0, "another frame is another"
 
 
-HARBOUR_SWEEP = {"call": "sweep", "band": (165e3, 135e3), "taper": 0.2}
+LOUD = {"level_db": 65.0}  # else nothing is near enough for an echo of the vehicle's own
+SWEEP = {"emitter": LOUD | {"call": "sweep", "taper": 0.2}}
+CASES = {
+    "sweep": SWEEP,
+    "hyperbolic at another rate, in water": {
+        "scenario": {"medium": "water"},
+        "emitter": LOUD | {"call": "sweep", "sweep": "hyperbolic"},
+        "receiver": {"sample_rate": 192e3},
+    },
+    "both sweep": SWEEP | {"beacon": {"call": "sweep", "taper": 0.2}},
+    "file": {"emitter": LOUD | {"call": "own.wav", "frequency": 47.5e3}},
+}
 
 
 @pytest.mark.parametrize(
-    ("emitter", "limit"),
-    [({}, 1e-6), pytest.param(HARBOUR_SWEEP, 1e-4, marks=pytest.mark.slow)],
+    "case", [pytest.param(c, marks=() if c in ("sweep", "file") else SLOW) for c in CASES]
+)
+def test_detections_of_a_recorded_call_equal_the_runs(tmp_path, monkeypatch, case):
+    monkeypatch.chdir(tmp_path)
+    call = Sweep(60e3, 35e3, 2.4e-3, "hyperbolic", taper=0.3)
+    time = np.arange(round(2.4e-3 * 250e3)) / 250e3
+    soundfile.write("own.wav", call.waveform(time, 47.5e3).real, 250_000, subtype="FLOAT")
+    log, _ = heard(record(Path("tape").absolute(), *words(CASES[case])))
+    run = frames_of_run(CASES[case])
+    assert [scan.time for scan in log] == [scan.time for scan in run]
+    assert sum(np.count_nonzero(scan.caller == 0) for scan in run) >= 8
+    rows = sum(scan.bearing.size for scan in run)
+    assert rows > 50
+    assert sum(agreeing(a, b, 1e-4, 1e-3) for a, b in zip(log, run, strict=True)) >= rows - 2
+
+
+HARBOUR_SWEEP = {"emitter": {"call": "sweep", "band": (165e3, 135e3), "taper": 0.2}}
+
+
+@pytest.mark.parametrize(
+    ("settings", "limit"),
+    [({}, 1e-6), pytest.param(HARBOUR_SWEEP, 1e-4, marks=SLOW)],
     ids=["tone", "sweep"],
 )
-def test_detections_of_an_underwater_recording_equal_the_runs(tmp_path, emitter, limit):
+def test_detections_of_an_underwater_recording_equal_the_runs(tmp_path, settings, limit):
     harbour = str(Path(__file__).parents[3] / "examples" / "harbour.toml")
-    words = [f"--emitter.{key}={value}" for key, value in emitter.items() if key != "band"]
-    words += ["--emitter.band", *map(str, emitter["band"])] if emitter else []
-    folder = record(tmp_path / "tape", "--settings", harbour, *words)
+    folder = record(tmp_path / "tape", "--settings", harbour, *words(settings))
     medium = read_description(folder).medium
     assert (medium["name"], medium["salinity"]) == ("water", 30.0)
     assert medium["speed_of_sound"] == read_description(folder).speed_of_sound > 1400.0
-    log, run = heard(folder)[0], frames_of_run([harbour], emitter)
+    log, run = heard(folder)[0], frames_of_run(settings, harbour)
     rows = sum(scan.bearing.size for scan in run)
-    found = sum(agreeing(a, b, limit, limit) for a, b in zip(log.scans, run, strict=True))
     assert rows > 100
-    assert found >= rows - 2
+    assert sum(agreeing(a, b, limit, limit) for a, b in zip(log, run, strict=True)) >= rows - 2
 
 
 def test_the_log_of_a_recording_holds_its_detections(own, tmp_path):
     done = pipistrelle.hear(own, output=tmp_path / "log")
-    log, scans = read_log(tmp_path / "log"), heard(own)[0].scans
+    log, scans = read_log(tmp_path / "log"), heard(own)[0]
     assert done.measurements.height == sum(scan.bearing.size for scan in scans)
     assert {"hearing.png", "truth.csv", "landmarks.csv"} < {p.name for p in done.folder.iterdir()}
     for mine, his in zip(log.scans, scans, strict=True):
@@ -119,17 +164,20 @@ def test_the_log_of_a_recording_holds_its_detections(own, tmp_path):
     assert pipistrelle.hear(own).measurements.equals(done.measurements)
 
 
-def test_slam_on_a_recording_repeats_the_run(tmp_path):
-    record(tmp_path / "tape", *UNLABELLED, "--filter.noise", "measured", "--filter", "smoother")
+@pytest.mark.parametrize(("settings", "limit"), [({}, 0.01), (SWEEP, 0.03)], ids=["tone", "sweep"])
+def test_slam_on_a_recording_repeats_the_run(tmp_path, settings, limit):
+    record(tmp_path / "tape", *UNLABELLED, "--filter.noise", "measured", *words(settings))
     pipistrelle.hear(tmp_path / "tape", output=tmp_path / "log")
     asked = {"filters": "smoother", "association__method": "marginal"}
     again = pipistrelle.slam(tmp_path / "log", gate=1.0, **asked).tracks
-    run = pipistrelle.run(
-        duration=4.0, landmarks=20, strategies="fused", receiver__elements=4,
-        listening__timing=True, filter__noise="measured", **asked,
-    ).tracks  # fmt: skip
+    warned = pytest.warns(UserWarning, match="every sample is recorded")
+    with warned if settings else nullcontext():
+        run = pipistrelle.run(
+            duration=4.0, landmarks=20, strategies="fused", receiver__elements=4,
+            listening__timing=True, filter__noise="measured", **settings, **asked,
+        ).tracks  # fmt: skip
     for name in ("x_m", "y_m", "heading_rad"):
-        assert np.abs(again[name].to_numpy() - run[name].to_numpy()).max() < 0.01
+        assert np.abs(again[name].to_numpy() - run[name].to_numpy()).max() < limit
 
 
 def test_sixteen_bits_and_flac_give_nearly_the_same_detections(tmp_path):
@@ -146,17 +194,17 @@ def test_sixteen_bits_and_flac_give_nearly_the_same_detections(tmp_path):
     soundfile.write(tmp_path / "flac" / "recording.w64", samples, rate, subtype="PCM_16")
     for name in ("short", "flac"):
         log, _ = heard(tmp_path / name)
-        found = sum(agreeing(a, b, 5e-3, 5e-3) for a, b in zip(log.scans, run, strict=True))
+        found = sum(agreeing(a, b, 5e-3, 5e-3) for a, b in zip(log, run, strict=True))
         assert found > 0.95 * rows
 
 
 @pytest.mark.parametrize("faces", [True, False])
 def test_a_point_simulated_by_another_program_is_located(tmp_path, faces):
     log, found = heard(foreign(tmp_path / "tape", place=(1.5, 0.9), faces=faces))
-    assert [scan.time for scan in log.scans] == [10.0 + s / 192e3 for s in (1000, 25e3, 47e3)] or (
-        len(log.scans) == 3
+    assert [scan.time for scan in log] == [10.0 + s / 192e3 for s in (1000, 25e3, 47e3)] or (
+        len(log) == 3
     )
-    for scan in log.scans:
+    for scan in log:
         loudest = int(scan.level_db.argmax())
         assert abs(scan.bearing[loudest] - np.arctan2(0.9, 1.5)) < 0.02
         assert abs(scan.range[loudest] - np.hypot(1.5, 0.9)) < 0.01
@@ -169,11 +217,10 @@ def test_gains_and_offsets_of_channels_do_not_matter(tmp_path):
     plain, _ = heard(foreign(tmp_path / "plain"))
     gain = 10.0 ** rng.uniform(-1.0, 0.5, 16)
     folder = foreign(tmp_path / "odd", gain=gain)
-    samples, rate = soundfile.read(folder / "tape.wav", dtype="float32")
     offset = rng.uniform(-0.05, 0.05, 16).astype(np.float32)
-    soundfile.write(folder / "tape.wav", samples + offset, rate, subtype="FLOAT")
+    with_samples(folder, lambda samples: samples + offset)
     odd, _ = heard(folder)
-    for one, other in zip(plain.scans, odd.scans, strict=True):
+    for one, other in zip(plain, odd, strict=True):
         a, b = int(one.level_db.argmax()), int(other.level_db.argmax())
         assert abs(one.bearing[a] - other.bearing[b]) < 3e-3
         assert abs(one.level_db[a] - other.level_db[b]) < 0.5
@@ -190,16 +237,14 @@ def test_calls_are_found_without_calls_csv_at_the_same_times(tmp_path, way):
         (folder / "recording.toml").write_text(about.replace("[log]", f"{more}[log]"))
     if way == "trigger":
         (folder / "recording.toml").write_text(about.replace("[log]", "trigger = 17\n[log]"))
-        samples, rate = soundfile.read(folder / "tape.wav", dtype="float32")
-        trigger = np.zeros((len(samples), 1), dtype=np.float32)
+        trigger = np.zeros((soundfile.info(folder / "tape.wav").frames, 1), dtype=np.float32)
         for begin in (1013, 25_013, 49_013):
             trigger[begin : begin + 121] = 0.8
-        both = np.hstack((samples, trigger))
-        soundfile.write(folder / "tape.wav", both, rate, subtype="FLOAT")
+        with_samples(folder, lambda samples: np.hstack((samples, trigger)))
     found, _ = heard(folder)
-    assert len(found.scans) == len(told.scans) == 3
+    assert len(found) == len(told) == 3
     late = 2.0 / 192e3 if way == "leak" else 1e-9
-    for a, b in zip(told.scans, found.scans, strict=True):
+    for a, b in zip(told, found, strict=True):
         assert abs(a.time - b.time) <= late
         i, j = int(a.level_db.argmax()), int(b.level_db.argmax())
         assert abs(a.range[i] - b.range[j]) <= 170.0 * late + 2e-3
@@ -316,7 +361,7 @@ def test_memory_does_not_grow_with_the_length(own, tmp_path):
             peaks.append(tracemalloc.get_traced_memory()[1])
         finally:
             tracemalloc.stop()
-    assert len(log.scans) == 48
+    assert len(log) == 48
     # gaps for the noise are up to 64, of eight in the one and 48 in the other
     assert peaks[1] < peaks[0] + 40 * 1300 * 2 * 16 * 4 * 2.5
 
@@ -401,17 +446,16 @@ def test_faces_that_share_a_centre_must_be_equal_lines(tmp_path):
 
 def test_samples_that_are_no_numbers_are_named_by_channel_and_place(tmp_path):
     folder = foreign(tmp_path / "tape")
-    samples, rate = soundfile.read(folder / "tape.wav", dtype="float32")
-    samples[30_000, 4] = np.nan
-    soundfile.write(folder / "tape.wav", samples, rate, subtype="FLOAT")
+    with_samples(folder, lambda samples: np.put(samples, 30_000 * 16 + 4, np.nan))
     refused(folder, "tape.wav, channel 5", "nan as sample 30000")
 
 
 def test_hear_warns_of_a_channel_that_is_a_copy(tmp_path):
+    def copy(samples):
+        samples[:, 6] = samples[:, 2]
+
     folder = foreign(tmp_path / "tape")
-    samples, rate = soundfile.read(folder / "tape.wav", dtype="float32")
-    samples[:, 6] = samples[:, 2]
-    soundfile.write(folder / "tape.wav", samples, rate, subtype="PCM_16")
+    with_samples(folder, copy, subtype="PCM_16")
     with pytest.warns(UserWarning, match="channel 7 is a copy of channel 3:"):
         done = pipistrelle.hear(folder)
     assert len(done.odd) == 1
@@ -420,12 +464,92 @@ def test_hear_warns_of_a_channel_that_is_a_copy(tmp_path):
 @pytest.mark.parametrize("value", [0.1, 1.0 / 3.0])
 def test_hear_refuses_a_channel_that_is_constant(tmp_path, value):
     folder = foreign(tmp_path / "tape")
-    samples, rate = soundfile.read(folder / "tape.wav", dtype="float32")
-    samples[:, 6] = value
-    soundfile.write(folder / "tape.wav", samples, rate, subtype="FLOAT")
+    with_samples(folder, lambda samples: samples[:, 6].fill(value))
     refused(folder, "channel 7", "no noise")
 
 
 def test_a_silent_channel_is_named(tmp_path):
     folder = foreign(tmp_path / "tape", gain=np.array([1.0] * 6 + [0.0] + [1.0] * 9))
     refused(folder, "channel 7", "no noise")
+
+
+# Calls that are not tones
+
+
+def test_a_recording_describes_and_keeps_the_sent_call(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    time = np.arange(500) / 250e3
+    wave = Sweep(60e3, 35e3, 2e-3).waveform(time, 47.5e3).real
+    soundfile.write("own.wav", wave, 250_000, subtype="FLOAT")
+    few = ["--emitter.call", "own.wav", "--emitter.frequency", "47e3", "--frames", "0:2"]
+    tape = record(tmp_path / "tape", *few, "--beacon.call", "sweep")
+    about = read_description(tape)
+    assert (about.call.call, about.callers[0].call) == ("call_vehicle.wav", "sweep")
+    assert about.callers[0].band == (28e3, 18e3)
+    kept, rate = soundfile.read(tape / "call_vehicle.wav")
+    assert rate == 250_000
+    np.testing.assert_allclose(kept, wave, atol=1e-6)
+
+
+@pytest.fixture(scope="module")
+def two_frames(tmp_path_factory):
+    """A recording of two frames of a vehicle that sends sweeps."""
+    folder = tmp_path_factory.mktemp("sweep") / "tape"
+    return record(folder, "--emitter.call", "sweep", "--frames", "0:2")
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        ('call = "sweep"', 'call = "gone.wav"', "gone.wav"),
+        ('call = "sweep"', 'call = "sweep"\ntaper = 2.0', "taper"),
+        ("60000.0", "120000.0", "half the sample rate"),
+        ("band = [", "bend = [", "bend"),
+    ],
+)
+def test_a_wrongly_described_call_is_refused(two_frames, tmp_path, old, new, message):
+    tape = shutil.copytree(two_frames, tmp_path / "tape")
+    text = (tape / "recording.toml").read_text()
+    text = text.replace("taper = 0.0\n", "", 1).replace(old, new, 1)
+    (tape / "recording.toml").write_text(text)
+    refused(tape, message)
+
+
+def test_a_sweep_without_call_times_is_found_by_its_leakage(tmp_path):
+    tape = record(tmp_path / "tape", "--emitter.call", "sweep", "--frames", "1:5")
+    told, _ = heard(tape)
+    (tape / "calls.csv").unlink()
+    found, _ = heard(tape)
+    assert len(found) == 4
+    for mine, his in zip(found, told, strict=True):
+        assert abs(mine.time - his.time) <= 1.01 / 200e3
+
+    def quiet(samples):
+        for begin in range(0, len(samples), 100_000):
+            samples[begin : begin + 600] = 0.0
+
+    with_samples(tape, quiet, "recording.wav")
+    refused(tape, "say in calls.csv when")  # no leak: echoes are all that there is
+
+
+CUT = (-0.5, -0.05, 0.05, 0.1, 0.25, 0.5, 0.75, 0.9, 0.97)
+"""Shares of a loud echo that the vehicle is deaf to, or that the next call cuts off."""
+
+
+@pytest.mark.parametrize("deaf", [3e-3, 2.2e-3])
+@pytest.mark.parametrize("loud", [0.5, 10.0])
+@pytest.mark.parametrize("end", ["begins", "ends"])
+def test_an_echo_that_the_window_cuts_leaves_no_rows(tmp_path, deaf, loud, end):
+    period = 0.05
+    whole = {"begins": deaf, "ends": period - 2e-3}[end]
+    late = [whole + 2e-3 * share * (1 if end == "ends" else -1) for share in CUT]
+    folder, times = swept(tmp_path / "tape", late, deaf=deaf, period=period, loud=loud)
+    rows = pipistrelle.hear(folder, detection__false_alarm=1e-9).measurements
+    for begin, delay, share in zip(times, late, CUT, strict=True):
+        found = rows.filter((rows["time"] - begin).abs() < 1e-6)["range"].to_numpy()
+        assert np.min(np.abs(found - 170.0 * 10e-3)) < 0.01, "the faint echo is heard"
+        ghosts = np.abs(found - 170.0 * 10e-3) > 0.01
+        if share <= 0.0:
+            assert np.min(np.abs(found - 170.0 * delay)) < 0.01, "a whole echo is heard"
+            ghosts &= np.abs(found - 170.0 * delay) > 0.01
+        assert found[ghosts].size == 0

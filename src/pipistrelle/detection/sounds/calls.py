@@ -23,17 +23,14 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Complex, Float, Int
 
-from pipistrelle.acoustics.call import Call, ToneBurst
-from pipistrelle.config import BLOCK, InputError
+from pipistrelle.acoustics.call import LEAST_SAMPLES, Call, ToneBurst, is_whole
+from pipistrelle.config import BLOCK
 from pipistrelle.detection.logs.text_tables import place_of, read_table
 from pipistrelle.detection.matched import BandFilters
 from pipistrelle.detection.sounds.sound_file import FILE as ABOUT
 from pipistrelle.detection.sounds.sound_file import Description, Sound
 from pipistrelle.jit import kernel
 from pipistrelle.refusals import refusal
-
-MIN_SAMPLES = 10
-"""Fewest samples of a call."""
 
 
 class Blocks(NamedTuple):
@@ -57,37 +54,23 @@ class Blocks(NamedTuple):
 
 
 def blocks_of(
-    rate: float,
-    duration: float,
-    tones: Float[np.ndarray, " c"],
-    where: str,
-    deaf: float | None = None,
+    rate: float, duration: float, tones: Float[np.ndarray, " c"], deaf: float | None = None
 ) -> Blocks:
     """Choose the block length for a call of a duration [s].
 
-    `where`: the file, for errors; `deaf`: time before the first block, by default the duration [s].
+    `deaf`: time before the first block, by default the duration [s].
 
-    >>> blocks_of(200e3, 2.8e-3, np.array([35e3, 30e3]), "")[1:4]
+    >>> blocks_of(200e3, 2.8e-3, np.array([35e3, 30e3]))[1:4]
     (40, 14, 560)
-    >>> blocks_of(192e3, 5e-4, np.array([40e3]), "")[1:4]
+    >>> blocks_of(192e3, 5e-4, np.array([40e3]))[1:4]
     (8, 12, 96)
     """
-    if tones.max() >= rate / 2.0:
-        raise InputError(
-            f"{where}: found a frequency of {tones.max():g} Hz, expected less than half the sample "
-            f"rate of {rate:g} Hz; correct the one that is wrong"
-        )
     length = duration * rate
-    if length < MIN_SAMPLES:
-        raise InputError(
-            f"{where}: found a duration of {duration:g} s, {length:.3g} samples at {rate:g} Hz; "
-            f"expected {MIN_SAMPLES} or more; correct the one that is wrong"
-        )
     whole = [rate * BLOCK, duration / BLOCK, *(tones * BLOCK)]
-    if all(round(one) >= 1 and abs(one - round(one)) < 1e-6 for one in whole):
+    if all(map(is_whole, whole)):
         block, pulse = round(rate * BLOCK), round(duration / BLOCK)
     else:
-        choice = [(max(round(length / count), 1), count) for count in range(MIN_SAMPLES, 21)]
+        choice = [(max(round(length / count), 1), count) for count in range(LEAST_SAMPLES, 21)]
         block, pulse = min(choice, key=lambda b: (abs(b[0] * b[1] - length), abs(b[1] - 14)))
     blank = length if deaf is None else deaf * rate
     return Blocks(rate, block, pulse, math.ceil(blank - 1e-6), tones)
@@ -166,7 +149,7 @@ class CallOutputs:
     """
 
     gaps = 64
-    """Most gaps between calls from which noise is measured."""
+    """Most gaps between calls that give the noise."""
 
     def __init__(
         self, calls: Sequence[Call], rate: float, blank: int, channel: Int[np.ndarray, "f e"]
@@ -178,7 +161,7 @@ class CallOutputs:
         tone = any(isinstance(call, ToneBurst) for call in calls)
         alike = self.blocks.pulse if tone else round(BLOCK / self.blocks.interval)
         self.apart = max(alike, 1)
-        """Step between outputs from which noise is measured, so that they are independent."""
+        """Step between outputs that give the noise, so that they are independent."""
         self.gain = np.ones((len(channel), len(calls), channel.shape[1]))
         """Factor of an output."""
         self.mean = np.zeros(int(channel.max()) + 1)
@@ -205,7 +188,7 @@ FILE = "calls.csv"
 LONGEST = 2.0
 """Longest time after a call that is used [s]."""
 MIN_GAP = 2
-"""Fewest call lengths from the end of one call to the beginning of the next."""
+"""Fewest call lengths from the end of a call to the beginning of the next."""
 MOST_CALLS = 10_000_000
 """Most calls of a period: a day of a hundred a second, half a gigabyte of numbers."""
 ONSET = 0.35
@@ -227,6 +210,19 @@ class Calls(NamedTuple):
     """Time by the odometry's clock [s]."""
     length: Int[np.ndarray, " k"]
     """Samples that belong to each call, from its beginning."""
+
+    def spread(self, most: int) -> Int[np.ndarray, " g"]:
+        """Return the numbers of at most so many calls, spread over the recording."""
+        return np.unique(np.linspace(0, self.sample.size - 1, most).round().astype(np.int64))
+
+    def gaps(
+        self, sound: Sound, numbers: Int[np.ndarray, " g"]
+    ) -> Iterator[Float[np.ndarray, "t m"]]:
+        """Yield the samples of some calls, each from its beginning to the next call."""
+        for first, count in zip(self.sample[numbers], self.length[numbers], strict=True):
+            samples = sound.read(int(first), int(count))
+            sound.refuse_odd(int(first), samples)
+            yield samples
 
 
 def calls_of(folder: Path, about: Description, sound: Sound, blocks: Blocks, sent: Call) -> Calls:

@@ -23,14 +23,13 @@ from pipistrelle.config import Config
 from pipistrelle.detection.noise import energy_of
 from pipistrelle.detection.scans import OWN, Scan
 from pipistrelle.detection.snapshots import Detections
-from pipistrelle.detection.sounds.calls import Blocks, Calls, calls_of
-from pipistrelle.detection.sounds.hearing import Frame, Hearing, copied_channels, sums_of
+from pipistrelle.detection.sounds.calls import Calls
+from pipistrelle.detection.sounds.hearing import GAPS, Frame, Hearing, copied_channels, prepared
 from pipistrelle.detection.sounds.sound_file import (
     Description,
     RecordedArray,
     Sound,
     open_sound,
-    recorded_array,
 )
 from pipistrelle.geometry import wrap
 
@@ -104,7 +103,7 @@ def _echo(frame: Frame, hearing: Hearing, d: int) -> _Echo | None:
         if not 0 <= round(at) < len(outputs):
             return None
         return _Echo(hearing.blocks.tones[[caller]], outputs[[round(at)]])
-    c, far = wide.speed_of_sound, np.linalg.norm(wide.position, axis=1).max()
+    c, far = wide.beams.speed_of_sound, np.linalg.norm(wide.beams.position, axis=1).max()
     toward = np.array([np.cos(found.bearing[d]), np.sin(found.bearing[d])])
     at -= wide.middle @ toward / c / frame.interval
     reach = AROUND + math.ceil(far / c / frame.interval)
@@ -118,7 +117,7 @@ def _echo(frame: Frame, hearing: Hearing, d: int) -> _Echo | None:
 
 
 def _pairs(frame: Frame, hearing: Hearing) -> list[tuple[int, float, int, float]]:
-    """Pair loud detections of one echo by two faces, within a quarter of a call of each other."""
+    """Pair loud detections of an echo by two faces, within a quarter of a call of each other."""
     found, pairs = frame.detections, []
     late = 0.25 * hearing.about.call.duration
     for one, other in combinations(np.flatnonzero(found.power >= LOUD).tolist(), 2):
@@ -277,8 +276,6 @@ class Overview:
         return np.array([np.nan if one is None else one.delay[number] for one in calls])
 
 
-GAPS = 16
-"""Most gaps between calls that are read, spread over the recording."""
 RATES = (44_100, 48_000, 88_200, 96_000, 176_400, 192_000, 200_000, 250_000, 256_000, 300_000,
          384_000, 500_000)  # fmt: skip
 """Usual sample rates [Hz]."""
@@ -291,16 +288,13 @@ LEAKS = 0.5
 def check_recording(folder: Path, about: Description, config: Config) -> list[str]:
     """Return a line for each suspected fault of a recording: channels, rate, clock, array."""
     with open_sound(folder, about) as sound:
-        array = recorded_array(folder, sound.channels, one_centre=about.one_centre)
-        sums, sent = sums_of(folder, sound, about, array)
-        blocks = sums.blocks
-        calls = calls_of(folder, about, sound, blocks, sent[0])
-        gaps = np.unique(np.linspace(0, calls.sample.size - 1, GAPS).round().astype(np.int64))
+        array, sums, sent, calls = prepared(folder, sound, about)
+        gaps = calls.spread(GAPS)
         dead, faults = _channels(sound, calls, gaps, array)
-        faults += copied_channels(sound, calls, blocks.blank, array.used)
+        faults += copied_channels(sound, calls, sums.blocks.blank, array.used)
         look = _tone_rate if isinstance(sent[0], ToneBurst) else _call_rate
         faults += look(sound, calls, gaps, sent[0])
-        faults += _clock(calls, blocks)
+        faults += _clock(calls, sound.rate)
         if dead:
             return [*faults, "the order of the channels was not looked at, for some are dead"]
         hearing = Hearing.of(folder, sound, about, config)
@@ -312,9 +306,7 @@ def _channels(
 ) -> tuple[bool, list[str]]:
     """Find dead, clipped and offset channels; return whether any is dead, and a line for each."""
     noise, mean, flat = [], [], np.zeros(sound.channels)
-    for k in gaps:
-        samples = sound.read(int(calls.sample[k]), int(calls.length[k]))
-        sound.refuse_odd(int(calls.sample[k]), samples)
+    for samples in calls.gaps(sound, gaps):
         mean.append(samples.mean(axis=0, dtype=np.float64))
         noise.append(np.median(np.abs(samples - np.median(samples, axis=0)), axis=0))
         most = np.abs(samples).max(axis=0)
@@ -384,7 +376,7 @@ def _call_rate(
             )
             answer += float((np.abs(answers) ** 2).max(axis=0).sum())
             energy += 0.5 * float((some**2).sum() * np.sum(np.abs(own) ** 2))
-        share[rate] = answer / energy
+        share[rate] = answer / energy if energy > 0.0 else 0.0  # silence
     best = max(share, key=lambda rate: share[rate])
     if share[best] > LEAKS and share[sound.rate] < BETTER * share[best]:
         yield (
@@ -393,7 +385,7 @@ def _call_rate(
         )
 
 
-def _clock(calls: Calls, blocks: Blocks) -> Iterator[str]:
+def _clock(calls: Calls, rate: float) -> Iterator[str]:
     """Yield a report if a few calls are not as regular as the others."""
     gap = np.diff(calls.sample)
     if gap.size < 5:
@@ -407,6 +399,6 @@ def _clock(calls: Calls, blocks: Blocks) -> Iterator[str]:
     more = f", and {odd.size - 1} more such" if odd.size > 1 else ""
     yield (
         f"from call {k} to the next (counted from 0) there are {gap[k]} samples, elsewhere "
-        f"{usual:.0f}{more}: {abs(gap[k] - usual) / blocks.rate:.3g} s were "
+        f"{usual:.0f}{more}: {abs(gap[k] - usual) / rate:.3g} s were "
         f"{'lost' if gap[k] < usual else 'put in'}, or the call is not when it is said to be"
     )

@@ -31,11 +31,12 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Bool, Complex, Float, Int
 
-from pipistrelle.acoustics.call import Call, Sweep, ToneBurst, extent_of
+from pipistrelle.acoustics.call import Call, ToneBurst, check_sampled
 from pipistrelle.config import Config
+from pipistrelle.detection.beams import Wide
 from pipistrelle.detection.front_end import (
+    Finders,
     FrontEnd,
-    Mixed,
     find_calls,
     front_end,
     unlabelled_scan,
@@ -61,7 +62,6 @@ from pipistrelle.detection.sounds.sound_file import (
     open_sound,
     recorded_array,
 )
-from pipistrelle.detection.wideband import Wide
 from pipistrelle.refusals import refusal
 
 GROUP, FIRST_GAPS = 64, 8
@@ -76,13 +76,9 @@ CHANCE = 5.0
 
 def set_noise(sums: ToneSums | CallOutputs, sound: Sound, calls: Calls, folder: Path) -> None:
     """Measure noise and mean of each channel, and scale the sums to unit noise."""
-    last = calls.sample.size - 1
-    first, gaps = (
-        np.unique(np.linspace(0, last, most).round().astype(np.int64))
-        for most in (FIRST_GAPS, sums.gaps)
-    )
+    first, gaps = calls.spread(FIRST_GAPS), calls.spread(sums.gaps)
     means, constant = [], np.ones(sound.channels, dtype=bool)
-    for samples in _gaps(sound, calls, first):
+    for samples in calls.gaps(sound, first):
         heard = samples[sums.blocks.blank :]
         means.append(heard.mean(axis=0, dtype=np.float64))
         constant &= (heard == heard[0]).all(axis=0)
@@ -107,16 +103,6 @@ def set_noise(sums: ToneSums | CallOutputs, sound: Sound, calls: Calls, folder: 
     sums.gain /= np.sqrt(_alike(level, count))
 
 
-def _gaps(
-    sound: Sound, calls: Calls, numbers: Int[np.ndarray, " g"]
-) -> Iterator[Float[np.ndarray, "t m"]]:
-    """Yield the samples of some gaps, each from the beginning of a call."""
-    for k in numbers:
-        samples = sound.read(int(calls.sample[k]), int(calls.length[k]))
-        sound.refuse_odd(int(calls.sample[k]), samples)
-        yield samples
-
-
 def _powers(
     sums: ToneSums | CallOutputs,
     sound: Sound,
@@ -126,7 +112,7 @@ def _powers(
 ) -> list[Float[np.ndarray, "b f c e"]]:
     """Return the powers of the sums in some stretches, concatenated over some gaps."""
     power: list[list[np.ndarray]] = [[] for _ in stretches]
-    for samples in _gaps(sound, calls, numbers):
+    for samples in calls.gaps(sound, numbers):
         heard = sums(samples)[:: sums.apart]
         edges = np.linspace(0, len(heard), STRETCHES + 1).astype(np.int64)
         for stretch, part in zip(stretches, power, strict=True):
@@ -196,8 +182,7 @@ def _sums(
     lates = range(-LATEST, LATEST + 1)
     product, count = np.zeros((len(lates), used.size, used.size)), 0
     source, power = np.zeros((len(lates), used.size)), np.zeros(used.size)
-    last = calls.sample.size - 1
-    for k in np.unique(np.linspace(0, last, GAPS).round().astype(np.int64)):
+    for k in calls.spread(GAPS):
         first = int(calls.sample[k]) + blank
         samples = sound.read(first, min(int(calls.length[k]) - blank, SAMPLES))
         sound.refuse_odd(first, samples)
@@ -239,11 +224,9 @@ class Frame(NamedTuple):
 class Hearing:
     """An open recording, with everything that its calls share."""
 
-    folder: Path
     about: Description
     sound: Sound
     array: RecordedArray
-    blocks: Blocks
     calls: Calls
     sums: ToneSums | CallOutputs
     config: Config
@@ -251,32 +234,32 @@ class Hearing:
     own_clock: Bool[np.ndarray, " c"]
     """Whether each caller calls independently of the vehicle: its detections are left out."""
 
+    @property
+    def blocks(self) -> Blocks:
+        """Sampling of a frame."""
+        return self.sums.blocks
+
     @classmethod
     def of(cls, folder: Path, sound: Sound, about: Description, config: Config) -> "Hearing":
         """Prepare an open recording: its microphones, calls, noise and detector."""
-        array = recorded_array(folder, sound.channels, one_centre=about.one_centre)
-        sums, sent = sums_of(folder, sound, about, array)
-        blocks = sums.blocks
-        calls = calls_of(folder, about, sound, blocks, sent[0])
+        array, sums, sent, calls = prepared(folder, sound, about)
         set_noise(sums, sound, calls, folder)
         settled = _settled(config, about, sound.rate)
         return cls(
-            folder=folder,
             about=about,
             sound=sound,
             array=array,
-            blocks=blocks,
             calls=calls,
             sums=sums,
             config=settled,
-            end=front_end(settled, array.layout, blocks.tones, str(folder / ARRAY), sent),
+            end=front_end(settled, array.layout, sums.blocks.tones, str(folder / ARRAY), sent),
             own_clock=np.array([False, *(one.own_clock for one in about.callers)]),
         )
 
     def wide(self, caller: int, group: int) -> Wide | None:
         """Return the wideband detector of a caller and a group; None for a tone."""
-        wide = self.end.wide if isinstance(self.end, Mixed) else ()
-        return next((one for p, g, one in wide if (p, g) == (caller, group)), None)
+        one = self.end.of(caller, group).detector if isinstance(self.end, Finders) else None
+        return one if isinstance(one, Wide) else None
 
     def frames(self, numbers: Sequence[int]) -> Iterator[Frame]:
         """Yield the frames after some of the calls, numbered from 0."""
@@ -308,7 +291,7 @@ class Hearing:
         matched: Complex[np.ndarray, "l f c e"],
         samples: Float[np.ndarray, "t m"],
     ) -> Frame:
-        """Detect the echoes of one call."""
+        """Detect the echoes of a call."""
         on, around = self.blocks, None
         start = on.blank / on.rate
         if isinstance(self.sums, CallOutputs):
@@ -323,30 +306,22 @@ class Hearing:
         return Frame(time, matched, start, on.interval, found, scan)
 
 
-def sums_of(
-    folder: Path, sound: Sound, about: Description, array: RecordedArray
-) -> tuple[ToneSums | CallOutputs, tuple[Call, ...]]:
-    """Return the block sums or matched filters of a recording, and its callers' calls."""
-    where, calls = str(folder / FILE), about.calls(folder)
-    tones = np.array([call.frequency for call in calls])
-    if all(isinstance(call, ToneBurst) for call in calls):
-        blocks = blocks_of(sound.rate, about.call.duration, tones, where, about.call.deaf)
-        return ToneSums(blocks, array.channel), calls
-    for call in calls:
-        low, high = extent_of(call, sound.rate)
-        if not 0.0 < low <= high < sound.rate / 2.0:
-            found = f"a call of {low:.0f} to {high:.0f} Hz, the edges of its spectrum included"
-            if isinstance(call, Sweep):
-                begin, end = sorted((call.start, call.end))
-                found = f"a sweep of {begin:g} to {end:g} Hz, whose edges reach from {low:.0f} to"
-                found += f" {high:.0f} Hz, as those of a short one with an abrupt beginning do"
-            expected = f"all below half the sample rate of {sound.rate:g} Hz"
-            fix = "correct the one that is wrong, or fade the call's ends in and out ('taper')"
-            raise refusal(where, found, expected, fix)
-    blank = about.call.deaf or about.call.duration
-    return CallOutputs(
-        calls, sound.rate, math.ceil(blank * sound.rate - 1e-6), array.channel
-    ), calls
+def prepared(
+    folder: Path, sound: Sound, about: Description
+) -> tuple[RecordedArray, ToneSums | CallOutputs, tuple[Call, ...], Calls]:
+    """Return the array of a recording, its sums or filters, calls by caller, and calls in time."""
+    array = recorded_array(folder, sound.channels, one_centre=about.one_centre)
+    sent, where = about.calls(folder), str(folder / FILE)
+    for call in sent:
+        check_sampled(call, sound.rate, where=where, duration=f"{where}, key 'call.duration'")
+    if all(isinstance(call, ToneBurst) for call in sent):
+        tones = np.array([call.frequency for call in sent])
+        blocks = blocks_of(sound.rate, about.call.duration, tones, about.call.deaf)
+        sums = ToneSums(blocks, array.channel)
+    else:
+        blank = math.ceil((about.call.deaf or about.call.duration) * sound.rate - 1e-6)
+        sums = CallOutputs(sent, sound.rate, blank, array.channel)
+    return array, sums, sent, calls_of(folder, about, sound, sums.blocks, sent[0])
 
 
 def hear_recording(

@@ -3,12 +3,11 @@
 Samples are read in pieces by the package soundfile, after a check of the header. A long recording
 is never held in memory. Libraries read a truncated file as a shorter one, so the size that a header
 announces is compared with the file's. WAV (RIFF, RIFX, RF64), W64, AIFF and CAF consist of chunks
-with a name and a size, and one holds the sound; AU has one header. FLAC and ALAC announce a number
+with a name and a size, and one holds the sound; AU has a header. FLAC and ALAC announce a number
 of samples, and spend a bit or more on each that is not predicted exactly: a file of fewer bits than
 samples is mostly digital silence, or incomplete.
 """
 
-import os
 import struct
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager
@@ -19,7 +18,7 @@ import numpy as np
 from jaxtyping import Float, Int
 from pydantic import ConfigDict, Field, ValidationError, field_validator, model_validator
 
-from pipistrelle.acoustics.call import Call, ToneBurst, sound_of
+from pipistrelle.acoustics.call import Call, ToneBurst, opened_sound, sound_faults, sound_of
 from pipistrelle.arrays.layout import Layout, Scattered, at_one_centre, read_array, scattered
 from pipistrelle.config import (
     MAX_OTHERS,
@@ -33,7 +32,7 @@ from pipistrelle.config import (
     Real,
     Section,
 )
-from pipistrelle.files import check_ordinary, read_text
+from pipistrelle.files import read_text
 from pipistrelle.refusals import expectation, meant, refusal, shown
 from pipistrelle.settings import parse_toml
 
@@ -105,7 +104,7 @@ class OwnCall(_Told):
     window: Literal["rectangular"] = "rectangular"
     level_db: Level | None = None
     period: Annotated[float, Field(ge=1e-3, le=1e4)] | None = None
-    """Time from one call to the next [s]."""
+    """Time from a call to the next [s]."""
     first: NonNegative = 0.0
     """Time of the first call after the beginning of the sound, with a period [s]."""
     trigger: _Channel | None = None
@@ -260,41 +259,14 @@ _KINDS = {
 }
 
 
-class _Announced(NamedTuple):
-    """Size of the sound that a header announces."""
-
-    size: int
-    """Announced size [byte]."""
-    there: int
-    """Size from its beginning to the end of the file [byte]."""
-    rate: int | None = None
-    """Bytes per second, if announced."""
-
-
-class Header(NamedTuple):
-    """The beginning of a sound file."""
-
-    magic: bytes
-    """Its first four bytes."""
-    length: int
-    """Length of the file [byte]."""
-    sound: _Announced | None
-    """None if the kind of file does not announce a size."""
-
-
-def header_of(path: Path) -> Header:
-    """Read the announced size from a sound file's header."""
+def _check_header(path: Path, file: "SoundFile") -> None:
+    """Raise if a header does not agree with its file: size, samples or rate."""
     length = path.stat().st_size
     with path.open("rb") as raw:
         magic = raw.read(4)
-        return Header(magic, length, _announced(raw, magic, length))
-
-
-def check_header(path: Path, file: "SoundFile", header: Header) -> None:
-    """Raise if a header does not agree with the file: size, samples or rate."""
-    magic, length, said = header
-    if said is not None:
-        _check_size(path, file, said, magic)
+        announced = _announced(raw, magic, length)
+    if announced is not None:
+        _check_size(path, file, magic, *announced)
     if not 1 <= file.frames < 2**50:
         found = "no samples, or a number of them that was never filled in, as in a pipe"
         raise refusal(path, found, "a whole sound file", "convert it to WAV")
@@ -305,38 +277,41 @@ def check_header(path: Path, file: "SoundFile", header: Header) -> None:
         raise refusal(path, found, expected, "copy it again, or cut digital silence out")
 
 
-def _check_size(path: Path, file: "SoundFile", said: _Announced, magic: bytes) -> None:
+def _check_size(
+    path: Path, file: "SoundFile", magic: bytes, size: int, there: int, rate: int | None
+) -> None:
     """Raise if the announced size is not filled in, exceeds the file, or contradicts a field."""
-    if said.size in UNFILLED and said.size != said.there:
+    if size in UNFILLED and size != there:
         raise InputError(
             f"{path}: found a header in which the size of its sound was never filled in "
-            f"({said.size:#x}), as where a recorder writes into a pipe, expected the size; fill it "
+            f"({size:#x}), as where a recorder writes into a pipe, expected the size; fill it "
             "in by 'sox --ignore-length OLD.wav NEW.wav' or 'ffmpeg -i OLD.wav -c copy NEW.wav'"
         )
-    if said.size > said.there:
-        found = (
-            f"a header of {said.size} bytes of sound, of which {said.size - said.there} are missing"
-        )
+    if size > there:
+        found = f"a header of {size} bytes of sound, of which {size - there} are missing"
         raise refusal(path, found, "a whole sound file", "copy it again")
     width = WIDTHS.get(file.subtype)
     if width is None or magic not in (b"RIFF", b"RIFX", b"RF64", b"riff"):
         return
     block = file.channels * width
     for found, expected, unit in (
-        (said.rate, block * file.samplerate, "bytes a second"),
-        (said.size // block, file.frames, "samples"),
+        (rate, block * file.samplerate, "bytes a second"),
+        (size // block, file.frames, "samples"),
     ):
         if found not in (None, expected):
             raise refusal(path, f"a header of {found} {unit}", f"{expected} by its other fields",
                           "mend its header, or convert it anew")  # fmt: skip
 
 
-def _announced(raw: BinaryIO, magic: bytes, length: int) -> _Announced | None:
-    """Return the announced size; None for an unknown kind, or a file without sound."""
+def _announced(raw: BinaryIO, magic: bytes, length: int) -> tuple[int, int, int | None] | None:
+    """Return the announced size of the sound, the size from its beginning on, and bytes per second.
+
+    None for an unknown kind, or a file without sound; the last is None if not announced.
+    """
     if magic == b".snd" and length >= 12:
         begin, size = struct.unpack(">II", raw.read(8))
         there = max(length - begin, 0)
-        return _Announced(there if size == UNTIL_THE_END[magic] else size, there)
+        return there if size == UNTIL_THE_END[magic] else size, there, None
     if magic not in _KINDS:
         return None
     kind, rate, long = _KINDS[magic], None, None
@@ -355,14 +330,11 @@ def _announced(raw: BinaryIO, magic: bytes, length: int) -> _Announced | None:
         if name == kind.data:
             there = length - at - kind.head.size
             size = long if size == 0xFFFFFFFF and long is not None else size - kind.own
-            return _Announced(there if size == UNTIL_THE_END.get(magic) else size, there, rate)
+            return there if size == UNTIL_THE_END.get(magic) else size, there, rate
         at += max(size - kind.own, 0) + kind.head.size
         at += -at % kind.even
     return None
 
-
-if TYPE_CHECKING:
-    from soundfile import SoundFile
 
 ENDINGS = (".wav", ".rf64", ".w64", ".flac", ".aif", ".aiff", ".caf", ".au")
 """Suffixes of sound files."""
@@ -396,7 +368,7 @@ class Sound:
             number = int(np.searchsorted(self._begin, first + done, side="right")) - 1
             file, place = self._files[number], first + done - int(self._begin[number])
             wanted = min(count - done, file.frames - place)
-            with faults_named(self.paths[number]):
+            with sound_faults(str(self.paths[number])):
                 if file.tell() != place:
                     file.seek(place)
                 got = len(file.read(wanted, out=samples[done : done + wanted]))
@@ -456,45 +428,11 @@ def _paths(folder: Path, about: Description) -> list[Path]:
 
 def _opened(path: Path) -> "SoundFile":
     """Open a sound file, and check its header."""
+    file = opened_sound(path, str(path))
     try:
-        import soundfile
-    except ImportError:
-        raise InputError(
-            f"{path}: is read by the package soundfile, which is not installed; install it by "
-            "python -m pip install 'pipistrelle[sound]'"
-        ) from None
-    check_ordinary(path)
-    if not path.exists():
-        found = "a link to no file" if path.is_symlink() else "no such file"
-        raise refusal(path, found, "a sound file", f"add it, or correct {FILE}")
-    with faults_named(path):
-        if not path.stat().st_size:
-            raise refusal(path, "an empty file", "a sound file", "copy it again")
-        header = header_of(path)
-        name: Any = os.fsencode(path)  # bytes, as text that is not UTF-8 is refused
-        file = soundfile.SoundFile(name)
-    try:
-        check_header(path, file, header)
+        with sound_faults(str(path)):
+            _check_header(path, file)
     except BaseException:
         file.close()
         raise
     return file
-
-
-@contextmanager
-def faults_named(path: Path) -> Iterator[None]:
-    """Turn failures of soundfile into errors that name the file."""
-    from soundfile import SoundFileError
-
-    try:
-        yield
-    except InputError:
-        raise
-    except PermissionError:
-        fix = "give yourself the permission to read it"
-        raise refusal(path, "a file that may not be read", "a sound file", fix) from None
-    except (SoundFileError, OSError, ValueError, TypeError, OverflowError) as error:
-        what: Any = str(error).strip().splitlines() or [type(error).__name__]
-        found = what[-1].removeprefix("Error opening ").strip(" .")
-        raise refusal(path, f"no sound that can be read ({found[-120:]})", "a sound file",
-                      "convert it to WAV or FLAC") from None  # fmt: skip
