@@ -1,5 +1,7 @@
 """Synthetic result folders: missions with known paths, studies with known scores."""
 
+from dataclasses import asdict
+
 import numpy as np
 
 from pipistrelle.config import Config
@@ -68,11 +70,9 @@ def study_folder(folder, plan, number, worlds=None):
 
 def _record(case, value):
     """Return the record of a trial with a given error."""
-    nothing = {"steps": np.empty((0, 5)), "landmark": np.empty(0, int), "full": np.empty(0, bool)}
-    common = {"case": case, "beamwidth_deg": None if case.strategy == "passive" else 33.0}
-    common |= nothing | {"landmark_error": np.empty(0)}
+    width = {"beamwidth_deg": None if case.strategy == "passive" else 33.0}
     if value is None:
-        return TrialRecord(error="Traceback: lost", **common)
+        return TrialRecord(case=case, row=width | {"error": "Traceback: lost"})
     lost = value != value
     scores = Scores(
         position_rmse_m=9.0 if lost else value, heading_rmse_rad=None, map_rmse_m=value,
@@ -80,4 +80,4 @@ def _record(case, value):
         nees_max=5.0, diverged=lost, landmarks_full=5, landmarks_total=6,
         measurements_per_frame=1.0, gated=0,
     )  # fmt: skip
-    return TrialRecord(scores=scores, **common)
+    return TrialRecord(case=case, row=width | asdict(scores))

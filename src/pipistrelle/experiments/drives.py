@@ -37,35 +37,24 @@ NO_TRUTH = Truth(time=np.empty(0))
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Drive:
-    """Input of an estimator for a drive, simulated or recorded, with the truth for scoring.
-
-    Attributes
-    ----------
-    time : (k + 1) [s]
-        The start, then the end of each control step.
-    controls : (k, c)
-        Controls of each step, as the motion model takes them.
-    truth : Truth
-        Truth at the same times; its landmarks include callers that do not move.
-    known : Landmarks
-        Landmarks known beforehand.
-    callers : (c)
-        Landmark label of each caller, by caller number; empty if only the vehicle calls.
-    moving : dict of label to str
-        Names of the moving callers, which are no landmarks of the map.
-    sensor : (3) [m, m, rad]
-        Pose of the sensor in the vehicle's axes: ahead, left, counter-clockwise.
-    """
+    """Input of an estimator for a drive, simulated or recorded, with the truth for scoring."""
 
     motion: Motion
     start: Gaussian
     time: Float[np.ndarray, " t"]
+    """The start, then the end of each control step [s]."""
     controls: Float[np.ndarray, "t-1 c"]
+    """Controls of each step, as the motion model takes them."""
     truth: Truth = NO_TRUTH
+    """Truth at the same times; its landmarks include callers that do not move."""
     known: Landmarks = field(default_factory=no_landmarks)
+    """Landmarks known beforehand."""
     callers: Int[np.ndarray, " c"] = field(default_factory=lambda: NO_CALLERS)
+    """Landmark label of each caller, by caller number; empty if only the vehicle calls."""
     moving: Mapping[int, str] = field(default_factory=dict)
+    """Names of the moving callers, which are no landmarks of the map, by label."""
     sensor: Pose = (0.0, 0.0, 0.0)
+    """Pose of the sensor in the vehicle's axes: ahead, left [m], counter-clockwise [rad]."""
 
 
 def split_at(drive: Drive, times: Sequence[float]) -> tuple[Drive, Int[np.ndarray, " t"]]:

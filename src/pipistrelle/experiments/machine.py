@@ -21,9 +21,6 @@ STEP_NUMBERS, TRACK_NUMBERS, ROW_NUMBERS = 18, 12, 9
 step of each track (pose and covariance), and for each measurement (`detection.scans.Scan`)."""
 LIMIT = Path("/sys/fs/cgroup/memory.max")
 """File with the memory limit of a container [bytes]; it may hold a word instead."""
-MALLOPT = ((-3, 32 << 20), (-1, 256 << 20))
-"""Parameters of the GNU C library's mallopt: allocate arrays up to 32 MB from the heap, and return
-memory to the system only when 256 MB are free."""
 
 
 def cores() -> int:
@@ -45,8 +42,6 @@ def check_memory(
 
     With passive bearings each landmark may be a whole ray of hypotheses. `workers` processes on
     this machine each need as much; 0 skips the check.
-
-    >>> check_memory(["ekf", "fastslam"], 51, Config(), passive=True)
     """
     each_ray = ray_members(config.rays)[0].size if passive else 1
     for name in filters:
@@ -61,10 +56,7 @@ def check_memory(
 def check_length(
     setup: ScenarioConfig, *, strategies: int = 1, filters: int = 1, workers: int = 1
 ) -> None:
-    """Raise if the scans and tracks of a drive may need more memory than this machine has.
-
-    >>> check_length(ScenarioConfig(), strategies=3, filters=2)
-    """
+    """Raise if the scans and tracks of a drive may need more memory than this machine has."""
     step = COPIES * STEP_NUMBERS + TRACK_NUMBERS * strategies * filters
     frames = setup.steps // setup.steps_per_frame
     rows = frames * setup.landmarks * (1 + strategies)
@@ -147,5 +139,5 @@ def keep_freed_memory() -> None:
     from ctypes import CDLL
 
     with suppress(AttributeError, OSError, TypeError):
-        for parameter, value in MALLOPT:
-            CDLL(None).mallopt(parameter, value)
+        CDLL(None).mallopt(-3, 32 << 20)  # arrays up to 32 MB come from the heap
+        CDLL(None).mallopt(-1, 256 << 20)  # memory is returned when 256 MB are free

@@ -36,11 +36,7 @@ class Case:
 
 
 def shipped(room: str) -> tuple[str, ...]:
-    """List the TOML files of a folder of this package by name, in alphabetical order.
-
-    >>> shipped("settings")
-    ('best', 'paper', 'physics')
-    """
+    """List the TOML files of a folder of this package by name, in alphabetical order."""
     files_there = (files("pipistrelle.experiments") / room).iterdir()
     return tuple(sorted(each.name[:-5] for each in files_there if each.name.endswith(".toml")))
 
@@ -51,15 +47,7 @@ PLANS = tuple(name for name in shipped("studies") if not name.endswith("_calibra
 
 
 def settings_of(word: str, where: str) -> Layer:
-    """Return the settings of a preset or a TOML file; `where` is the option that names it.
-
-    >>> settings_of("best", "--settings")
-    {('settings',): Given(value='best', where='--settings')}
-    >>> settings_of("bset", "--settings")
-    Traceback (most recent call last):
-    pipistrelle.config.InputError: --settings: found 'bset', expected best, paper, physics or the
-    path of a TOML file; did you mean best?
-    """
+    """Return the settings of a preset or a TOML file; `where` is the option that names it."""
     if word in NAMES:
         return {SETTINGS: Given(word, where)}
     path = Path(word)
@@ -85,10 +73,6 @@ def over_named(*layers: Layer, default: str | None = None) -> tuple[Layer, tuple
     """Merge settings over the preset that they name, else over `default`.
 
     Also returns the estimators that the preset is meant for; none without a preset.
-
-    >>> layer, estimators = over_named({}, default="paper")
-    >>> resolve(layer) == Config(settings="paper"), estimators
-    (True, ('ekf',))
     """
     over = laid(*layers)
     given = over.get(SETTINGS, Given(default, "settings"))
@@ -104,12 +88,7 @@ def over_named(*layers: Layer, default: str | None = None) -> tuple[Layer, tuple
 
 
 def laid(*layers: Layer) -> Layer:
-    """Merge layers of settings; later layers win, also over values for single estimators.
-
-    >>> own, common = ("own", "iekf", "rays", "power"), ("rays", "power")
-    >>> list(laid({own: Given(8.0, "file")}, {common: Given(3.0, "flag")}))
-    [('rays', 'power')]
-    """
+    """Merge layers of settings; later layers win, also over values for single estimators."""
     found: Layer = {}
     for layer in layers:
         beneath = {key: one for key, one in found.items() if not (_own(key) and key[2:] in layer)}
@@ -144,12 +123,7 @@ def check_own(layer: Layer) -> None:
 
 
 def own_config(config: Config, name: str) -> Config:
-    """Return the settings of an estimator: the common ones with its overrides applied.
-
-    >>> own = {"iekf": {"rays": {"power": 8.0}}}
-    >>> [own_config(Config(own=own), name).rays.power for name in ("ekf", "iekf")]
-    [2.0, 8.0]
-    """
+    """Return the settings of an estimator: the common ones with its overrides applied."""
     if config.own is None:
         return config
     own = from_flags(config.own.get(name, {}))
@@ -157,12 +131,7 @@ def own_config(config: Config, name: str) -> Config:
 
 
 def of_estimators(config: Config, names: Sequence[str]) -> Config:
-    """Return the settings of a mission; overrides are merged if all its estimators agree.
-
-    >>> config = Config(own={"iekf": {"rays": {"power": 8.0}}})
-    >>> of_estimators(config, ["iekf"]).rays.power, of_estimators(config, ["ekf"]) == Config()
-    (8.0, True)
-    """
+    """Return the settings of a mission; overrides are merged if all its estimators agree."""
     first, *others = (own_config(config, name) for name in names)
     if all(other == first for other in others):
         return first

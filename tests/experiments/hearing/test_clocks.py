@@ -30,7 +30,7 @@ def heard_calls(config, world=None):
 
 
 def direct_times(world, config):
-    return [call.time for call in calls_heard(world, config.scenario, config.air.sound_speed)]
+    return [time for time, _ in calls_heard(world, config.scenario, config.air.sound_speed)]
 
 
 def test_a_call_is_heard_when_its_sound_has_come_straight_to_where_the_vehicle_is_then():

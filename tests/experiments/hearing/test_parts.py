@@ -85,6 +85,23 @@ def bearings(layout, angle, draws, snr_db=15.0):
     return np.array(heard).T
 
 
+def own_echoes(world, heard):
+    """Yield range, bearing, pose and true places of the vehicle's echoes in each frame."""
+    for frame in heard:
+        rows = frame.rows
+        own = np.flatnonzero((rows.caller == VEHICLE) & (rows.landmark <= 50))
+        pose = world.path[np.searchsorted(world.time, rows.time)]
+        yield rows.range[own], rows.bearing[own], pose, world.landmarks[rows.landmark[own] - 1]
+
+
+def range_errors(world, heard):
+    """Return the errors of all ranges of the vehicle's echoes [m]."""
+    return np.concatenate([
+        distance - np.hypot(*(places - pose[:2]).T)
+        for distance, _, pose, places in own_echoes(world, heard)
+    ])  # fmt: skip
+
+
 @pytest.mark.parametrize("angle", [-0.7, 0.0, 0.3])
 def test_elements_at_any_places_find_a_bearing_as_surely_as_their_spread_allows(angle):
     found, said, delay = bearings(RULER, angle, 200)
@@ -104,14 +121,10 @@ def test_a_wider_array_of_fewer_elements_hears_bearings_more_surely_in_a_mission
     off = []
     for layout in (None, RULER):
         (heard,) = listen(world, CONFIG, (0.0088,), layout=layout)
-        errors = []
-        for frame in heard:
-            rows = frame.rows
-            x, y, heading = world.path[np.searchsorted(world.time, rows.time)]
-            own = np.flatnonzero((rows.caller == VEHICLE) & (rows.landmark <= 50))
-            east, north = (world.landmarks[rows.landmark[own] - 1] - (x, y)).T
-            errors.append(wrap(rows.bearing[own] - (np.arctan2(north, east) - heading)))
-        errors = np.concatenate(errors)
+        errors = np.concatenate([
+            wrap(bearing - np.arctan2(*(places - pose[:2]).T[::-1]) + pose[2])
+            for _, bearing, pose, places in own_echoes(world, heard)
+        ])  # fmt: skip
         assert errors.size > 20
         off.append(np.median(np.abs(errors)))
     assert off[1] < 0.7 * off[0]
@@ -173,14 +186,7 @@ def test_a_sweep_is_heard_in_a_mission_where_echoes_overlap_less():
     world, off = world_of(DENSE), []
     for call in (ToneBurst, Sweep):
         (heard,) = listen(world, DENSE, (0.0025,), call=call)
-        errors = []
-        for frame in heard:
-            rows = frame.rows
-            place = world.path[np.searchsorted(world.time, rows.time), :2]
-            own = np.flatnonzero((rows.caller == VEHICLE) & (rows.landmark <= 50))
-            true = np.hypot(*(world.landmarks[rows.landmark[own] - 1] - place).T)
-            errors.append(rows.range[own] - true)
-        off.append(np.abs(np.concatenate(errors)))
+        off.append(np.abs(range_errors(world, heard)))
     assert min(error.size for error in off) >= 8
     assert np.quantile(off[1], 0.9) < 0.02 < 0.5 * np.quantile(off[0], 0.9)
 
@@ -206,15 +212,7 @@ def test_a_mission_in_another_medium_ranges_where_the_front_end_assumes_its_spee
     config = CONFIG.model_copy(update={"assumed": AssumedConfig(speed_of_sound=1480.0)})
     world = world_of(config)
     (heard,) = listen(world, config, (0.0025,), medium=WATER)
-    errors = []
-    for frame in heard:
-        rows = frame.rows
-        place = world.path[np.searchsorted(world.time, rows.time), :2]
-        own = np.flatnonzero((rows.caller == VEHICLE) & (rows.landmark <= 50))
-        errors.append(
-            rows.range[own] - np.hypot(*(world.landmarks[rows.landmark[own] - 1] - place).T)
-        )
-    errors = np.concatenate(errors)
+    errors = range_errors(world, heard)
     assert errors.size > 20
     assert np.median(np.abs(errors)) < 0.25, "a tenth of a call, 2 m long"
 
@@ -249,16 +247,8 @@ def test_a_mission_in_water_ranges_by_the_sound_in_water_and_not_by_that_in_air(
     world, off = world_of(wet), []
     for config in (wet, deceived):
         (heard,) = listen(world, config, (0.0088,))
-        rows = [
-            (frame.rows, world.path[np.searchsorted(world.time, frame.rows.time)])
-            for frame in heard
-        ]
-        errors = [
-            row.range[i] - np.hypot(*(world.landmarks[row.landmark[i] - 1] - place[:2]))
-            for row, place in rows
-            for i in np.flatnonzero((row.caller == VEHICLE) & (row.landmark <= 50))
-        ]
-        assert len(errors) > 20
+        errors = range_errors(world, heard)
+        assert errors.size > 20
         off.append(np.median(np.abs(errors)))
     assert off[0] < 0.1, "a fifth of a call, 0.45 m long"
     assert off[1] > 3.0

@@ -27,30 +27,12 @@ STEPS = 400
 EKF_LIMIT = entry("ekf").nees_limit
 EVO_APE = shutil.which("evo_ape", path=Path(sys.executable).parent)
 KEYS = [
-    "strategy",
-    "filter",
-    "position_rmse_m",
-    "heading_rmse_rad",
-    "map_rmse_m",
-    "position_rmse_aligned_m",
-    "map_rmse_aligned_m",
-    "position_floor_m",
-    "position_bound_m",
-    "heading_bound_rad",
-    "nees_mean",
-    "nees_max",
-    "caller_rmse_m",
-    "caller_rmse_aligned_m",
-    "diverged",
-    "landmarks_full",
-    "landmarks_total",
-    "measurements_per_frame",
-    "gated",
-    "nis_mean",
-    "gated_of",
-    "ignored_rows",
-    "wall_s",
-]
+    "strategy", "filter", "position_rmse_m", "heading_rmse_rad", "map_rmse_m",
+    "position_rmse_aligned_m", "map_rmse_aligned_m", "position_floor_m", "position_bound_m",
+    "heading_bound_rad", "nees_mean", "nees_max", "caller_rmse_m", "caller_rmse_aligned_m",
+    "diverged", "landmarks_full", "landmarks_total", "measurements_per_frame", "gated",
+    "nis_mean", "gated_of", "ignored_rows", "wall_s",
+]  # fmt: skip
 
 
 def loop():
@@ -100,15 +82,9 @@ def trial(track, strategy="fused", name="ekf"):
 
 
 def write(folder, *trials, truth=TRUTH, **changes):
-    arguments = {
-        "config": Config(),
-        "command": "pipistrelle run --seed 7",
-        "seed": 7,
-        "trials": trials,
-        "truth": truth,
-        "ignored_rows": {},
-    }
-    write_results(OwnFiles(folder, RESULTS), **(arguments | changes))
+    given = {"config": Config(), "command": "pipistrelle run --seed 7", "seed": 7}
+    given |= {"trials": trials, "truth": truth, "ignored_rows": {}} | changes
+    write_results(OwnFiles(folder, RESULTS), **given)
     return json.loads((folder / "summary.json").read_text())
 
 
@@ -237,19 +213,10 @@ def test_the_summary_has_the_promised_keys_in_their_order(tmp_path):
 def test_the_folder_holds_exactly_the_promised_files(tmp_path):
     write(tmp_path, trial(drifting_track(), "active"), trial(drifting_track(1), "fused"))
     assert sorted(path.name for path in tmp_path.iterdir()) == [
-        "README.md",
-        "SHA256SUMS",
-        "config.toml",
-        "landmarks.parquet",
-        "map_active_ekf.csv",
-        "map_fused_ekf.csv",
-        "measurements.parquet",
-        "steps.parquet",
-        "summary.json",
-        "track_active_ekf.tum",
-        "track_fused_ekf.tum",
-        "truth.tum",
-    ]
+        "README.md", "SHA256SUMS", "config.toml", "landmarks.parquet", "map_active_ekf.csv",
+        "map_fused_ekf.csv", "measurements.parquet", "steps.parquet", "summary.json",
+        "track_active_ekf.tum", "track_fused_ekf.tum", "truth.tum",
+    ]  # fmt: skip
     readme = (tmp_path / "README.md").read_text()
     assert "pipistrelle run --seed 7" in readme
     assert len(readme.splitlines()) <= 40
@@ -307,19 +274,11 @@ def test_two_filters_of_one_strategy_share_their_measurements(tmp_path):
     track = drifting_track()
     write(tmp_path, trial(track), trial(track, name="fastslam"), trial(track, "active"))
     measurements = pl.read_parquet(tmp_path / "measurements.parquet")
-    measured = [
-        "landmark",
-        "bearing_rad",
-        "range_m",
-        "excess_path_m",
-        "excess_path_std_m",
-        "caller",
-        "bearing_std_rad",
-        "range_std_m",
-        "assigned",
+    assert measurements.columns == [
+        "strategy", "filter", "time_s", "landmark", "bearing_rad", "range_m", "excess_path_m",
+        "excess_path_std_m", "caller", "bearing_std_rad", "range_std_m", "assigned",
         "true_landmark",
-    ]
-    assert measurements.columns == ["strategy", "filter", "time_s", *measured]
+    ]  # fmt: skip
     assert measurements["filter"].null_count() == 6
     assert measurements["strategy"].to_list() == ["fused"] * 3 + ["active"] * 3
     assert measurements["range_m"].to_list() == [4.0, None, 2.0] * 2
@@ -343,21 +302,13 @@ def test_pictures_for_which_there_is_no_room_leave_nothing(tmp_path):
 def test_evo_reads_the_files_untouched_and_finds_our_errors(tmp_path):
     track = drifting_track()
     write(tmp_path, trial(track))
-    environment = os.environ | {
-        "HOME": str(tmp_path),
-        "MPLBACKEND": "Agg",
-        "PYTHONWARNINGS": "error",
-    }
+    settings = {"HOME": str(tmp_path), "MPLBACKEND": "Agg", "PYTHONWARNINGS": "error"}
 
     def ape(*options):
         told = subprocess.run(
-            [EVO_APE, "tum", "truth.tum", "track_fused_ekf.tum", *options],
-            cwd=tmp_path,
-            env=environment,
-            capture_output=True,
-            text=True,
-            check=True,
-        ).stdout
+            [EVO_APE, "tum", "truth.tum", "track_fused_ekf.tum", *options], cwd=tmp_path,
+            env=os.environ | settings, capture_output=True, text=True, check=True,
+        ).stdout  # fmt: skip
         [found] = [line.split()[1] for line in told.splitlines() if line.split()[:1] == ["rmse"]]
         return float(found)
 

@@ -195,7 +195,7 @@ from pipistrelle.experiments.runs import compiling, trial
 
 config = Config(listening=ListeningConfig(timing=sys.argv[2] == "True"))
 compiling.compile_filters(config, sys.argv[1:2])
-kept = trial.run_trials
+kept = trial.try_trial
 
 def told(*given, **named):
     with install_recorder("numba:compile") as recorder:
@@ -203,7 +203,7 @@ def told(*given, **named):
     print(len({event.data["dispatcher"].py_func.__name__ for _, event in recorder.buffer}))
     return done
 
-trial.run_trials = told
+trial.try_trial = told
 trial.run_mission(config, ("fused",), sys.argv[1:2])
 """
     environment = os.environ | {"NUMBA_CACHE_DIR": str(tmp_path / "kernels")}

@@ -17,7 +17,7 @@ from pipistrelle.estimation.measurement import excess_path_of
 from pipistrelle.estimation.motion import Motion, motion_step
 from pipistrelle.experiments.drives import NO_TRUTH, Truth
 from pipistrelle.experiments.results.writing import run_entry, tables_of
-from pipistrelle.experiments.runs.replay import as_heard_by, load, motion_of, replay, start_of
+from pipistrelle.experiments.runs.replay import as_heard_by, drive_of, load, motion_of, replay
 from pipistrelle.experiments.runs.truth_files import read_truth, write_truth
 from pipistrelle.geometry import range_and_bearing
 from pipistrelle.scripting.arguments import with_log
@@ -378,7 +378,7 @@ def test_fused_is_the_union_of_active_and_passive():
 
 def test_the_filters_take_the_logs_motion_and_start():
     log = read_log(DATA / "bicycle_log")
-    motion, start = motion_of(log), start_of(log)
+    motion, start = motion_of(log), drive_of(log, NO_TRUTH).start
     assert (motion.model, motion.control_std, motion.wheelbase) == ("bicycle", (0.1, 0.03), 0.2)
     assert motion.noise_at_rest
     assert start.mean.tolist() == [0.0, -1.0, 0.0]
@@ -400,9 +400,18 @@ def looks(*rows):
         for at, (bearing, bearing_std, range_std) in zip(time[1:], rows, strict=True)
     ]
     return replace(
-        read_log(DATA / "unicycle_log"), time=time, controls=np.zeros((len(rows), 2)),
-        dt=np.diff(time), scans=tuple(scans), initial_pose=(0.0, 0.0, 0.0),
+        log_of(time, np.zeros((len(rows), 2)), scans), control_std=(0.1, 0.15),
         initial_pose_std=(0.0, 0.0, 0.0), noise_at_rest=False, range_std=0.2, bearing_std=0.1,
+    )  # fmt: skip
+
+
+def log_of(time, controls, scans):
+    """Return the log of a unicycle that starts, surely, at the origin."""
+    return Log(
+        name="log", time=time, controls=controls, dt=np.diff(time), scans=tuple(scans),
+        motion="unicycle", control_std=(0.01, 0.01), initial_pose=(0.0, 0.0, 0.0),
+        initial_pose_std=(0.001, 0.001, 0.001), range_std=0.01, bearing_std=0.01,
+        range_bounds=(0.5, 20.0), ignored_rows={},
     )  # fmt: skip
 
 
@@ -565,21 +574,8 @@ def test_a_logs_sensor_settings_are_defaults():
 
 def a_log():
     """A vehicle that stands."""
-    return Log(
-        name="stand",
-        time=np.array([0.0, 1.0]),
-        controls=np.zeros((1, 2)),
-        dt=np.ones(1),
-        scans=(scan_with([7], [0.0], [3.0], time=0.0),),
-        motion="unicycle",
-        control_std=(0.01, 0.01),
-        initial_pose=(0.0, 0.0, 0.0),
-        initial_pose_std=(0.001, 0.001, 0.001),
-        range_std=0.01,
-        bearing_std=0.01,
-        range_bounds=(0.5, 20.0),
-        ignored_rows={},
-    )
+    scan = scan_with([7], [0.0], [3.0], time=0.0)
+    return log_of(np.array([0.0, 1.0]), np.zeros((1, 2)), [scan])
 
 
 def test_a_caller_with_a_stated_position_is_mapped_once_without_labels():
@@ -618,10 +614,8 @@ def heard_without_labels(place):
         )  # fmt: skip
         scans.append(replace(scan, direct=direct))
     caller = LogCaller(name="mate", landmark=900, place=tuple(place))
-    return Log(
-        name="log", time=0.2 * np.arange(101), controls=np.tile([0.6, 0.2], (100, 1)),
-        dt=np.full(100, 0.2), scans=tuple(scans), motion="unicycle", control_std=(0.02, 0.02),
-        initial_pose=(0.0, 0.0, 0.0), initial_pose_std=(1e-3, 1e-3, 1e-3), range_std=0.02,
-        bearing_std=0.01, excess_path_std=0.02, range_bounds=(0.3, 20.0), callers=(caller,),
-        ignored_rows={},
+    return replace(
+        log_of(0.2 * np.arange(101), np.tile([0.6, 0.2], (100, 1)), scans),
+        control_std=(0.02, 0.02), range_std=0.02, excess_path_std=0.02, range_bounds=(0.3, 20.0),
+        callers=(caller,),
     )  # fmt: skip

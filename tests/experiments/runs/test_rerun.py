@@ -70,7 +70,7 @@ def test_reruns_give_the_tracks_of_the_folder_to_the_bit(made, name):
 
 @pytest.mark.skipif(os.name == "nt", reason="all names are Unicode there")
 @pytest.mark.parametrize("name", [b"log\xff", b"log\n<title>", "log\u202egol".encode()])
-def test_results_of_a_log_with_an_odd_name_are_viewed_and_compared(folders, name, capsys):
+def test_results_of_a_log_with_an_odd_name_are_viewed_and_compared(folders, name, capsys, undrawn):
     log = os.fsdecode(name)
     Path("log").rename(log)
     assert main(["slam", log, "--filter", "ekf", "--quiet", "-o", "one"]) == 0
@@ -180,7 +180,7 @@ def test_a_log_that_was_changed_is_refused_by_its_file(folders, gone, said):
     assert f"found not the log that was solved ({said}), {expected}" in found
 
 
-def test_a_truth_that_came_later_is_a_change(folders):
+def test_a_truth_that_came_later_is_a_change(folders, undrawn):
     shutil.copytree(OWN / "unicycle_log", "other")
     Path("other/truth.csv").unlink()
     assert main(["slam", "other", "--quiet", "-o", "solved"]) == 0

@@ -319,7 +319,7 @@ def test_a_path_that_is_revised_is_nearer_to_the_truth():
         track = run_filter(Retraced(), line, scans, RNG(7))
         true = flat(x, x).mean
         squares.append(
-            [score_path(pose, true).position_rmse_m ** 2 for pose in (track.online, track.pose)]
+            [score_path(pose, true)["position_rmse_m"] ** 2 for pose in (track.online, track.pose)]
         )
     gain = -np.diff(squares, axis=1)
     assert gain.mean() > 3.0 * gain.std(ddof=1) / np.sqrt(gain.size)

@@ -16,7 +16,7 @@ from pipistrelle.evaluation.bound import nees_of_exact_start, pose_bound
 from pipistrelle.evaluation.consistency import nees
 from pipistrelle.experiments.hearing.listening import listen
 from pipistrelle.experiments.hearing.scenario import world_of
-from pipistrelle.experiments.results.scores import OF_ASSOCIATION
+from pipistrelle.experiments.results.scores import OF_ASSOCIATION, Scores
 from pipistrelle.experiments.runs import heard_world
 from pipistrelle.experiments.runs.heard_world import drive_of, scans_of
 from pipistrelle.experiments.runs.trial import run_mission, run_trial
@@ -28,7 +28,7 @@ from pipistrelle.experiments.studies.world import (
     check_world,
     done_worlds,
     failed_records,
-    read_ended_trials,
+    read_outcomes,
     refuse_strange,
     run_world,
     sweep,
@@ -38,7 +38,7 @@ from pipistrelle.experiments.studies.world import (
 )
 from pipistrelle.files import write_down
 from pipistrelle.settings import Given, from_flags, known_settings, resolve
-from reference.studies import SMALL, as_rows, contents, leftovers, plan_of
+from reference.studies import SMALL, TIMINGS, as_rows, contents, leftovers, plan_of
 
 BOUNDS = ("position_bound_m", "heading_bound_rad")
 
@@ -61,11 +61,16 @@ def alone(varied):
     return [run_mission(c.config, (c.strategy,), (c.filter,)) for c in cases_of(varied)]
 
 
+def scores_of(record):
+    """Return the scores in the row of a record, by name."""
+    return {field.name: record.row[field.name] for field in fields(Scores)}
+
+
 def test_each_case_scores_as_in_a_separate_mission(ran, alone):
     assert len(ran) == 2 * 2 * (2 * 2 * 2 + 2)
     for record, mission in zip(ran, alone, strict=True):
         (trial,) = mission.trials
-        assert asdict(record.scores) == asdict(trial.scores)
+        assert scores_of(record) == asdict(trial.scores)
 
 
 def test_steps_are_the_errors_and_the_nees_at_the_frames(ran, alone):
@@ -111,25 +116,31 @@ def test_the_map_is_kept_with_the_distance_of_each_landmark_from_its_place(ran, 
 def test_particles_record_their_mean_number_of_full_landmarks(ran, alone):
     for record, mission in zip(ran, alone, strict=True):
         full = mission.trials[0].track.full
-        expected = record.scores.landmarks_full if full is None else full
-        assert record.landmarks_full_mean == expected
+        expected = record.row["landmarks_full"] if full is None else full
+        assert record.row["landmarks_full_mean"] == expected
         assert (full is None) == (record.case.filter == "ekf")
 
 
-def test_only_active_and_fused_cases_have_their_pistons_beamwidth(ran):
-    for record in ran:
-        if record.case.strategy == "passive":
-            assert record.beamwidth_deg is None
+def beamwidths_of(plan):
+    """Return each case of a plan with the beamwidth in its row."""
+    rows = as_rows(world_tables(plan, 0, failed_records(plan, "gone\n"))["trials"])
+    return zip(cases_of(plan), (row["beamwidth_deg"] for row in rows), strict=True)
+
+
+def test_only_active_and_fused_cases_have_their_pistons_beamwidth(varied):
+    for case, found in beamwidths_of(varied):
+        if case.strategy == "passive":
+            assert found is None
         else:
-            width = beamwidth(record.case.config.emitter.radius, frequency=35e3, speed_of_sound=343)
-            assert record.beamwidth_deg == pytest.approx(np.degrees(width), rel=1e-12)
+            width = beamwidth(case.config.emitter.radius, frequency=35e3, speed_of_sound=343)
+            assert found == pytest.approx(np.degrees(width), rel=1e-12)
 
 
 def test_clutter_per_frame_is_counted_in_the_cases_beam(ran, alone):
     for record, mission in zip(ran, alone, strict=True):
         clutter = [heard.clutter for heard in mission.heard]
-        assert record.clutter_per_frame == pytest.approx(np.mean(clutter), rel=1e-12)
-    assert len({record.clutter_per_frame for record in ran}) > 1
+        assert record.row["clutter_per_frame"] == pytest.approx(np.mean(clutter), rel=1e-12)
+    assert len({record.row["clutter_per_frame"] for record in ran}) > 1
 
 
 def test_the_beamwidth_uses_the_cases_frequency_and_speed_of_sound():
@@ -137,11 +148,11 @@ def test_the_beamwidth_uses_the_cases_frequency_and_speed_of_sound():
         ("emitter.frequency", (35e3, 50e3)),
         ("air.speed_of_sound", (343.0, 320.0)),
     ):
-        for record in failed_records(plan_with(Config(), setting, values), "gone\n"):
-            emitter, c = record.case.config.emitter, record.case.config.air.sound_speed
+        for case, found in beamwidths_of(plan_with(Config(), setting, values)):
+            emitter, c = case.config.emitter, case.config.air.sound_speed
             half_power = 1.6163399 / (2.0 * np.pi * emitter.frequency / c * emitter.radius)
             width = 2.0 * np.degrees(np.arcsin(half_power))
-            assert record.beamwidth_deg == pytest.approx(width, rel=1e-6)
+            assert found == pytest.approx(width, rel=1e-6)
 
 
 def test_cases_that_hear_the_same_world_listen_once(varied, monkeypatch):
@@ -161,119 +172,52 @@ def test_cases_that_hear_the_same_world_listen_once(varied, monkeypatch):
 
 
 OTHERS = {
-    "seed": 8,
-    "callers": [{}, {"frequency": 25e3}],
-    "scenario.vehicle": 2,
-    "scenario.medium": "water",
-    "scenario.steps": 24,
-    "scenario.step": 0.1,
-    "scenario.steps_per_frame": 5,
-    "scenario.speed": 0.8,
-    "scenario.steering": 0.03,
-    "scenario.start": [0.0, -7.0, 0.1],
-    "scenario.course": "corridor",
-    "scenario.extent": 9.0,
-    "scenario.lane": 3.0,
-    "scenario.field": "rows",
-    "scenario.landmarks": 10,
-    "scenario.radius": 20.0,
-    "scenario.spacing": 6.0,
-    "scenario.clearance": 3.0,
+    "seed": 8, "callers": [{}, {"frequency": 25000.0}],
+    "scenario.vehicle": 2, "scenario.medium": "water", "scenario.steps": 24, "scenario.step": 0.1,
+    "scenario.steps_per_frame": 5, "scenario.speed": 0.8, "scenario.steering": 0.03,
+    "scenario.start": [0.0, -7.0, 0.1], "scenario.course": "corridor", "scenario.extent": 9.0,
+    "scenario.lane": 3.0, "scenario.field": "rows", "scenario.landmarks": 10,
+    "scenario.radius": 20.0, "scenario.spacing": 6.0, "scenario.clearance": 3.0,
     "scenario.beacon_distance": 12.0,
-    "air.speed_of_sound": 340.0,
-    "air.temperature_c": 0.0,
-    "air.relative_humidity": 0.1,
-    "air.pressure_kpa": 80.0,
-    "air.spreading": "bistatic",
-    "water.speed_of_sound": 1500.0,
-    "water.temperature_c": 20.0,
-    "water.salinity": 0.0,
-    "water.depth": 100.0,
-    "water.ph": 7.0,
-    "water.spreading": "paper",
-    "target.shape": "sphere",
-    "target.radius": 0.05,
-    "emitter.call": "sweep",
-    "emitter.sweep": "hyperbolic",
-    "emitter.band": [60e3, 45e3],
-    "emitter.taper": 0.5,
-    "emitter.frequency": 40e3,
-    "emitter.radius": 0.02,
-    "emitter.level_db": 60.0,
-    "emitter.off_axis": "power",
-    "emitter.pulse": 2.0e-3,
-    "beacon.call": "sweep",
-    "beacon.sweep": "hyperbolic",
-    "beacon.band": [28e3, 15e3],
-    "beacon.taper": 0.5,
-    "beacon.frequency": 25e3,
-    "beacon.level_db": 55.0,
+    "air.speed_of_sound": 340.0, "air.temperature_c": 0.0, "air.relative_humidity": 0.1,
+    "air.pressure_kpa": 80.0, "air.spreading": "bistatic",
+    "water.speed_of_sound": 1500.0, "water.temperature_c": 20.0, "water.salinity": 0.0,
+    "water.depth": 100.0, "water.ph": 7.0, "water.spreading": "paper",
+    "target.shape": "sphere", "target.radius": 0.05,
+    "emitter.call": "sweep", "emitter.sweep": "hyperbolic", "emitter.band": [60000.0, 45000.0],
+    "emitter.taper": 0.5, "emitter.frequency": 40000.0, "emitter.radius": 0.02,
+    "emitter.level_db": 60.0, "emitter.off_axis": "power", "emitter.pulse": 0.002,
+    "beacon.call": "sweep", "beacon.sweep": "hyperbolic", "beacon.band": [28000.0, 15000.0],
+    "beacon.taper": 0.5, "beacon.frequency": 25000.0, "beacon.level_db": 55.0,
     "receiver.array": [[x, y, 0.0, 0.0, ""] for x, y in ((0.01, 0.0), (0.0, 0.01), (-0.01, 0.0))],
-    "receiver.elements": 8,
-    "receiver.spacing": 0.004,
-    "receiver.sample_rate": 250e3,
-    "receiver.noise_level_db": 6.0,
-    "receiver.engine": "dense",
-    "detection.false_alarm": 1e-2,
-    "detection.snapshots": "runs",
-    "detection.leakage_db": -10.0,
-    "detection.peak_db": -0.5,
-    "detection.scan_limit_deg": 76.0,
-    "detection.angle_limit_deg": 40.0,
-    "detection.averaging": "weighted",
-    "matching.delay_gate": 0.01,
+    "receiver.elements": 8, "receiver.spacing": 0.004, "receiver.sample_rate": 250000.0,
+    "receiver.noise_level_db": 6.0, "receiver.engine": "dense",
+    "detection.false_alarm": 0.01, "detection.snapshots": "runs", "detection.leakage_db": -10.0,
+    "detection.peak_db": -0.5, "detection.scan_limit_deg": 76.0,
+    "detection.angle_limit_deg": 40.0, "detection.averaging": "weighted",
     "detection.overlaps": "resolve",
-    "matching.bearing_gate": 0.01,
-    "matching.margin_db": 0.0,
+    "matching.delay_gate": 0.01, "matching.bearing_gate": 0.01, "matching.margin_db": 0.0,
     "listening.timing": True,
-    "motion.model": "unicycle",
-    "motion.wheelbase": 0.3,
-    "motion.speed_std": 0.2,
-    "motion.steering_std": 0.06,
-    "motion.angular_rate_std": 0.2,
-    "motion.speed_bias": 0.1,
+    "motion.model": "unicycle", "motion.wheelbase": 0.3, "motion.speed_std": 0.2,
+    "motion.steering_std": 0.06, "motion.angular_rate_std": 0.2, "motion.speed_bias": 0.1,
     "motion.turn_bias": 0.01,
-    "assumed.wheelbase": 0.3,
-    "assumed.speed_std": 0.2,
-    "assumed.steering_std": 0.06,
-    "assumed.angular_rate_std": 0.3,
-    "assumed.speed_of_sound": 335.0,
-    "filter.noise": "measured",
-    "filter.robust": "huber",
-    "filter.range_std": 0.4,
-    "filter.bearing_std": 0.05,
-    "filter.excess_path_std": 0.7,
-    "filter.caller_speed_std": 0.3,
-    "filter.caller_walk_std": 0.6,
-    "filter.initial_pose_std": [0.1, 0.1, 0.1],
-    "filter.first_pose": "drawn",
-    "filter.gate": 0.05,
-    "filter.calibrate": ["speed_scale", "turn_bias"],
-    "filter.window": 3.0,
-    "prior.speed_scale_std": 0.01,
-    "prior.turn_bias_std": 0.001,
-    "prior.wheelbase_std": 0.3,
-    "prior.speed_of_sound_std": 1.0,
-    "prior.sensor_heading_std": 0.01,
-    "prior.sensor_place_std": 0.5,
-    "prior.time_offset_std": 0.01,
-    "rays.ratio": 0.2,
-    "rays.density": 2.0,
-    "rays.range_bounds": [1.0, 15.0],
-    "rays.prune": 0.3,
-    "rays.power": 4.0,
-    "rays.weights": "aggregated",
-    "rays.likelihood": "printed",
-    "rays.spacing": "auto",
-    "rays.ranged": "heaviest",
-    "rays.merge": 2.0,
-    "fastslam.particles": 30,
-    "fastslam.resample_below": 1.0,
-    "fastslam.mixture": "exact",
-    "fastslam.weights": "sampled",
-    "fastslam.resampled_rays": "restart",
+    "assumed.wheelbase": 0.3, "assumed.speed_std": 0.2, "assumed.steering_std": 0.06,
+    "assumed.angular_rate_std": 0.3, "assumed.speed_of_sound": 335.0,
+    "filter.noise": "measured", "filter.robust": "huber", "filter.range_std": 0.4,
+    "filter.bearing_std": 0.05, "filter.excess_path_std": 0.7, "filter.caller_speed_std": 0.3,
+    "filter.caller_walk_std": 0.6, "filter.initial_pose_std": [0.1, 0.1, 0.1],
+    "filter.first_pose": "drawn", "filter.gate": 0.05,
+    "filter.calibrate": ["speed_scale", "turn_bias"], "filter.window": 3.0,
+    "prior.speed_scale_std": 0.01, "prior.turn_bias_std": 0.001, "prior.wheelbase_std": 0.3,
+    "prior.speed_of_sound_std": 1.0, "prior.sensor_heading_std": 0.01,
+    "prior.sensor_place_std": 0.5, "prior.time_offset_std": 0.01,
+    "rays.ratio": 0.2, "rays.density": 2.0, "rays.range_bounds": [1.0, 15.0], "rays.prune": 0.3,
+    "rays.power": 4.0, "rays.weights": "aggregated", "rays.likelihood": "printed",
+    "rays.spacing": "auto", "rays.ranged": "heaviest", "rays.merge": 2.0,
+    "fastslam.particles": 30, "fastslam.resample_below": 1.0, "fastslam.mixture": "exact",
+    "fastslam.weights": "sampled", "fastslam.resampled_rays": "restart",
     "fastslam.estimate": "mixture",
-}
+}  # fmt: skip
 """Another value of every setting, far enough from its default to be heard or believed."""
 FEW = ("air.spreading", "water.spreading", "target.shape", "emitter.radius", "beacon.level_db",
        "receiver.elements",
@@ -338,14 +282,14 @@ def plan_with(config, setting="", values=(), filters=("ekf", "fastslam")):
 
 def found_in(varied):
     """All that is found in the first world of a plan but for the times that it took, to the bit."""
-    skipped = ("case", "wall_s", "cpu_s")
     return [
-        {
-            field.name: value.tobytes() if isinstance(value, np.ndarray) else repr(value)
-            for field in fields(record)
-            if field.name not in skipped
-            for value in [getattr(record, field.name)]
-        }
+        (
+            repr({name: value for name, value in record.row.items() if name not in TIMINGS}),
+            *(
+                getattr(record, name).tobytes()
+                for name in ("steps", "landmark", "full", "landmark_error")
+            ),
+        )
         for record in run_world(varied, 0)
     ]
 
@@ -374,9 +318,9 @@ def test_values_of_a_grid_give_the_results_of_separate_runs(setting):
 
 def test_different_worlds_have_different_scores(varied, ran):
     again, other = run_world(varied, 0), run_world(varied, 1)
-    assert [r.scores for r in again] == [r.scores for r in ran]
+    assert [scores_of(r) for r in again] == [scores_of(r) for r in ran]
     pairs = zip(other, ran, strict=True)
-    assert all(a.scores.position_rmse_m != b.scores.position_rmse_m for a, b in pairs)
+    assert all(a.row["position_rmse_m"] != b.row["position_rmse_m"] for a, b in pairs)
 
 
 def test_each_case_of_a_later_world_equals_a_separate_trial(varied):
@@ -386,8 +330,8 @@ def test_each_case_of_a_later_world_equals_a_separate_trial(varied):
         (heard,) = listen(scenario, config, [config.emitter.radius], iteration=1)
         scans = scans_of(heard, record.case.strategy, config)
         trial = run_trial(number, drive_of(scenario, config), scans, config)
-        bounds = {name: getattr(record.scores, name) for name in BOUNDS}
-        assert asdict(record.scores) == asdict(trial.scores) | bounds
+        bounds = {name: record.row[name] for name in BOUNDS}
+        assert scores_of(record) == asdict(trial.scores) | bounds
 
 
 def test_a_trial_that_raises_is_recorded_and_the_others_go_on(varied, ran, monkeypatch):
@@ -402,13 +346,12 @@ def test_a_trial_that_raises_is_recorded_and_the_others_go_on(varied, ran, monke
     for record, whole in zip(run_world(varied, 0), ran, strict=True):
         case = record.case
         if (case.strategy, case.filter) == ("fused", "fastslam"):
-            assert record.error.startswith("Traceback")
-            assert record.error.endswith("ZeroDivisionError: no particles left\n")
-            assert record.scores is None
+            assert [*record.row] == ["error"]
+            assert record.row["error"].startswith("Traceback")
+            assert record.row["error"].endswith("ZeroDivisionError: no particles left\n")
             assert len(record.steps) == len(record.landmark) == 0
         else:
-            assert record.error is None
-            assert record.scores == whole.scores
+            assert scores_of(record) == scores_of(whole)
 
 
 def test_a_world_that_cannot_be_drawn_fails_only_its_cases(tmp_path):
@@ -416,9 +359,9 @@ def test_a_world_that_cannot_be_drawn_fails_only_its_cases(tmp_path):
     varied = plan_of(tmp_path, text)
     for record in run_world(varied, 0):
         crowded = record.case.config.scenario.landmarks == 900
-        assert (record.error is not None) == crowded
+        assert ("error" in record.row) == crowded
         if crowded:
-            assert "InputError: scenario.landmarks: found 900" in record.error
+            assert "InputError: scenario.landmarks: found 900" in record.row["error"]
 
 
 def test_a_failed_trial_keeps_its_case_its_seed_and_its_error(varied):
@@ -433,11 +376,9 @@ def test_a_failed_trial_keeps_its_case_its_seed_and_its_error(varied):
 
 
 def test_tables_keep_infinities_and_store_missing_values_as_null(varied, ran):
-    scores = replace(
-        ran[0].scores, nees_max=np.inf, position_rmse_m=np.nan, map_rmse_m=None, diverged=True
-    )
+    scores = {"nees_max": np.inf, "position_rmse_m": np.nan, "map_rmse_m": None, "diverged": True}
     steps = np.array([[np.nan, np.inf, np.inf, 2.2, 3.5]], dtype=np.float32)
-    tables = world_tables(varied, 0, [replace(ran[0], scores=scores, steps=steps)])
+    tables = world_tables(varied, 0, [replace(ran[0], row=ran[0].row | scores, steps=steps)])
     (row,) = as_rows(tables["trials"])
     assert row["nees_max"] == np.inf
     assert np.isnan(row["position_rmse_m"])
@@ -471,13 +412,13 @@ def test_an_exact_start_leaves_frames_unscored_until_the_covariance_is_positive_
 
 def test_columns_of_a_worlds_tables_equal_their_records(varied, ran):
     tables = world_tables(varied, 3, ran)
-    trials, scored = as_rows(tables["trials"]), asdict(ran[0].scores)
+    trials, scored = as_rows(tables["trials"]), scores_of(ran[0])
     for row, record in zip(trials, ran, strict=True):
         assert (row["iteration"], row["case"]) == (3, record.case.number)
         left = {"nis_mean", *OF_ASSOCIATION}
         assert not left & {*row}, "worlds of a study that was begun before have none"
         kept = {name: row[name] for name in scored if name not in left}
-        assert kept == {name: v for name, v in asdict(record.scores).items() if name in kept}
+        assert kept == {name: v for name, v in record.row.items() if name in kept}
         own = tables["steps"].filter(case=record.case.number)
         assert own["frame"].to_list() == list(range(1, 11))
         names = ["position_error_m", "heading_error_rad", "nees", "nees_expected", "nees_variance"]
@@ -536,7 +477,7 @@ def bounded(tmp_path_factory):
 def bounds_of(ran, strategy, radius=0.0025):
     """All bounds of a strategy at a radius, each once."""
     return {
-        tuple(getattr(record.scores, name) for name in BOUNDS)
+        tuple(record.row[name] for name in BOUNDS)
         for record in ran
         if record.case.strategy == strategy and record.case.config.emitter.radius == radius
     }
@@ -544,7 +485,7 @@ def bounds_of(ran, strategy, radius=0.0025):
 
 @pytest.mark.parametrize("strategy", ["active", "fused", "passive"])
 def test_the_bound_is_the_same_for_all_filters_and_their_settings(bounded, strategy):
-    assert {record.error for record in bounded} == {None}
+    assert not any("error" in record.row for record in bounded)
     for radius in (0.0025, 0.025):
         found = bounds_of(bounded, strategy, radius)
         assert len(found) == (0 if (strategy, radius) == ("passive", 0.0025) else 1)
@@ -579,13 +520,13 @@ def test_only_measured_noise_raises_the_bound(varied, monkeypatch):
     after = run_world(short, 0)
     monkeypatch.setattr(heard_world, "without_hidden", without_hidden)
     pairs = zip(before, after, strict=True)
-    share = [b.scores.heading_bound_rad / a.scores.heading_bound_rad for a, b in pairs]
+    share = [b.row["heading_bound_rad"] / a.row["heading_bound_rad"] for a, b in pairs]
     assert max(share) > 1.03
     for one, other, same in zip(before, after, run_world(stated, 0), strict=True):
         for name in BOUNDS:
-            assert getattr(other.scores, name) > getattr(one.scores, name)
-            assert getattr(same.scores, name) == getattr(one.scores, name)
-        assert other.scores.position_rmse_m == one.scores.position_rmse_m
+            assert other.row[name] > one.row[name]
+            assert same.row[name] == one.row[name]
+        assert other.row["position_rmse_m"] == one.row["position_rmse_m"]
 
 
 def test_a_world_is_done_when_its_trials_are_there(folder, plan, records):
@@ -595,7 +536,8 @@ def test_a_world_is_done_when_its_trials_are_there(folder, plan, records):
     for table in TABLES:
         assert world_file(folder, table, 2).is_file()
     assert leftovers(folder) == []
-    assert read_ended_trials(folder, plan, 2) == [(r.case.strategy, r.error) for r in records]
+    outcomes = [(record.case.strategy, record.row["error"]) for record in records]
+    assert read_outcomes(folder, plan, 2) == outcomes
 
 
 def test_the_trials_are_written_last(folder, plan, records, monkeypatch):
@@ -738,7 +680,7 @@ def test_a_damaged_world_is_named_with_the_way_out(folder, plan):
     with pytest.raises(
         InputError, match=r"0\.parquet: could not be read: it is no whole .*; remove"
     ):
-        read_ended_trials(folder, plan, 0)
+        read_outcomes(folder, plan, 0)
 
 
 @pytest.mark.parametrize("table", TABLES)
@@ -751,7 +693,7 @@ def test_one_bit_that_a_disk_changed_is_noticed(folder, plan, records, table, pl
     data[int(place * len(data))] ^= 4
     path.write_bytes(data)
     with pytest.raises(InputError) as refused:
-        read_ended_trials(folder, plan, 3)
+        read_outcomes(folder, plan, 3)
     assert str(refused.value).startswith(f"{path}: ")
     assert "remove trials/iteration_00003.parquet" in str(refused.value)
 
@@ -783,7 +725,7 @@ def test_trials_of_other_columns_are_named_though_their_sums_are_right(folder, p
     for name, file in world.with_sums(other, plan, 0).items():
         world_file(folder, name, 0).write_bytes(file)
     with pytest.raises(InputError, match=r"iteration_00000\.parquet: has not the columns"):
-        read_ended_trials(folder, plan, 0)
+        read_outcomes(folder, plan, 0)
 
 
 @pytest.mark.parametrize("table", TABLES)
@@ -835,7 +777,7 @@ def test_no_name_of_a_folder_is_a_pattern_or_a_place_elsewhere(
     for folder in {Path(name), beside}:
         world_files_of(folder, plan, records)
     for folder in {Path(name), beside}:
-        assert len(read_ended_trials(folder, plan, 0)) == len(records)
+        assert len(read_outcomes(folder, plan, 0)) == len(records)
         study = load_study(folder)
         assert [len(getattr(study, table).collect()) for table in TABLES] == [0, 0, len(records)]
 

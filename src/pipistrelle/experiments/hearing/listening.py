@@ -8,14 +8,14 @@ paper's half second, less the call itself, when the receiver is deaf. The block 
 the last arrival. The rest would be noise, which gets no label, so labelled scans have the same
 distribution; only the count of clutter lacks the false alarms of the silence (about 0.01 a frame).
 
-Callers without a clock call when the vehicle does. A call of a caller with a clock is received in
-the frames in which its sounds arrive; arrivals that begin less than the duration of a call before
+Callers without a clock call when the vehicle does. A call of a caller with a clock belongs to
+all frames that receive its sounds; arrivals that begin less than the duration of a call before
 the vehicle's next call are lost.
 """
 
 import math
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -55,7 +55,6 @@ from pipistrelle.detection.snapshots import Detections, Detector, detections_at,
 from pipistrelle.experiments.hearing.oracle import faintest_level_db, label_detections
 from pipistrelle.experiments.hearing.scenario import (
     Scenario,
-    TimedCall,
     caller_labels,
     calls_heard,
     with_times,
@@ -65,8 +64,7 @@ EMISSIONS_AT_ONCE = 25
 """Emissions whose arrivals are computed together; a few thousand rows keep NumPy efficient."""
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class CallHeard:
+class CallHeard(NamedTuple):
     """Arrivals at the vehicle from a single call of a caller on an independent clock."""
 
     number: int
@@ -80,8 +78,7 @@ class CallHeard:
     """Arrivals for each piston, with delays from `time`."""
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Frame:
+class Frame(NamedTuple):
     """All arrivals from a call of the vehicle until its next call."""
 
     time: float
@@ -103,16 +100,15 @@ def frames_of(
     setup, medium = config.scenario, medium or medium_of(config.medium)
     calls = calls_heard(scenario, setup, medium.speed_of_sound)
     begin = scenario.time[setup.steps_per_frame :: setup.steps_per_frame]
-    world = with_times(scenario, [call.time for call in calls]) if calls else scenario
+    world = with_times(scenario, [time for time, _ in calls]) if calls else scenario
     own_clock = [j for j, caller in enumerate(scenario.callers) if caller.calls is not None]
-    heard = _calls_heard(world, calls, radii, config, beam, medium)
+    emissions = partial(_emissions, world, radii=radii, config=config, beam=beam, medium=medium)
+    heard = _calls_heard(world, calls, emissions, medium.speed_of_sound)
     span = setup.steps_per_frame * setup.step - config.emitter.pulse
     last = np.array([one.time + one.sounds[0].delay.max() for one in heard])
-    first = np.array([call.time for call in calls])
+    first = np.array([one.time for one in heard])
     steps = np.searchsorted(world.time, begin)
-    for time, aimed in zip(
-        begin.tolist(), _emissions(world, steps, radii, config, beam, medium), strict=True
-    ):
+    for time, aimed in zip(begin.tolist(), emissions(steps), strict=True):
         near = [heard[i] for i in np.flatnonzero((first < time + span) & (last >= time))]
         if own_clock:
             aimed = [
@@ -138,38 +134,25 @@ def _together(
 
 def _calls_heard(
     world: Scenario,
-    calls: Sequence[TimedCall],
-    radii: Sequence[float],
-    config: Config,
-    beam: Callable[..., Arrivals],
-    medium: Medium,
+    calls: Sequence[tuple[float, int]],
+    emissions: Callable[[Int[np.ndarray, " k"]], Iterator[list[Arrivals]]],
+    speed_of_sound: float,
 ) -> list[CallHeard]:
     """Return the arrivals at the vehicle of each call from callers on independent clocks."""
     following = dict.fromkeys(range(len(world.callers)), np.inf)
     until = []
-    for call in reversed(calls):
-        until.append(following[call.caller])
-        following[call.caller] = call.time
-    steps = np.searchsorted(world.time, [call.time for call in calls])
+    for time, caller in reversed(calls):
+        until.append(following[caller])
+        following[caller] = time
+    steps = np.searchsorted(world.time, [time for time, _ in calls])
     heard = []
-    for number, (call, aimed) in enumerate(
-        zip(calls, _emissions(world, steps, radii, config, beam, medium), strict=True)
-    ):
-        place = np.asarray(world.callers[call.caller].place)
+    for number, ((time, caller), aimed) in enumerate(zip(calls, emissions(steps), strict=True)):
+        place = np.asarray(world.callers[caller].place)
         place = place if place.ndim == 1 else place[steps[number]]
-        straight = np.hypot(*(place - world.path[steps[number], :2])) / medium.speed_of_sound
-        heard.append(
-            CallHeard(
-                number=number,
-                caller=call.caller,
-                time=call.time,
-                until=until[-1 - number],
-                sounds=[
-                    replace(sounds, delay=sounds.delay - straight)
-                    for sounds in (arrivals_at(one, one.caller == call.caller) for one in aimed)
-                ],
-            )
-        )
+        straight = np.hypot(*(place - world.path[steps[number], :2])) / speed_of_sound
+        own = (arrivals_at(one, one.caller == caller) for one in aimed)
+        sounds = [replace(one, delay=one.delay - straight) for one in own]
+        heard.append(CallHeard(number, caller, time, until[-1 - number], sounds))
     return heard
 
 
@@ -276,9 +259,9 @@ def listen(
     """
     setup = config.scenario
     settled = sampling(config, scenario.callers, call=call, medium=medium)
-    rig = _rig(config, scenario, layout or layout_of(config), settled, find, oracle, labels)
+    rig = _Rig(config, scenario, layout or layout_of(config), settled, oracle, labels)
     purpose = "noise" if setup.vehicle == 1 else f"noise of {setup.vehicle}"
-    engine = _dense if settled.dense else _blocks
+    engine = rig.dense if settled.dense else rig.blocks
     beams: tuple[list[FrameMeasurements], ...] = tuple([] for _ in radii)
     beam = beam or partial(through_piston, off_axis=config.emitter.off_axis)
     calls: dict[int, tuple[CallHeard, list[list[Detections]]]] = {}
@@ -286,21 +269,21 @@ def listen(
         key = stream_key(config.seed, iteration, purpose, number)
         for timed in frame.calls:
             calls.setdefault(timed.number, (timed, [[] for _ in radii]))
-        for r, record in enumerate(engine(frame.aimed, rig, key)):
+        for r, record in enumerate(engine(frame.aimed, key)):
             more = {"around": record.around} if record.around else {}
-            found = rig.find(record.matched, rig.front_end, **record.lags, **more)
+            found = find(record.matched, rig.front_end, **record.lags, **more)
             if keep is not None and record.sums is not None:
                 keep(number, frame.aimed[r], record.sums)
             for timed in frame.calls:
-                calls[timed.number][1][r].append(_of_call(timed, frame.time, record, found, rig))
+                calls[timed.number][1][r].append(rig.of_call(timed, frame.time, record, found))
             if rig.own_clock.any():
                 found = detections_at(found, ~rig.own_clock[found.caller])
-            beams[r].append(_heard(frame.time, found, frame.aimed[r], rig))
+            beams[r].append(rig.heard(frame.time, found, frame.aimed[r]))
         if progress:
             progress("listening", number, setup.steps // setup.steps_per_frame)
     for timed, parts in calls.values():
         for heard, part, sounds in zip(beams, parts, timed.sounds, strict=True):
-            between = _heard(timed.time, joined(part), sounds, rig)
+            between = rig.heard(timed.time, joined(part), sounds)
             if between.rows.landmark.size:
                 heard.append(replace(between, between=True))
     return tuple(tuple(sorted(heard, key=lambda one: one.rows.time)) for heard in beams)
@@ -327,53 +310,136 @@ class _Record(NamedTuple):
         return {"start": self.start, "interval": self.interval, "pulse": self.pulse}
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
 class _Rig:
     """Settings, arrays, detector and buffers shared by all frames of a path."""
 
-    config: Config
-    layout: Layout | Scattered
-    sampling: Sampling
-    front_end: FrontEnd
-    find: Callable[..., Detections]
-    oracle: Callable[..., Int[np.ndarray, " d"]]
-    labels: bool
-    faintest_db: float
-    callers: Int[np.ndarray, " c"]
-    missable: Bool[np.ndarray, " c"]
-    own_clock: Bool[np.ndarray, " c"]
-    workspace: Workspace
-    filters: BandFilters | None
-    """Matched filters for real samples."""
+    def __init__(
+        self,
+        config: Config,
+        scenario: Scenario,
+        layout: Layout | Scattered,
+        settled: Sampling,
+        oracle: Callable[..., Int[np.ndarray, " d"]],
+        labels: bool,
+    ) -> None:
+        calls = settled.calls if settled.real else ()
+        self.config, self.layout, self.sampling = config, layout, settled
+        self.oracle, self.labels = oracle, labels
+        self.front_end = front_end(config, layout, settled.tones, calls=calls)
+        self.faintest_db = _faintest_db(self.front_end, layout, settled, config)
+        self.callers = caller_labels(scenario)
+        self.own_clock = np.array([caller.calls is not None for caller in scenario.callers])
+        self.missable: Bool[np.ndarray, " c"] = self.own_clock | [
+            caller.heading is not None for caller in scenario.callers
+        ]
+        self.workspace = Workspace()
+        self.filters = BandFilters(settled.calls, settled.rate) if settled.real else None
+        """Matched filters for real samples."""
 
+    def of_call(
+        self, call: CallHeard, time: float, record: _Record, found: Detections
+    ) -> Detections:
+        """Select the detections of a caller's call in a frame; delays count from the call."""
+        after, early = call.time - time, 0.5 * record.interval * record.pulse
+        stretch = after - early, call.until - time - early
+        part = call_in(record.matched, self.front_end, found, call.caller, stretch, **record.lags)
+        direct = part.direct and part.direct._replace(delay=part.direct.delay - after)
+        return replace(part, delay=part.delay - after, direct=direct)
 
-def _rig(
-    config: Config,
-    scenario: Scenario,
-    layout: Layout | Scattered,
-    settled: Sampling,
-    find: Callable[..., Detections],
-    oracle: Callable[..., Int[np.ndarray, " d"]],
-    labels: bool,
-) -> _Rig:
-    """Create the detector, limits and buffers shared by all frames of a path."""
-    end = front_end(config, layout, settled.tones, calls=settled.calls if settled.real else ())
-    own_clock = np.array([caller.calls is not None for caller in scenario.callers])
-    return _Rig(
-        config=config,
-        layout=layout,
-        sampling=settled,
-        front_end=end,
-        find=find,
-        oracle=oracle,
-        labels=labels,
-        faintest_db=_faintest_db(end, layout, settled, config),
-        callers=caller_labels(scenario),
-        missable=own_clock | [caller.heading is not None for caller in scenario.callers],
-        own_clock=own_clock,
-        workspace=Workspace(),
-        filters=BandFilters(settled.calls, settled.rate) if settled.real else None,
-    )
+    def heard(self, time: float, detections: Detections, arrivals: Arrivals) -> FrameMeasurements:
+        """Label a frame's detections and average them over the faces, by label and caller."""
+        config = self.config
+        label = self.oracle(
+            detections,
+            arrivals,
+            self.layout,
+            config.matching,
+            pulse=config.emitter.pulse,
+            faintest_db=self.faintest_db,
+        )
+        detections = with_edge_floor(detections, config)
+        direct = detections.direct
+        if direct is not None and self.missable.any():
+            direct = own_alone(direct, label, self.callers, self.missable)
+        heard = average_faces(
+            time,
+            replace(detections, direct=direct),
+            label,
+            averaging=config.detection.averaging,
+            speed_of_sound=config.assumed_sound_speed,
+            callers=self.callers,
+        )
+        return heard if self.labels else self._unlabelled(time, detections, label, heard)
+
+    def _unlabelled(
+        self,
+        time: float,
+        detections: Detections,
+        label: Int[np.ndarray, " d"],
+        heard: FrameMeasurements,
+    ) -> FrameMeasurements:
+        """Add the measurements without labels to a frame, with the true label of each.
+
+        An echo's label is taken from its strongest labelled detection, a direct call's from its
+        caller.
+        """
+        scan, echo = unlabelled_scan(time, detections, self.config, self.missable)
+        causes = np.full(int(echo.max(initial=-1)) + 1, UNLABELLED)
+        for d in np.argsort(detections.power, kind="stable").tolist():
+            causes[echo[d]] = causes[echo[d]] if label[d] == UNLABELLED else label[d]
+        known = np.flatnonzero(scan.direct >= 0)
+        causes[scan.direct[known]] = self.callers[known]
+        return replace(heard, unlabelled=scan, causes=causes)
+
+    def blocks(self, aimed: Sequence[Arrivals], key: int) -> Iterator[_Record]:
+        """Yield the matched-filter output of each beam's arrivals, from block sums."""
+        layout, settled, space = self.layout, self.sampling, self.workspace
+        pulse = settled.pulse
+        own, others = _parted(aimed[0])
+        shape = block_shape(blocks_to_hear(aimed[0], settled, layout), layout, settled)
+        shared = noise_blocks(shape[0], layout, settled, key, out=space.array("shared", shape))
+        add_echo_blocks(shared, arrivals_at(aimed[0], others), layout, settled)
+        lags = (shape[0] - pulse + 1, *shape[1:])
+        for left, arrivals in zip(range(len(aimed) - 1, -1, -1), aimed, strict=True):
+            signal = shared
+            if left:  # the last beam may overwrite the shared sums
+                signal = space.array("signal", shape)
+                np.copyto(signal, shared)
+            add_echo_blocks(signal, arrivals_at(arrivals, own), layout, settled)
+            matched = filter_blocks(
+                signal,
+                pulse=pulse,
+                block=settled.block,
+                noise_std=settled.noise_std,
+                out=space.array("matched", lags),
+            )
+            yield _Record(matched, start=pulse * BLOCK, interval=BLOCK, pulse=pulse, sums=signal)
+
+    def dense(self, aimed: Sequence[Arrivals], key: int) -> Iterator[_Record]:
+        """Yield the matched-filter output of each beam's arrivals, in single precision."""
+        settled, setup, filters = self.sampling, self.config.scenario, self.filters
+        period = math.floor(setup.steps_per_frame * setup.step / settled.interval) - settled.pulse
+        start = settled.pulse * settled.interval
+        for arrivals in aimed:
+            samples = record_samples(
+                max(period, blocks_to_hear(arrivals, settled, self.layout)),
+                arrivals,
+                self.layout,
+                settled,
+                np.random.default_rng(key),
+                single=True,
+            )
+            if filters is not None:
+                interval, pulse = filters.step / settled.rate, filters.pulse
+                matched = filters(samples, settled.noise_std)
+                around = partial(filters.around, samples, settled.noise_std)
+                yield _Record(matched, start, interval, pulse, sums=samples, around=around)
+            else:
+                matched = filter_samples(
+                    samples, calls=settled.calls, rate=settled.rate, noise_std=settled.noise_std
+                )
+                pulse = settled.pulse * settled.block
+                yield _Record(matched, start=start, interval=1.0 / settled.rate, pulse=pulse)
 
 
 def _faintest_db(
@@ -396,93 +462,6 @@ def _faintest_db(
     )
 
 
-def _of_call(
-    call: CallHeard, time: float, record: "_Record", found: Detections, rig: _Rig
-) -> Detections:
-    """Select the detections of a caller's call in a frame; delays count from the call."""
-    after, early = call.time - time, 0.5 * record.interval * record.pulse
-    stretch = after - early, call.until - time - early
-    part = call_in(record.matched, rig.front_end, found, call.caller, stretch, **record.lags)
-    direct = part.direct and part.direct._replace(delay=part.direct.delay - after)
-    return replace(part, delay=part.delay - after, direct=direct)
-
-
-def _heard(time: float, detections: Detections, arrivals: Arrivals, rig: _Rig) -> FrameMeasurements:
-    """Label a frame's detections and average them over the faces."""
-    label = rig.oracle(
-        detections,
-        arrivals,
-        rig.layout,
-        rig.config.matching,
-        pulse=rig.config.emitter.pulse,
-        faintest_db=rig.faintest_db,
-    )
-    detections = with_edge_floor(detections, rig.config)
-    direct = detections.direct
-    if direct is not None and rig.missable.any():
-        direct = own_alone(direct, label, rig.callers, rig.missable)
-    heard = _averaged(time, replace(detections, direct=direct), label, rig)
-    return heard if rig.labels else _unlabelled(time, detections, label, heard, rig)
-
-
-def _averaged(
-    time: float, detections: Detections, label: Int[np.ndarray, " d"], rig: _Rig
-) -> FrameMeasurements:
-    """Average a frame's detections over the faces, by label and caller."""
-    return average_faces(
-        time,
-        detections,
-        label,
-        averaging=rig.config.detection.averaging,
-        speed_of_sound=rig.config.assumed_sound_speed,
-        callers=rig.callers,
-    )
-
-
-def _unlabelled(
-    time: float,
-    detections: Detections,
-    label: Int[np.ndarray, " d"],
-    heard: FrameMeasurements,
-    rig: _Rig,
-) -> FrameMeasurements:
-    """Add the measurements without labels to a frame, with the true label of each.
-
-    An echo's label is taken from its strongest labelled detection, a direct call's from its caller.
-    """
-    scan, echo = unlabelled_scan(time, detections, rig.config, rig.missable)
-    causes = np.full(int(echo.max(initial=-1)) + 1, UNLABELLED)
-    for d in np.argsort(detections.power, kind="stable").tolist():
-        causes[echo[d]] = causes[echo[d]] if label[d] == UNLABELLED else label[d]
-    known = np.flatnonzero(scan.direct >= 0)
-    causes[scan.direct[known]] = rig.callers[known]
-    return replace(heard, unlabelled=scan, causes=causes)
-
-
-def _blocks(aimed: Sequence[Arrivals], rig: _Rig, key: int) -> Iterator[_Record]:
-    """Yield the matched-filter output of each beam's arrivals, from block sums."""
-    layout, settled, space, pulse = rig.layout, rig.sampling, rig.workspace, rig.sampling.pulse
-    own, others = _parted(aimed[0])
-    shape = block_shape(blocks_to_hear(aimed[0], settled, layout), layout, settled)
-    shared = noise_blocks(shape[0], layout, settled, key, out=space.array("shared", shape))
-    add_echo_blocks(shared, arrivals_at(aimed[0], others), layout, settled)
-    lags = (shape[0] - pulse + 1, *shape[1:])
-    for left, arrivals in zip(range(len(aimed) - 1, -1, -1), aimed, strict=True):
-        signal = shared
-        if left:  # the last beam may overwrite the shared sums
-            signal = space.array("signal", shape)
-            np.copyto(signal, shared)
-        add_echo_blocks(signal, arrivals_at(arrivals, own), layout, settled)
-        matched = filter_blocks(
-            signal,
-            pulse=pulse,
-            block=settled.block,
-            noise_std=settled.noise_std,
-            out=space.array("matched", lags),
-        )
-        yield _Record(matched, start=pulse * BLOCK, interval=BLOCK, pulse=pulse, sums=signal)
-
-
 def _parted(arrivals: Arrivals) -> tuple[slice | np.ndarray, slice | np.ndarray]:
     """Split arrivals into two groups: through a piston, and shared by all beamwidths."""
     if arrivals.departure is None:
@@ -490,30 +469,3 @@ def _parted(arrivals: Arrivals) -> tuple[slice | np.ndarray, slice | np.ndarray]
         return slice(own), slice(own, None)
     beamed = (arrivals.caller == VEHICLE) | np.isfinite(arrivals.departure)
     return beamed, ~beamed
-
-
-def _dense(aimed: Sequence[Arrivals], rig: _Rig, key: int) -> Iterator[_Record]:
-    """Yield the matched-filter output of each beam's arrivals, from single-precision samples."""
-    settled, setup = rig.sampling, rig.config.scenario
-    period = math.floor(setup.steps_per_frame * setup.step / settled.interval) - settled.pulse
-    start = settled.pulse * settled.interval
-    for arrivals in aimed:
-        samples = record_samples(
-            max(period, blocks_to_hear(arrivals, settled, rig.layout)),
-            arrivals,
-            rig.layout,
-            settled,
-            np.random.default_rng(key),
-            single=True,
-        )
-        if rig.filters is not None:
-            interval, pulse = rig.filters.step / settled.rate, rig.filters.pulse
-            matched = rig.filters(samples, settled.noise_std)
-            around = partial(rig.filters.around, samples, settled.noise_std)
-            yield _Record(matched, start, interval, pulse, sums=samples, around=around)
-        else:
-            matched = filter_samples(
-                samples, calls=settled.calls, rate=settled.rate, noise_std=settled.noise_std
-            )
-            pulse = settled.pulse * settled.block
-            yield _Record(matched, start=start, interval=1.0 / settled.rate, pulse=pulse)

@@ -10,6 +10,7 @@ can measure. Between control steps all motion is linear, with a constant turn ra
 from collections.abc import Mapping, Sequence
 from copy import deepcopy
 from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -67,12 +68,7 @@ class Scenario:
 
 
 def world_of(config: Config, iteration: int = 0, world: World = ALL_DRAWN) -> Scenario:
-    """Draw the world of the settings' seed and a number; raises InputError as `draw_scenario` does.
-
-    >>> one, again, other = world_of(Config()), world_of(Config()), world_of(Config(), 1)
-    >>> (one.path == again.path).all().item(), (one.path == other.path).all().item()
-    (True, False)
-    """
+    """Draw the world of the settings' seed and a number, as `draw_scenario` does."""
     key = stream_key(config.seed, iteration, "scenario")
     return draw_scenario(config, np.random.default_rng(key), world)
 
@@ -96,11 +92,15 @@ def draw_scenario(config: Config, rng: np.random.Generator, world: World = ALL_D
     path, controls = driven(course, setup, motion, rng, bias)
     given = config.callers is None and world.callers is not None
     settings, first = world.callers if given else config.callers, deepcopy(rng)
-    beacon = np.zeros(2) if given else _place_beacon(setup, [path[:, :2], _sized(world)], rng)
+    clear_of = [path[:, :2]]
+    if world.landmarks is not None and world.bodies is not None:
+        clear_of.append(world.landmarks[np.isfinite(world.bodies.radius)])
+    beacon = np.zeros(2) if given else _place_beacon(setup, clear_of, rng)
     landmarks = world.landmarks
     if landmarks is None:
-        callers = _places(settings or ()) if given else beacon[np.newaxis]
-        landmarks = landmarks_in(setup, path[:, :2], callers, rng)
+        still = [one.place for one in settings or () if one.way == "stand" and one.place]
+        clear = np.array(still, dtype=float).reshape(-1, 2) if given else beacon[np.newaxis]
+        landmarks = landmarks_in(setup, path[:, :2], clear, rng)
     vehicle, *others = callers_of(config, beacon)
     if settings is not None:
         around = Surroundings(
@@ -137,56 +137,28 @@ def _mission_of(world: Scenario, vehicle: int) -> Scenario:
             "times"
         )
     path, controls = other.mission or (world.path, world.controls)
+    mission = {"place": world.path[:, :2], "heading": world.path[:, 2]}
     callers = list(world.callers)
-    callers[VEHICLE] = replace(
-        one,
-        frequency=other.frequency,
-        level_db=other.level_db,
-        key=other.key,
-        sound=other.sound,
-    )
-    callers[j] = replace(
-        other,
-        frequency=one.frequency,
-        level_db=one.level_db,
-        key=one.key,
-        sound=one.sound,
-        place=world.path[:, :2],
-        heading=world.path[:, 2],
-        mission=(world.path, world.controls),
-    )
+    callers[VEHICLE] = replace(one, **_voice(other))
+    callers[j] = replace(other, **_voice(one), **mission, mission=(world.path, world.controls))
     return replace(world, path=path, controls=controls, callers=tuple(callers))
 
 
-def landmark_count(scenario: Scenario) -> int:
-    """Count the landmarks to map: the world's landmarks and all callers except the vehicle.
-
-    >>> landmark_count(world_of(Config(scenario=ScenarioConfig(landmarks=12))))
-    13
-    """
-    return len(scenario.landmarks) + len(scenario.callers[VEHICLE + 1 :])
+def _voice(caller: Caller) -> dict[str, Any]:
+    """Return the tone, level, key and sound of a caller, by field."""
+    return {name: getattr(caller, name) for name in ("frequency", "level_db", "key", "sound")}
 
 
 def standing_landmarks(scenario: Scenario) -> LabelledPoints:
-    """Return labels, rising, and positions [m] of the landmarks and of callers that do not move.
-
-    >>> labels, places = standing_landmarks(world_of(Config()))
-    >>> labels[[0, -1]], places.shape
-    (array([ 1, 51]), (51, 2))
-    """
-    landmarks = scenario.landmarks
-    others = _others(scenario).items()
+    """Return labels, rising, and positions [m] of the landmarks and of callers that do not move."""
+    landmarks, others = scenario.landmarks, _others(scenario).items()
     standing = {label: np.asarray(c.place) for label, c in others if not moves(c)}
     labels = np.array([*range(1, len(landmarks) + 1), *standing])
     return labels, np.vstack((landmarks, *standing.values()))
 
 
 def moving_callers(scenario: Scenario) -> dict[int, Caller]:
-    """Return the callers that move, by rising label; they are no landmarks of a map.
-
-    >>> moving_callers(world_of(Config()))
-    {}
-    """
+    """Return the callers that move, by rising label; they are no landmarks of a map."""
     return {label: caller for label, caller in _others(scenario).items() if moves(caller)}
 
 
@@ -196,38 +168,16 @@ def _others(scenario: Scenario) -> dict[int, Caller]:
 
 
 def caller_labels(scenario: Scenario) -> Int[np.ndarray, " c"]:
-    """Return each caller's label as a landmark, by caller number; the vehicle's is UNLABELLED.
-
-    >>> caller_labels(world_of(Config()))
-    array([-1, 51])
-    """
+    """Return each caller's label as a landmark, by caller number; the vehicle's is UNLABELLED."""
     labels = len(scenario.landmarks) + np.arange(len(scenario.callers))
     labels[VEHICLE] = UNLABELLED
     return labels
 
 
 def assumed_motion(config: Config) -> Motion:
-    """Return the motion model that the estimators assume: the true one with the `assumed` settings.
-
-    >>> from pipistrelle.config import AssumedConfig
-    >>> assumed_motion(Config(assumed=AssumedConfig(wheelbase=0.25))).wheelbase
-    0.25
-    """
+    """Return the motion model of the estimators: the true model with the `assumed` settings."""
     given = config.assumed.model_dump(exclude_none=True, exclude={"speed_of_sound"})
     return motion_of(config.motion.model_copy(update=given))
-
-
-def _places(callers: Sequence[CallerConfig]) -> Float[np.ndarray, "n 2"]:
-    """Return the given positions of callers that do not move."""
-    places = [caller.place for caller in callers if caller.way == "stand" and caller.place]
-    return np.array(places, dtype=float).reshape(-1, 2)
-
-
-def _sized(world: World) -> Float[np.ndarray, "n 2"]:
-    """Return the positions of a world's landmarks with a given radius."""
-    if world.landmarks is None or world.bodies is None:
-        return np.empty((0, 2))
-    return world.landmarks[np.isfinite(world.bodies.radius)]
 
 
 def _place_beacon(
@@ -245,29 +195,19 @@ def _place_beacon(
 
 
 MICROSECOND = 1e-6
-"""Largest difference between times that count as equal [s]."""
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class TimedCall:
-    """A call of a caller on an independent clock."""
-
-    caller: int
-    """Index of the caller."""
-    time: float
-    """Time of the direct arrival [s]."""
+"""Times are rounded to this, or to a control step within it [s]."""
 
 
 def calls_heard(
     scenario: Scenario, setup: ScenarioConfig, speed_of_sound: float
-) -> list[TimedCall]:
-    """List the calls from independent clocks that reach the vehicle, in order of direct arrival.
+) -> list[tuple[float, int]]:
+    """List time of direct arrival [s] and caller of each call from an independent clock.
 
     Arrivals before the vehicle's first call, which begins the first frame, or after the end of the
     path are excluded.
     """
     first, last = setup.steps_per_frame * setup.step, float(scenario.time[-1])
-    calls = []
+    calls: list[tuple[float, int]] = []
     for j, caller in enumerate(scenario.callers):
         if caller.calls is not None:
             place = _places_at(caller.calls, scenario.time, np.asarray(caller.place))
@@ -275,9 +215,11 @@ def calls_heard(
             for _ in range(4):  # converges fast, as the vehicle is far slower than sound
                 away = place - path_at(heard.clip(0.0, last), scenario.time, scenario.path)[:, :2]
                 heard = caller.calls + np.hypot(*away.T) / speed_of_sound
-            heard = _on_clock(heard, scenario.time)
-            calls += [TimedCall(caller=j, time=t) for t in heard.tolist() if first <= t <= last]
-    return sorted(calls, key=lambda call: call.time)
+            clock = scenario.time
+            near = clock[np.abs(clock[:, np.newaxis] - heard).argmin(axis=0)]
+            heard = np.where(np.abs(near - heard) <= MICROSECOND, near, heard.round(6))
+            calls += [(time, j) for time in heard.tolist() if first <= time <= last]
+    return sorted(calls)
 
 
 def with_times(scenario: Scenario, times: Sequence[float]) -> Scenario:
@@ -302,14 +244,6 @@ def _with_times(
         velocity=None if velocity is None else _places_at(time, clock, np.asarray(velocity)),
         heading=None if heading is None else wrap(np.interp(time, clock, np.unwrap(heading))),
     )
-
-
-def _on_clock(
-    times: Float[np.ndarray, " m"], clock: Float[np.ndarray, " t"]
-) -> Float[np.ndarray, " m"]:
-    """Round times to microseconds, or to a time of the clock within a microsecond."""
-    near = clock[np.abs(clock[:, np.newaxis] - times).argmin(axis=0)]
-    return np.where(np.abs(near - times) <= MICROSECOND, near, times.round(6))
 
 
 def _places_at(

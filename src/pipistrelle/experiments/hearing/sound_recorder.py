@@ -27,8 +27,6 @@ from pipistrelle.files import OwnFiles, PiecesFile, make_folder, remove_empty
 SOUND_FILE = "recording.wav"
 HEADROOM = 4.0
 """Largest amplitude that the file can hold, in units of the loudest call's at 1 m."""
-_LARGEST_RIFF = 2**32 - 2**16
-"""Bytes of samples above which 64-bit sizes are written (RF64)."""
 _README = """A sound recording of Pipistrelle. Make a log of it with: pipistrelle hear FOLDER -o LOG
 
 recording.wav     the microphones' samples, a channel each; times `scale` they are amplitudes
@@ -161,9 +159,10 @@ class SoundRecorder:
         import tomli_w
 
         calls = {
-            name: wav_header(4 * one.samples.size, 1, one.rate, 32)
-            + (one.samples).astype("<f4").tobytes()
-            for name, one in _call_files(scenario).items()
+            _call_file(one): wav_header(4 * one.sound.samples.size, 1, one.sound.rate, 32)
+            + one.sound.samples.astype("<f4").tobytes()
+            for one in scenario.callers
+            if isinstance(one.sound, RecordedCall)
         }
         time = (np.arange(len(self.frames)) + self.frames.start + 1) * self.period
         return calls | {
@@ -211,12 +210,6 @@ class SoundRecorder:
         }
 
 
-def _call_files(scenario: Scenario) -> dict[str, RecordedCall]:
-    """Return the recorded calls of the callers, by file name."""
-    sounds = {_call_file(caller): caller.sound for caller in scenario.callers}
-    return {name: one for name, one in sounds.items() if isinstance(one, RecordedCall)}
-
-
 def _call_file(caller: Caller) -> str:
     """Return the name of the file with a caller's call."""
     return f"call_{caller.name}.wav"
@@ -224,10 +217,8 @@ def _call_file(caller: Caller) -> str:
 
 def _told(caller: Caller) -> dict[str, Any]:
     """Return the call of a caller as settings, or the name of its sound file."""
-    told = settings_of(caller.sound)
-    if isinstance(caller.sound, RecordedCall):
-        return {"call": _call_file(caller)}
-    return told
+    recorded = isinstance(caller.sound, RecordedCall)
+    return {"call": _call_file(caller)} if recorded else settings_of(caller.sound)
 
 
 def wav_header(size: int, channels: int, rate: float, bits: int) -> bytes:
@@ -237,10 +228,6 @@ def wav_header(size: int, channels: int, rate: float, bits: int) -> bytes:
     integers.
 
     Sources: Microsoft, Multiple Channel Audio Data and WAVE Files (2007); EBU Tech 3306 (RF64).
-
-    >>> header = wav_header(800, 40, 200e3, 32)
-    >>> header[:4], header[-8:-4], len(header)
-    (b'RIFF', b'data', 80)
     """
     frame, count = channels * bits // 8, size // (channels * bits // 8)
     kind = 3 if bits == 32 else 1
@@ -250,7 +237,7 @@ def wav_header(size: int, channels: int, rate: float, bits: int) -> bytes:
     fact = struct.pack("<I", min(count, 2**32 - 1))
     parts = ((b"fmt ", fmt), (b"fact", fact))
     chunks = b"".join(name + struct.pack("<I", len(data)) + data for name, data in parts)
-    if size <= _LARGEST_RIFF:
+    if size <= 2**32 - 2**16:  # sizes of 32 bits hold the header as well
         head = b"RIFF" + struct.pack("<I", 4 + len(chunks) + 8 + size) + b"WAVE"
         return head + chunks + b"data" + struct.pack("<I", size)
     whole = 4 + 36 + len(chunks) + 8 + size

@@ -23,8 +23,6 @@ MAX_STEERING = 0.6
 """Largest steering angle that the driver commands [rad]."""
 TIME_TOLERANCE = 1e-6
 """Difference below which two times count as equal, in steps or seconds."""
-EIGHT_POINTS = 96
-"""Number of way-points of a figure of eight."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -64,9 +62,6 @@ def motion_of(motion: MotionConfig) -> Motion:
     """Return the true motion model of the settings.
 
     Bradley & Abaid, Eq. (5).
-
-    >>> motion_of(MotionConfig(speed_std=0.2)).control_std
-    (0.2, 0.03)
     """
     bicycle = motion.model == "bicycle"
     return Motion(
@@ -82,17 +77,10 @@ def course_of(setup: ScenarioConfig, motion: Motion) -> Course:
     A circle gives constant controls; a unicycle turns at the rate of the bicycle of its wheelbase.
 
     Bradley & Abaid, Sec. IV: the circle.
-
-    >>> unicycle = Motion(model="unicycle", control_std=(0.1, 0.1))
-    >>> course_of(ScenarioConfig(course="corridor", extent=9.0, lane=4.0), unicycle).points
-    array([[-9., -1.],
-           [ 9., -1.],
-           [ 9.,  1.],
-           [-9.,  1.]])
     """
     a = setup.extent
     if setup.course == "eight":
-        t = np.linspace(0.0, 2.0 * np.pi, EIGHT_POINTS, endpoint=False)
+        t = np.linspace(0.0, 2.0 * np.pi, 96, endpoint=False)
         return Waypoints(points=a * np.column_stack((np.sin(t), np.sin(t) * np.cos(t))))
     if setup.course == "corridor":
         side = 0.25 * setup.lane
@@ -110,9 +98,6 @@ def steps_of(course: Course, setup: ScenarioConfig) -> int:
     """Return the number of control steps of a course; way-points count from the first to the last.
 
     `setup` gives the length of a step and the speed between way-points.
-
-    >>> steps_of(Waypoints(points=np.array([[0.0, 0.0], [7.5, 0.0]])), ScenarioConfig())
-    80
     """
     if isinstance(course, Waypoints):
         _check_speed(setup)
@@ -134,14 +119,6 @@ def driven(
     Returns the true poses [m, m, rad], the start first, and the controls that the estimators know.
 
     Bradley & Abaid, Eq. (5).
-
-    Straight on without noise, then round the first corner of a corridor:
-
-    >>> still = Motion(model="unicycle", control_std=(0.0, 0.0))
-    >>> setup = ScenarioConfig(course="corridor", extent=3.0, steps=80)
-    >>> path, _ = driven(course_of(setup, still), setup, still, np.random.default_rng(7))
-    >>> path[16].round(3), path[-1, :2].round(1)
-    (array([-1.5, -1. ,  0. ]), array([2.8, 0.8]))
     """
     if not isinstance(course, Waypoints):
         _check_length(course, setup)

@@ -28,8 +28,8 @@ from pipistrelle.settings import leaves
 SUMMARY = "summary.json"
 
 
-class RunEntry(BaseModel):
-    """An estimate's entry in ``summary.json``."""
+class RunEntry(BaseModel, extra="allow"):
+    """An estimate's entry in ``summary.json``, with its scores."""
 
     strategy: Strategy
     filter: str
@@ -57,7 +57,7 @@ class LogEntry(BaseModel):
 
 
 class Summary(BaseModel):
-    """The parts of ``summary.json`` needed to run a mission again; no `log` if it was simulated."""
+    """Content of ``summary.json``; no `log` if the mission was simulated."""
 
     format: Literal[1]
     version: str
@@ -67,13 +67,7 @@ class Summary(BaseModel):
 
 
 def read_summary(folder: Path) -> Summary:
-    """Read the summary of a result folder; raise if it is another kind of folder.
-
-    >>> read_summary(Path("nowhere"))
-    Traceback (most recent call last):
-    pipistrelle.config.InputError: nowhere: found no such folder, expected the result folder of
-    `pipistrelle run` or `pipistrelle slam`; check the path
-    """
+    """Read the summary of a result folder; raise if it is another kind of folder."""
     path = folder / SUMMARY
     if not path.exists() or (folder / "plan.toml").exists():
         raise _no_results(folder)
@@ -151,23 +145,22 @@ class StoredMission:
 
 
 def read_mission(folder: Path) -> StoredMission:
-    """Read the results in a folder; raise if a file was changed since.
-
-    >>> read_mission(Path("nowhere"))
-    Traceback (most recent call last):
-    pipistrelle.config.InputError: nowhere: found no such folder, expected the result folder of
-    `pipistrelle run` or `pipistrelle slam`; check the path
-    """
-    own = results_in(folder)
+    """Read the results in a folder; raise if a file was changed since."""
+    own, summary = results_in(folder), read_summary(folder)
+    scores: dict[Estimate, dict[str, Any]] = {
+        (run.strategy, run.filter): run.model_dump() for run in summary.runs
+    }
+    names = {estimate: f"{estimate[0]}_{short_name(estimate[1])}" for estimate in scores}
+    log = {} if summary.log is None else summary.log.model_dump(exclude={"path_bytes"})
+    if log:
+        log["files"] = sha256(json.dumps(log["files"], sort_keys=True).encode()).hexdigest()[:8]
     try:
-        summary = json.loads(own.read(SUMMARY))
-        scores = {(run["strategy"], run["filter"]): run for run in summary["runs"]}
-        names = {estimate: f"{estimate[0]}_{short_name(estimate[1])}" for estimate in scores}
+        settings = leaves(tomllib.loads(own.read("config.toml").decode()))
         return StoredMission(
             folder=folder,
-            version=str(summary["version"]),
-            settings=flattened(tomllib.loads(own.read("config.toml").decode()))
-            | _log_settings(summary.get("log")),
+            version=summary.version,
+            settings={".".join(key): value for key, value in settings}
+            | {f"log.{name}": value for name, value in log.items()},
             scores=scores,
             paths={key: _path(own.read(f"track_{name}.tum")) for key, name in names.items()},
             maps={key: _placed(own.read(f"map_{name}.csv")) for key, name in names.items()},
@@ -178,24 +171,6 @@ def read_mission(folder: Path) -> StoredMission:
     except (ValueError, LookupError, TypeError, AttributeError) as error:  # valid sums, not ours
         found = f"files that Pipistrelle would not write ({error})"
         raise refusal(folder, found, "results of it", "run again what wrote them") from error
-
-
-def _log_settings(log: Mapping[str, Any] | None) -> dict[str, Any]:
-    """Return the log of a mission and the options of its replay, as settings."""
-    if log is None:
-        return {}
-    asked = {f"log.{name}": log[name] for name in ("path", "robot", "beamwidth_rad")}
-    sums = json.dumps(log["files"], sort_keys=True).encode()
-    return {**asked, "log.files": sha256(sums).hexdigest()[:8]}
-
-
-def flattened(table: Mapping[str, Any]) -> dict[str, Any]:
-    """Flatten nested tables into a dict by dotted names.
-
-    >>> flattened({"seed": 3, "air": {"pressure_kpa": 90.0}})
-    {'seed': 3, 'air.pressure_kpa': 90.0}
-    """
-    return {".".join(key): value for key, value in leaves(table)}
 
 
 def results_in(folder: Path) -> OwnFiles:

@@ -33,9 +33,6 @@ MAP = "visualization_msgs/msg/MarkerArray"
 TRANSFORM = "geometry_msgs/msg/TransformStamped"
 _PLANE = (0, 1, 5)
 """Indices of x, y and the rotation about z among the six coordinates of a ROS pose."""
-_SPHERE, _DELETE_ALL = 2, 3
-_HEIGHT = 0.05
-"""Height of a landmark's marker [m]."""
 _NUMBERS = ("weight", "x_m", "y_m", "xx_m2", "xy_m2", "yy_m2")
 _COLORS = {"full": {"r": 0.0, "g": 0.6, "b": 0.5}, "partial": {"r": 0.9, "g": 0.6, "b": 0.0}}
 _END = 2**31
@@ -51,11 +48,7 @@ class Told(NamedTuple):
 
 
 def header(time: float, frame: str) -> Fields:
-    """Return the header of a message: its time [s] as a stamp, and its coordinate frame.
-
-    >>> header(1.5, "map")
-    {'stamp': {'sec': 1, 'nanosec': 500000000}, 'frame_id': 'map'}
-    """
+    """Return the header of a message: its time [s] as a stamp, and its coordinate frame."""
     if not 0.0 <= time < _END:
         found, expected = f"the time {time} s", f"0 s or more, below {_END}, as a stamp can tell"
         raise refusal("a message of ROS", found, expected, "count from another zero")
@@ -93,10 +86,6 @@ def correction_fields(
 
     `frames` are the names of the map's and the odometry's frame; `pose` and `odometry` [m, m, rad]
     are the vehicle's poses in them at the same time.
-
-    >>> told = correction_fields(0.0, ("map", "odom"), (3.0, 1.0, 0.5), (1.0, 1.0, 0.5))
-    >>> told["transform"]["translation"]
-    {'x': 2.0, 'y': 0.0}
     """
     turned, (x, y, _) = after(planar(*pose), inverse(planar(*odometry)))
     heading = math.atan2(turned[1, 0], turned[0, 0])
@@ -116,7 +105,7 @@ def map_fields(time: float, frame: str, table: "pl.DataFrame") -> Fields:
     ``landmarks.parquet``; rows that are not finite are omitted.
     """
     head = header(time, frame)
-    markers: list[Fields] = [{"header": head, "action": _DELETE_ALL}]
+    markers: list[Fields] = [{"header": head, "action": 3}]  # DELETEALL
     for number, row in enumerate(table.iter_rows(named=True)):
         if not all(math.isfinite(row[name]) for name in _NUMBERS):
             continue
@@ -127,9 +116,9 @@ def map_fields(time: float, frame: str, table: "pl.DataFrame") -> Fields:
                 "header": head,
                 "ns": f"landmark {row['landmark']}",
                 "id": number,
-                "type": _SPHERE,
+                "type": 2,  # SPHERE
                 "pose": {"position": place, "orientation": _turn(angle)},
-                "scale": {"x": 2.0 * along, "y": 2.0 * across, "z": _HEIGHT},
+                "scale": {"x": 2.0 * along, "y": 2.0 * across, "z": 0.05},
                 "color": _COLORS[row["status"]] | {"a": row["weight"]},
                 "text": row["status"],
             }
@@ -143,11 +132,7 @@ def _turn(heading: float) -> Fields:
 
 
 def _ellipse(xx: float, xy: float, yy: float) -> tuple[float, float, float]:
-    """Return the standard deviations along and across a covariance's major axis, and its angle.
-
-    >>> _ellipse(4.0, 0.0, 1.0)
-    (2.0, 1.0, 0.0)
-    """
+    """Return the standard deviations along and across a covariance's major axis, and its angle."""
     middle, spread = 0.5 * (xx + yy), math.hypot(0.5 * (xx - yy), xy)
     least = max(middle - spread, 0.0)
     return math.sqrt(middle + spread), math.sqrt(least), 0.5 * math.atan2(2.0 * xy, xx - yy)

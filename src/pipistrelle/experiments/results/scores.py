@@ -40,15 +40,8 @@ OF_ASSOCIATION = (
 """Scores of data association, which known labels lack."""
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class PathScores:
-    """Scores of a path, by the names of `Scores`."""
-
-    position_rmse_m: float | None
-    heading_rmse_rad: float | None
-    position_rmse_aligned_m: float | None
-    nees_mean: float | None
-    nees_max: float | None
+PathScores = dict[str, float | None]
+"""Scores of a path, by their names in `Scores`."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -56,76 +49,53 @@ class Scores:
     """Scores of a trial, by their names in ``summary.json``.
 
     None without truth or data; infinite or NaN if the trial diverged. Errors and NEES are over the
-    control steps, the start excluded.
-
-    Attributes
-    ----------
-    position_rmse_m, heading_rmse_rad : float or None
-        RMSE of the path.
-    map_rmse_m : float or None
-        RMSE of the fully initialised landmarks with known true positions.
-    position_rmse_aligned_m, map_rmse_aligned_m : float or None
-        RMSE of path and map, each after its best rigid motion; at least two points.
-    position_floor_m : float or None
-        RMSE of a path without errors after the first scan (`position_floor`).
-    position_bound_m, heading_bound_rad : float or None
-        Lower bound of the RMSE of any unbiased estimator, averaged over such drives, with an exact
-        start and the measured noise (`evaluation.bound.path_bound`).
-    nees_mean, nees_max : float or None
-    caller_rmse_m, caller_rmse_aligned_m : float or None
-        RMSE of the tracked callers, at the scans since the initialisation of each; the second after
-        a rigid motion of all these positions.
-    diverged : bool or None
-        Whether any NEES is not finite or exceeds the limit. Without truth: True if the path is not
-        finite, else None.
-    landmarks_full, landmarks_total : int
-        Number of fully initialised landmarks, and of all.
-    measurements_per_frame : float or None
-        Mean number of bearings per scan.
-    gated : int
-        Number of measurements rejected by the gate, of `judged`.
-    associated_right : float or None
-        Share of correct labels among all measurements labelled by the association
-        (`evaluation.association`); None for a log without labels. This and all following scores of
-        the association are None for known labels.
-    associated_found : float or None
-        Share of landmark measurements with a correct label: low if much of the map is lost, or if
-        many measurements are too uncertain to be used.
-    landmarks_missed, landmarks_false, landmarks_twice : int or None
-        Landmarks measured in three scans or more and not mapped; mapped landmarks without a true
-        landmark, or far from it (`map_motion`); landmarks mapped twice. For a log without labels
-        all true landmarks count as measured, and landmarks are matched by position.
-    gospa_m, gospa_error_m, gospa_missed, gospa_false
-        GOSPA metric of the map against the measured landmarks, and its parts.
-    nis_mean : float or None
-        Normalised innovation squared per degree of freedom, for fully initialised landmarks: about
-        1 for a consistent filter. None if the filter does not provide it (`Innovations`).
+    control steps, the start excluded. "Aligned": after the best rigid motion of path or map, for
+    two points or more.
     """
 
     position_rmse_m: float | None
     heading_rmse_rad: float | None
     map_rmse_m: float | None
+    """RMSE of the fully initialised landmarks with known true positions."""
     position_rmse_aligned_m: float | None
     map_rmse_aligned_m: float | None
     position_floor_m: float | None = None
+    """RMSE of a path without errors after the first scan (`position_floor`)."""
     position_bound_m: float | None = None
     heading_bound_rad: float | None = None
+    """Lower bound of the RMSE of any unbiased estimator, averaged over such drives, with an exact
+    start and the measured noise (`evaluation.bound.path_bound`)."""
     nees_mean: float | None
     nees_max: float | None
     caller_rmse_m: float | None = None
+    """RMSE of the tracked callers, at the scans since the initialisation of each."""
     caller_rmse_aligned_m: float | None = None
     diverged: bool | None
+    """Whether any NEES is not finite or exceeds the limit. Without truth: True if the path is not
+    finite, else None."""
     landmarks_full: int
     landmarks_total: int
     measurements_per_frame: float | None
+    """Mean number of bearings per scan."""
     gated: int
+    """Number of measurements rejected by the gate, of `judged`."""
     nis_mean: float | None = None
+    """Normalised innovation squared per degree of freedom, for fully initialised landmarks: about
+    1 for a consistent filter. None if the filter does not provide it (`Innovations`)."""
     associated_right: float | None = None
+    """Share of correct labels among all measurements labelled by the association; None for a log
+    without labels. This and all following scores are None for known labels."""
     associated_found: float | None = None
+    """Share of landmark measurements with a correct label: low if much of the map is lost, or if
+    many measurements are too uncertain to be used."""
     landmarks_missed: int | None = None
+    """Landmarks measured in three scans or more and not mapped. For a log without labels all true
+    landmarks count as measured, and landmarks are matched by position."""
     landmarks_false: int | None = None
+    """Mapped landmarks without a true landmark, or far from it (`map_motion`)."""
     landmarks_twice: int | None = None
     gospa_m: float | None = None
+    """GOSPA metric of the map against the measured landmarks; its parts follow."""
     gospa_error_m: float | None = None
     gospa_missed: int | None = None
     gospa_false: int | None = None
@@ -169,11 +139,6 @@ def judged(scans: Sequence[Scan]) -> int:
     """Count the measurements that a gate tests: bearings, with their ranges, and excess paths.
 
     `Scores.gated` counts bearing and excess path of a row separately.
-
-    >>> from pipistrelle.detection.scans import make_scan
-    >>> ahead = make_scan(0.0, np.array([3, 8]), np.zeros(2), excess_path=np.array([2.0, np.nan]))
-    >>> judged([ahead])
-    3
     """
     numbers = ([scan.bearing, scan.excess_path] for scan in scans)
     return sum(int(np.count_nonzero(~np.isnan(both))) for both in numbers)
@@ -186,17 +151,9 @@ def score(track: Track, truth: Truth, scans: Sequence[Scan], limit: float) -> Sc
     The scans are the estimator's input. A NEES above `limit` counts as divergence.
 
     Bradley & Abaid, Eqs. (23), (26) and (27) and Sec. V-A.
-
-    >>> from pipistrelle.estimation.beliefs import Gaussian, no_landmarks
-    >>> pose = Gaussian(mean=np.zeros((2, 3)), covariance=np.tile(np.eye(3), (2, 1, 1)))
-    >>> still = Track(time=np.arange(2.0), pose=pose, landmarks=no_landmarks(), gated=0)
-    >>> truth = Truth(time=still.time, path=np.array([[0.0, 0, 0], [3, 4, 0]]))
-    >>> scores = score(still, truth, (), 50.0)
-    >>> scores.position_rmse_m, scores.nees_max, scores.map_rmse_m
-    (5.0, 25.0, None)
     """
     path = score_path(track.pose, truth.path)
-    worst = path.nees_max
+    worst = path["nees_max"]
     estimate = heaviest(track.landmarks)
     labels, positions = truth.landmarks or (np.empty(0, int), np.empty((0, 2)))
     mapped, true = scored_landmarks(estimate, labels, positions)
@@ -205,12 +162,12 @@ def score(track: Track, truth: Truth, scans: Sequence[Scan], limit: float) -> Sc
     squared, degrees = track.innovations
     rows = np.count_nonzero(~np.isnan(np.concatenate([[], *(scan.bearing for scan in scans)])))
     return Scores(
-        position_rmse_m=path.position_rmse_m,
-        heading_rmse_rad=path.heading_rmse_rad,
+        position_rmse_m=path["position_rmse_m"],
+        heading_rmse_rad=path["heading_rmse_rad"],
         map_rmse_m=_rmse(position_error(mapped, true)),
-        position_rmse_aligned_m=path.position_rmse_aligned_m,
+        position_rmse_aligned_m=path["position_rmse_aligned_m"],
         map_rmse_aligned_m=_aligned_rmse(mapped, true),
-        nees_mean=path.nees_mean,
+        nees_mean=path["nees_mean"],
         nees_max=worst,
         caller_rmse_m=_rmse(position_error(followed, walked)),
         caller_rmse_aligned_m=_aligned_rmse(followed, walked),
@@ -305,20 +262,6 @@ def position_floor(drive: Drive, scans: Sequence[Scan]) -> float | None:
               \hat x_k \text{ by dead reckoning} \quad (k < j)
 
     The start is excluded; None if the truth is unknown at step j. Alignment removes this error.
-
-    A metre ahead without measurements, then a straight drive:
-
-    >>> from pipistrelle.detection.scans import make_scan
-    >>> from pipistrelle.estimation.motion import Motion
-    >>> path = np.array([[0.0, 0, 0], [2, 0, 0], [3, 0, 0]])
-    >>> drive = Drive(
-    ...     motion=Motion(model="unicycle", control_std=(1.0, 0.1)),
-    ...     start=Gaussian(mean=np.zeros(3), covariance=np.eye(3)),
-    ...     time=np.arange(3.0), controls=np.array([[1.0, 0.0], [1.0, 0.0]]),
-    ...     truth=Truth(time=np.arange(3.0), path=path),
-    ... )
-    >>> position_floor(drive, [make_scan(1.0, np.array([4]), np.array([0.2]))])
-    1.0
     """
     if drive.truth.path is None:
         return None
@@ -378,10 +321,6 @@ def score_path(pose: Gaussian, true_path: Float[np.ndarray, "k 3"] | None) -> Pa
     """Score a path against the truth, excluding its start and true poses that are NaN.
 
     Bradley & Abaid, Eqs. (23) and (26).
-
-    >>> pose = Gaussian(mean=np.zeros((2, 3)), covariance=np.tile(np.eye(3), (2, 1, 1)))
-    >>> score_path(pose, np.array([[0.0, 0, 0], [3, 4, 0]])).position_rmse_m
-    5.0
     """
     true_poses = np.full_like(pose.mean, np.nan) if true_path is None else true_path
     if len(true_poses) != len(pose.mean):
@@ -391,13 +330,13 @@ def score_path(pose: Gaussian, true_path: Float[np.ndarray, "k 3"] | None) -> Pa
     error = pose_error(path, truth)
     epsilon = track_nees(pose, true_poses)[1:]
     epsilon = epsilon[~np.isnan(epsilon)]
-    return PathScores(
-        position_rmse_m=_rmse(position_error(path, truth)),
-        heading_rmse_rad=_rmse(error[:, 2]),
-        position_rmse_aligned_m=_aligned_rmse(path[:, :2], truth[:, :2]),
-        nees_mean=float(np.mean(epsilon)) if len(epsilon) else None,
-        nees_max=float(np.max(epsilon)) if len(epsilon) else None,
-    )
+    return {
+        "position_rmse_m": _rmse(position_error(path, truth)),
+        "heading_rmse_rad": _rmse(error[:, 2]),
+        "position_rmse_aligned_m": _aligned_rmse(path[:, :2], truth[:, :2]),
+        "nees_mean": float(np.mean(epsilon)) if len(epsilon) else None,
+        "nees_max": float(np.max(epsilon)) if len(epsilon) else None,
+    }
 
 
 def _rmse(error: Float[np.ndarray, " n"]) -> float | None:

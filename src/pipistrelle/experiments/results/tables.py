@@ -41,11 +41,7 @@ def tum_text(time: Float[np.ndarray, " k"], path: Float[np.ndarray, "k 3"]) -> s
 
 
 def place_text(time: Float[np.ndarray, " k"], place: Float[np.ndarray, "k 2"]) -> str:
-    """Format positions without heading in the TUM format, omitting NaN.
-
-    >>> print(place_text(np.arange(2.0), np.array([[np.nan, np.nan], [1.0, 2.0]])), end="")
-    1.000000 1.000000000000 2.000000000000 0 0 0 0.000000000000 1.000000000000
-    """
+    """Format positions without heading in the TUM format, omitting NaN."""
     finite = ~np.isnan(place).any(axis=1)
     return tum_text(time[finite], np.column_stack((place[finite], np.zeros(finite.sum()))))
 
@@ -54,17 +50,6 @@ def map_text(landmarks: Landmarks) -> str:
     """Format a map as CSV, a line per landmark: mean, covariance and status.
 
     A partially initialised landmark is represented by its heaviest hypothesis.
-
-    >>> covariance = np.array([[[0.04, 0.01], [0.01, 0.09]]])
-    >>> landmarks = Landmarks(
-    ...     landmark=np.array([7]),
-    ...     mean=np.array([[1.0, 2.0]]),
-    ...     covariance=covariance,
-    ...     weight=np.array([1.0]),
-    ... )
-    >>> print(map_text(landmarks), end="")
-    landmark,x,y,xx,xy,yy,status
-    7,1,2,0.04,0.01,0.09,full
     """
     estimate = heaviest(landmarks)
     lines = ["landmark,x,y,xx,xy,yy,status"]
@@ -83,13 +68,6 @@ def step_table(track: Track, true_path: Float[np.ndarray, "k 3"] | None) -> "pl.
     Columns that need the truth are null without it.
 
     Bradley & Abaid, the terms of Eqs. (23) and (26).
-
-    >>> from pipistrelle.estimation.beliefs import Gaussian, no_landmarks
-    >>> pose = Gaussian(mean=np.zeros((1, 3)), covariance=4 * np.eye(3)[None])
-    >>> track = Track(time=np.zeros(1), pose=pose, landmarks=no_landmarks(), gated=0)
-    >>> table = step_table(track, np.array([[3.0, 4.0, 0.0]]))
-    >>> table["x_std_m"].item(), table["position_error_m"].item(), table["nees"].item()
-    (2.0, 5.0, 6.25)
     """
     import polars as pl
 
@@ -134,16 +112,6 @@ def landmark_table(
     for a true landmark missing from the map, unseen.
 
     Bradley & Abaid, the terms of Eq. (27).
-
-    >>> landmarks = Landmarks(
-    ...     landmark=np.array([7]),
-    ...     mean=np.array([[3.0, 4.0]]),
-    ...     covariance=np.eye(2)[None],
-    ...     weight=np.array([1.0]),
-    ... )
-    >>> table = landmark_table(landmarks, (np.array([7, 8]), np.zeros((2, 2))))
-    >>> table.select("landmark", "status", "error_m").rows()
-    [(7, 'full', 5.0), (8, 'unseen', None)]
     """
     import polars as pl
 
@@ -194,11 +162,6 @@ def measurement_table(
     ``caller`` is the name of the emitter of an echo, number 1 being the first name; null for the
     vehicle. ``assigned`` is the label from an association, with an array of `labels` for each scan.
     ``true_landmark`` is the landmark that caused the row: by `causes`, else its recorded label.
-
-    >>> from pipistrelle.detection.scans import make_scan
-    >>> scan = make_scan(1.0, np.array([7]), np.array([0.5]))
-    >>> measurement_table([scan]).rows()
-    [(1.0, 7, 0.5, None, None, None, None, None, None, None, 7)]
     """
     import polars as pl
 

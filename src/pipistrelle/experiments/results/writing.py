@@ -27,7 +27,7 @@ from pipistrelle.config import InputError
 from pipistrelle.estimation.beliefs import Track
 from pipistrelle.estimation.catalogue import short_name
 from pipistrelle.experiments.drives import Truth
-from pipistrelle.experiments.results.scores import OF_ASSOCIATION, Scores, TrialResult, judged
+from pipistrelle.experiments.results.scores import OF_ASSOCIATION, TrialResult, judged
 from pipistrelle.experiments.results.tables import (
     landmark_table,
     map_text,
@@ -62,13 +62,6 @@ def result_folder(
     Without a path it is ``runs/<time>-<name>``; once complete, ``runs/latest`` links to it, if the
     file system has symbolic links and no other file has that name. Earlier results stay until the
     new ones are complete.
-
-    >>> from tempfile import TemporaryDirectory
-    >>> with TemporaryDirectory() as parent:
-    ...     with result_folder(Path(parent) / "one", "run", overwrite=False) as own:
-    ...         own.replace({"summary.json": "{}"})
-    ...     own.folder.is_dir()
-    True
     """
     if path is not None:
         yield claim(path, RESULTS, overwrite=overwrite, flags=flags)
@@ -119,7 +112,6 @@ def _point_latest_at(folder: Path) -> None:
 if TYPE_CHECKING:
     import polars as pl
 
-FORMAT = 1
 README = """\
 # Results
 
@@ -213,7 +205,7 @@ def write_results(
     files |= beside
     files |= drawn_files(draw)
     summary = {
-        "format": FORMAT,
+        "format": 1,
         "version": find_version(),
         "config_hash": config_hash(config),
         "seed": seed,
@@ -286,30 +278,25 @@ def config_hash(config: BaseModel) -> str:
     """Return 16 hexadecimal digits that identify a configuration.
 
     They are the start of the SHA-256 of its JSON with sorted keys and no spaces.
-
-    >>> from pipistrelle.config import Config
-    >>> config_hash(Config(seed=7)) == config_hash(Config()), len(config_hash(Config()))
-    (True, 16)
     """
     return settings_hash(config.model_dump(mode="json", exclude_none=True))
 
 
 def settings_hash(settings: Mapping[str, object]) -> str:
-    """Return 16 hexadecimal digits that identify settings, as nested in ``config.toml``.
-
-    >>> settings_hash({"seed": 7, "rays": {}}) == settings_hash({"rays": {}, "seed": 7})
-    True
-    """
+    """Return 16 hexadecimal digits that identify settings, as nested in ``config.toml``."""
     text = json.dumps(settings, sort_keys=True, separators=(",", ":"), allow_nan=False)
     return hashlib.sha256(text.encode()).hexdigest()[:16]
 
 
 def run_entry(trial: TrialResult, ignored_rows: Mapping[str, int]) -> dict[str, object]:
     """Return the entry of a trial in the summary; non-finite numbers become None."""
+    scores = asdict(trial.scores)
+    if all(scores[name] is None for name in OF_ASSOCIATION):
+        scores = {name: score for name, score in scores.items() if name not in OF_ASSOCIATION}
     run: dict[str, object] = {
         "strategy": trial.strategy,
         "filter": trial.filter,
-        **_finite(_told(trial.scores)),
+        **_finite(scores),
         "gated_of": judged(trial.scans),
         **({"calibration": calibrated} if (calibrated := calibration_of(trial.track)) else {}),
         "ignored_rows": {
@@ -318,31 +305,17 @@ def run_entry(trial: TrialResult, ignored_rows: Mapping[str, int]) -> dict[str, 
         },
         "wall_s": trial.wall_s,
     }
-    return run if trial.online is None else run | {"online": _finite(asdict(trial.online))}
+    return run if trial.online is None else run | {"online": _finite(trial.online)}
 
 
 def calibration_of(track: Track) -> dict[str, float]:
-    """Return the estimated calibration parameters, and ``NAME_std`` of each.
-
-    >>> from pipistrelle.estimation.beliefs import Gaussian, no_landmarks
-    >>> pose = Gaussian(mean=np.zeros((1, 3)), covariance=np.zeros((1, 3, 3)))
-    >>> known = {"landmarks": no_landmarks(), "gated": 0, "calibration": {"wheelbase": (0.2, 0.01)}}
-    >>> calibration_of(Track(time=np.zeros(1), pose=pose, **known))
-    {'wheelbase': 0.2, 'wheelbase_std': 0.01}
-    """
+    """Return the estimated calibration parameters, and ``NAME_std`` of each."""
     both = track.calibration.items()
     return {
         key: one
         for name, (value, std) in both
         for key, one in ((name, value), (f"{name}_std", std))
     }
-
-
-def _told(scores: Scores) -> dict[str, object]:
-    """Return scores by name, without the scores of data association if all are None."""
-    told = asdict(scores)
-    known = all(told[name] is None for name in OF_ASSOCIATION)
-    return {name: v for name, v in told.items() if not (known and name in OF_ASSOCIATION)}
 
 
 def _finite(scores: Mapping[str, object]) -> dict[str, object]:

@@ -22,9 +22,9 @@ from pipistrelle.estimation.catalogue import CATALOGUE
 from pipistrelle.estimation.data_association.sequential import METHODS
 from pipistrelle.experiments.drives import Drive
 from pipistrelle.experiments.machine import cores
-from pipistrelle.experiments.named_settings import each_its_own
+from pipistrelle.experiments.named_settings import Case, each_its_own
 from pipistrelle.experiments.runs.heard_world import drive_of
-from pipistrelle.experiments.runs.trial import run_mission, run_trials
+from pipistrelle.experiments.runs.trial import run_mission, try_trial
 from pipistrelle.experiments.runs.validate import checked_scenario
 from pipistrelle.geometry import wrap
 from pipistrelle.kernel_clock import announce
@@ -71,8 +71,8 @@ def in_two_processes(
 ) -> Iterator[None]:
     """Let a second process compile kernels in parallel, if any must be compiled.
 
-    It starts with the first compilation in this process, announced through `tell` if given. The
-    processes do not repeat each other's work (`pipistrelle.kernel_folder`).
+    It starts with the first compilation in this process, which is announced. The processes do not
+    repeat each other's work (`pipistrelle.kernel_folder`).
     """
     second = None
 
@@ -121,7 +121,8 @@ def compile_filters(config: Config, filters: Iterable[str]) -> None:
             _true_scan(drive, each * k, int(k > _HEARD), timing=own.listening.timing)
             for k in range(1, _FRAMES + 1)
         ]
-        run_trials(names, drive, {"fused": scans}, own)
+        for name in names:
+            try_trial(Case(strategy="fused", filter=name), drive, scans, own)
 
 
 def _true_scan(drive: Drive, step: int, first: int, *, timing: bool) -> Scan:

@@ -1,15 +1,14 @@
 """Missions that are solved again: recorded logs, and missions of result folders.
 
-A log is read with its truth and reduced to the measurements of a strategy. A mission is repeated
-for views that need the belief of every frame: equal settings give equal bits, so a folder stores
-the settings and, for a recorded log, its path, sums and options (`log_entry`), but no belief of
-every frame.
+Equal settings give equal bits, so a folder stores the settings and, for a recorded log, its path,
+sums and options (`log_entry`), but no belief of every frame.
 """
 
 import math
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import replace
 from hashlib import file_digest
+from itertools import product
 from os import fsencode
 from pathlib import Path
 from typing import Any
@@ -46,14 +45,14 @@ from pipistrelle.experiments.drives import Drive, Truth
 from pipistrelle.experiments.hearing.listening import Progress
 from pipistrelle.experiments.hearing.scenario import ALL_DRAWN
 from pipistrelle.experiments.hearing.world_folder import read_world
-from pipistrelle.experiments.named_settings import each_its_own
+from pipistrelle.experiments.named_settings import Case, each_its_own
 from pipistrelle.experiments.results.reading import SUMMARY, Summary, read_summary
 from pipistrelle.experiments.results.scores import TrialResult
 from pipistrelle.experiments.results.tables import tum_text
 from pipistrelle.experiments.results.writing import settings_hash
 from pipistrelle.experiments.runs import truth_files
 from pipistrelle.experiments.runs.heard_world import Mission
-from pipistrelle.experiments.runs.trial import Watch, in_order, run_mission, run_trials
+from pipistrelle.experiments.runs.trial import Watch, run_mission, try_trial
 from pipistrelle.experiments.runs.truth_files import TRUTHS, WithTruth, with_files_beside
 from pipistrelle.experiments.runs.validate import check_filters
 from pipistrelle.files import LOG, OwnFiles, read_file, text_of
@@ -121,16 +120,10 @@ def _refuse_unknown(folder: Path, titles: str) -> None:
     if not folder.is_dir():
         found = "a file" if folder.is_file() else "no such folder"
         raise refusal(folder, found, titles, "check the path")
-    if what := _of_ours(folder):
+    study = (folder / "plan.toml").is_file() and (folder / "trials").is_dir()
+    if what := "a study" if study else OwnFiles(folder, LOG).there:
         fix = "name the log itself; `pipistrelle view` plays results, `report` is for studies"
         raise refusal(folder, f"{what} of Pipistrelle", titles, fix)
-
-
-def _of_ours(folder: Path) -> str | None:
-    """Name the kind of a folder written by Pipistrelle; None for other folders."""
-    if (folder / "plan.toml").is_file() and (folder / "trials").is_dir():
-        return "a study"
-    return OwnFiles(folder, LOG).there
 
 
 def as_heard_by(
@@ -142,13 +135,6 @@ def as_heard_by(
     measured actively. Outside it only the bearing is measured, passively; excess paths are measured
     everywhere. Fused keeps both, active only rows with a range and no excess paths, passive all
     bearings and no range. Without a beamwidth all ranges are kept.
-
-    >>> from pipistrelle.detection.scans import make_scan
-    >>> scan = make_scan(0.0, np.array([3, 8]), np.array([0.1, 0.4]), range=np.array([2.0, 5.0]))
-    >>> as_heard_by([scan], "fused", 0.5)[0].range
-    array([ 2., nan])
-    >>> as_heard_by([scan], "active", 0.5)[0].landmark
-    array([3])
     """
     limit = math.inf if beamwidth is None else beamwidth / 2.0
     heard = []
@@ -162,17 +148,7 @@ def as_heard_by(
 
 
 def motion_of(log: Log) -> Motion:
-    """Return the motion model of a log.
-
-    >>> log = Log(
-    ...     name="walk", time=np.array([0.0, 1.0]), controls=np.array([[1.0, 0.0]]),
-    ...     dt=np.array([1.0]), scans=(), motion="unicycle", control_std=(0.1, 0.15),
-    ...     initial_pose=(0.0, 0.0, 0.0), initial_pose_std=(0.0, 0.0, 0.0), range_std=0.2,
-    ...     bearing_std=0.06, range_bounds=(0.5, 20.0), ignored_rows={},
-    ... )
-    >>> motion_of(log).control_std
-    (0.1, 0.15)
-    """
+    """Return the motion model of a log."""
     return Motion(
         model=log.motion,
         control_std=log.control_std,
@@ -180,22 +156,6 @@ def motion_of(log: Log) -> Motion:
         speed_offset=log.speed_offset,
         noise_at_rest=log.noise_at_rest,
     )
-
-
-def start_of(log: Log) -> Gaussian:
-    """Return the initial pose of a log, with independent errors in x, y and heading.
-
-    >>> log = Log(
-    ...     name="walk", time=np.array([0.0, 1.0]), controls=np.array([[1.0, 0.0]]),
-    ...     dt=np.array([1.0]), scans=(), motion="unicycle", control_std=(0.1, 0.15),
-    ...     initial_pose=(2.0, 0.0, 1.5), initial_pose_std=(0.5, 0.5, 0.25), range_std=0.2,
-    ...     bearing_std=0.06, range_bounds=(0.5, 20.0), ignored_rows={},
-    ... )
-    >>> start_of(log).mean, start_of(log).covariance.diagonal()
-    (array([2. , 0. , 1.5]), array([0.25  , 0.25  , 0.0625]))
-    """
-    variance = np.square(np.array(log.initial_pose_std, dtype=float))
-    return Gaussian(mean=np.array(log.initial_pose, dtype=float), covariance=np.diag(variance))
 
 
 def replay(
@@ -232,44 +192,50 @@ def replay(
     (array([7]), array([[3., 0.]]))
     """
     drive = drive_of(log, truth)
-    apart = tuple(each_its_own(config, filters))
-    for own, names in apart:
+    groups = tuple(each_its_own(config, filters))
+    for own, names in groups:
         check_filters(names, drive.motion, own, drive.moving.values())
         check_calibrated(log, own)
-    trials: list[TrialResult] = []
-    for own, names in apart:
-        heard = _heard(log, strategies, beamwidth, own)
-        causes = {} if own.association.method == KNOWN else _log_causes(log, heard)
-        noise = noise_of(own.filter)
-        unsure: dict[str, Any] = {s: left_out(own, map(noise, heard[s])) for s in heard}
-        done = run_trials(names, drive, heard, own, causes=causes, progress=progress, watch=watch)
-        trials += [replace(trial, left_out=unsure[trial.strategy]) for trial in done]
-    trials = [*in_order(trials, strategies, filters)]
-    return Mission(config=config, drive=drive, trials=tuple(trials), beamwidth=beamwidth, log=log)
-
-
-def _heard(
-    log: Log, strategies: Sequence[Strategy], beamwidth: float | None, config: Config
-) -> dict[Strategy, tuple[Scan, ...]]:
-    """Return the scans of each strategy under the given settings."""
-    if config.association.method == KNOWN and _is_bare(log):
-        raise refusal(log.name, "rows without labels", LABELS, UNKNOWN)
-    scans = [without_unused(rows, config) for rows in log.scans]
-    return {
-        strategy: tuple(with_noise(s, config) for s in as_heard_by(scans, strategy, beamwidth))
-        for strategy in strategies
-    }
+    bare = all((scan.landmark == UNLABELLED).all() for scan in log.scans)
+    trials: dict[tuple[str, str], TrialResult] = {}
+    for (own, names), strategy in product(groups, strategies):
+        known = own.association.method == KNOWN
+        if known and bare:
+            raise refusal(log.name, "rows without labels", LABELS, UNKNOWN)
+        used = [without_unused(rows, own) for rows in log.scans]
+        scans = tuple(with_noise(scan, own) for scan in as_heard_by(used, strategy, beamwidth))
+        causes: Causes | None = None
+        if not (known or bare):
+            pairs = zip(scans, log.scans, strict=True)
+            causes = [causes_of(scan, rows, rows.landmark) for scan, rows in pairs]
+        unsure: Any = left_out(own, map(noise_of(own.filter), scans))
+        for name in names:
+            case = Case(strategy=strategy, filter=name)
+            trial = try_trial(
+                case, drive, scans, own, causes=causes, progress=progress, watch=watch
+            )
+            trials[strategy, name] = replace(trial, left_out=unsure)
+    ordered = tuple(trials[pair] for pair in product(strategies, filters))
+    return Mission(config=config, drive=drive, trials=ordered, beamwidth=beamwidth, log=log)
 
 
 def drive_of(log: Log, truth: Truth) -> Drive:
-    """Return the drive of a log."""
+    """Return the drive of a log; it starts with independent errors in x, y and heading."""
+    placed = [caller for caller in log.callers if caller.place is not None]
+    stds = [np.maximum(caller.place_std or KNOWN_STD, LEAST_STD) for caller in placed]
+    variance = np.square(np.array(log.initial_pose_std, dtype=float))
     return Drive(
         motion=motion_of(log),
-        start=start_of(log),
+        start=Gaussian(mean=np.array(log.initial_pose, dtype=float), covariance=np.diag(variance)),
         time=log.time,
         controls=log.controls,
         truth=truth,
-        known=_known_callers(log),
+        known=Landmarks(
+            landmark=np.array([caller.landmark for caller in placed], dtype=np.int64),
+            mean=np.array([caller.place for caller in placed], dtype=float).reshape(-1, 2),
+            covariance=np.array([np.eye(2) * std**2 for std in stds]).reshape(-1, 2, 2),
+            weight=np.ones(len(placed)),
+        ),
         callers=np.array([UNLABELLED, *(who.landmark for who in log.callers)]),
         moving={who.landmark: who.name for who in log.callers if who.moves},
         sensor=log.sensor_pose,
@@ -304,39 +270,10 @@ UNKNOWN = "add --association.method marginal"
 """Expected labels of a log, and the fix if it has none."""
 
 
-def _is_bare(log: Log) -> bool:
-    """Return whether a log has no labels at all."""
-    return all((scan.landmark == UNLABELLED).all() for scan in log.scans)
-
-
-def _log_causes(
-    log: Log, heard: Mapping[Strategy, Sequence[Scan]]
-) -> dict[Strategy, Causes | None]:
-    """Return a log's labels as the true landmark of each measurement; None if the log has none."""
-    if _is_bare(log):
-        return dict.fromkeys(heard)
-    return {
-        strategy: [causes_of(s, r, r.landmark) for s, r in zip(scans, log.scans, strict=True)]
-        for strategy, scans in heard.items()
-    }
-
-
-def _known_callers(log: Log) -> Landmarks:
-    """Return the callers with given positions, as landmarks known beforehand."""
-    placed = [caller for caller in log.callers if caller.place is not None]
-    stds = [np.maximum(caller.place_std or KNOWN_STD, LEAST_STD) for caller in placed]
-    return Landmarks(
-        landmark=np.array([caller.landmark for caller in placed], dtype=np.int64),
-        mean=np.array([caller.place for caller in placed], dtype=float).reshape(-1, 2),
-        covariance=np.array([np.eye(2) * std**2 for std in stds]).reshape(-1, 2, 2),
-        weight=np.ones(len(placed)),
-    )
-
-
 def _whose(
     reader: Reader, folder: Path, robot: Robot | None, formats: Sequence[Reader]
 ) -> tuple[Robot, ...]:
-    """Return the robot that the log's reader is called with; () if its format has one robot."""
+    """Return the robot for the log's reader; () if its format has a single robot."""
     if reader.robots is None:
         if robot is None:
             return ()
@@ -363,30 +300,22 @@ def rerun(
 
     `log` is the new path of a log that was moved. Estimators and associations from outside
     (``module:Class``) run only if `trusted` lists them, as the folder may be another person's.
-
-    >>> from tempfile import TemporaryDirectory
-    >>> from pipistrelle.config import Config, ScenarioConfig
-    >>> from pipistrelle.experiments.drives import NO_TRUTH
-    >>> from pipistrelle.experiments.results.writing import write_results
-    >>> from pipistrelle.files import RESULTS, OwnFiles
-    >>> config = Config(scenario=ScenarioConfig(steps=8, landmarks=3))
-    >>> done = run_mission(config, ["fused"])
-    >>> kept = {"command": "pipistrelle run", "seed": config.seed, "ignored_rows": {}}
-    >>> with TemporaryDirectory() as name:
-    ...     own = OwnFiles(Path(name), RESULTS)
-    ...     write_results(own, config=config, trials=done.trials, truth=NO_TRUTH, **kept)
-    ...     same = rerun(Path(name))
-    >>> same.difference, np.array_equal(*(it.trials[0].track.pose.mean for it in (done, same)))
-    ('', True)
     """
     summary = read_summary(folder)
-    for name in {run.filter for run in summary.runs} - {*CATALOGUE, *trusted}:
-        fix = f"add --filter {name} (in Python: filters={name!r}) to run it"
-        raise _not_ours(f"{folder / SUMMARY}: runs.filter", name, fix)
+
+    def trust(place: str, name: str, known: Collection[str], flag: str, keyword: str) -> None:
+        if name not in (*known, *trusted):
+            found = f"{name!r}, whose code is not Pipistrelle's"
+            fix = f"add --{flag} {name} (in Python: {keyword}={name!r}) to run it"
+            raise refusal(place, found, "one that you trust", fix)
+
+    for run in summary.runs:
+        trust(f"{folder / SUMMARY}: runs.filter", run.filter, CATALOGUE, "filter", "filters")
     config = resolve(from_file(folder / "config.toml"))
-    if (method := config.association.method) not in (KNOWN, *METHODS, *trusted):
-        fix = f"add --association.method {method} (in Python: association={method!r}) to run it"
-        raise _not_ours(f"{folder / 'config.toml'}: association.method", method, fix)
+    trust(
+        f"{folder / 'config.toml'}: association.method", config.association.method,
+        (KNOWN, *METHODS), "association.method", "association",
+    )  # fmt: skip
     strategies = list(dict.fromkeys(run.strategy for run in summary.runs))
     filters = list(dict.fromkeys(run.filter for run in summary.runs))
     if summary.log is None:
@@ -403,22 +332,8 @@ def rerun(
     return replace(mission, difference=_difference(folder, summary, mission.trials))
 
 
-def _not_ours(where: str, name: str, fix: str) -> InputError:
-    """Return the error for code from outside that is named only by a folder."""
-    found = f"{name!r}, whose code is not Pipistrelle's"
-    return refusal(where, found, "one that you trust", fix)
-
-
 def log_entry(log: Path, robot: Robot | None, beamwidth: float | None) -> dict[str, object]:
-    """Return the entry of a log in ``summary.json``: folder, SHA-256 of its files, beamwidth [rad].
-
-    >>> from tempfile import TemporaryDirectory
-    >>> with TemporaryDirectory() as name:
-    ...     _ = (Path(name) / "log.toml").write_text("format = 1")
-    ...     entry = log_entry(Path(name), None, 0.5)
-    >>> entry["beamwidth_rad"], list(entry["files"])
-    (0.5, ['log.toml'])
-    """
+    """Return the entry of a log in ``summary.json``: folder, sums of its files, beamwidth [rad]."""
     path = str(log.resolve())
     entry: dict[str, object] = {"path": text_of(path), "robot": robot, "beamwidth_rad": beamwidth}
     entry |= {"files": _sums(log)}
@@ -501,16 +416,12 @@ def _difference(folder: Path, summary: Summary, trials: Sequence[TrialResult]) -
         return ""
     name, how = next(iter(differences.items()))
     others = f", nor are {len(differences) - 1} more" if len(differences) > 1 else ""
-    return f"{folder / name}: {how}{others}{_reason(folder, summary)}"
-
-
-def _reason(folder: Path, summary: Summary) -> str:
-    """Name the reason for a difference, if known: other settings or another version."""
+    reason = ""
     if settings_hash(read_toml(folder / "config.toml")) != summary.config_hash:
-        return "; config.toml was changed since"
-    if summary.version != find_version():
-        return f"; it was written by version {summary.version}, this is {find_version()}"
-    return ""
+        reason = "; config.toml was changed since"
+    elif summary.version != find_version():
+        reason = f"; it was written by version {summary.version}, this is {find_version()}"
+    return f"{folder / name}: {how}{others}{reason}"
 
 
 def _apart(here: str, there: str) -> str:

@@ -1,8 +1,7 @@
 """Simulated missions: draw a world, simulate scans, run each estimator, score the estimates.
 
-Read this file first: each call is a box of the paper's workflow. `run_filter` runs an estimator
-over a drive, scan by scan, and keeps every pose. Invalid inputs and outputs of estimators raise an
-InputError.
+Read this file first: `run_mission` is the paper's workflow, `run_trial` an estimate and its scores,
+`run_filter` an estimator over a drive, scan by scan.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -34,6 +33,7 @@ from pipistrelle.estimation.beliefs import (
     answer,
     at_steps,
     in_sight,
+    no_landmarks,
 )
 from pipistrelle.estimation.catalogue import CATALOGUE, entry, short_name
 from pipistrelle.estimation.data_association.sequential import association_of
@@ -55,178 +55,13 @@ from pipistrelle.experiments.results.scores import (
     with_bound,
 )
 from pipistrelle.experiments.runs.heard_world import HeardWorld, Mission, drive_of
-from pipistrelle.experiments.runs.validate import check_filters, checked_scenario, failed_trial
+from pipistrelle.experiments.runs.validate import (
+    check_filters,
+    checked_scenario,
+    let_interruptions_pass,
+    located,
+)
 
-
-def run_filter(
-    estimator: Estimator[B],
-    drive: Drive,
-    scans: Sequence[Scan],
-    rng: np.random.Generator,
-    *,
-    association: Association | None = None,
-    noise: ConstantNoise | None = None,
-    progress: Callable[[int, int], None] | None = None,
-    watch: Callable[[Scan, B], None] | None = None,
-) -> Track:
-    """Run an estimator over a drive: predict to each scan, update with it, keep every pose.
-
-    If the belief revises its path (it has ``path``), the track is the final revised path, and the
-    poses estimated at each time are kept as ``online``. Revised tracks of callers (``tracks``)
-    replace the online ones.
-
-    Parameters
-    ----------
-    estimator : Estimator
-    drive : Drive
-    scans : sequence of Scan
-        In order, at times of the drive.
-    rng : Generator
-    association, noise : optional
-        See `Session`.
-    progress, watch : callable, optional
-        Called with the number of scans done and the total, and with each scan, as the estimator
-        used it, and the belief after it.
-
-    Raises
-    ------
-    InputError
-        For an unusable measurement or label, scans out of order or at other times than the drive's,
-        moving landmarks known beforehand, or a wrong number of poses.
-    """
-    time = drive.time
-    steps = _steps_of(scans, time)
-    _check_known(drive, scans)
-    session = Session(
-        estimator, drive.start, rng, known=drive.known, callers=drive.callers,
-        association=association, noise=noise,
-    )  # fmt: skip
-    path = Gaussian(mean=np.empty((time.size, 3)), covariance=np.empty((time.size, 3, 3)))
-    path.mean[0], path.covariance[0] = drive.start.mean, drive.start.covariance
-    callers: dict[int, Gaussian] = {}
-    done = 0
-    for number, (k, scan) in enumerate(zip(steps, scans, strict=True), start=1):
-        _move(session, drive, done, k, path)
-        done, used = k, session.hear(scan)
-        pose = session.belief.pose()
-        path.mean[k], path.covariance[k] = pose.mean, pose.covariance
-        _follow(callers, scan, session.belief, (k, time.size))
-        if watch:
-            watch(used, session.belief)
-        if progress:
-            progress(number, len(scans))
-    _move(session, drive, done, len(drive.controls), path)
-    track = _track_of(session.belief, time, path, callers)
-    if association is None:
-        return track
-    return replace(track, landmarks=session.landmarks(), labels=tuple(session.labels))
-
-
-def _track_of(
-    belief: Belief, time: Float[np.ndarray, " k"], path: Gaussian, callers: dict[int, Gaussian]
-) -> Track:
-    """Return the track of a drive from its final belief and its online estimates."""
-    online = replace(path, invariant=belief.pose().invariant)
-    revised, cloud = answer(belief, "path"), answer(belief, "cloud")
-    if revised is not None:
-        check_poses("path", revised, time.size)
-    return Track(
-        time=time,
-        pose=revised or online,
-        landmarks=belief.landmarks(),
-        gated=belief.gated,
-        innovations=_innovations(belief),
-        cloud=cloud,
-        full=None if cloud is None else getattr(belief, "full", None),
-        online=online if revised else None,
-        calibration=answer(belief, "calibration") or {},
-        callers=_retraced(callers, belief, time.size),
-    )
-
-
-def _move(session: Session[B], drive: Drive, first: int, last: int, path: Gaussian) -> None:
-    """Predict a session over some steps of a drive, and store the pose after each."""
-    if last == first:
-        return
-    dt = np.diff(drive.time[first : last + 1])
-    poses, after = session.move(drive.controls[first:last], dt), slice(first + 1, last + 1)
-    path.mean[after], path.covariance[after] = poses.mean, poses.covariance
-
-
-def _check_known(drive: Drive, scans: Sequence[Scan]) -> None:
-    """Raise if landmarks known beforehand move."""
-    labelled = (scan for scan in scans if not scan.direct.size)
-    moving = {*drive.moving, *(label for scan in labelled for label in scan.moving.tolist())}
-    if roving := sorted(moving.intersection(drive.known.landmark.tolist())):
-        raise InputError(
-            f"landmarks known beforehand: found {roving}, which move; expected some that stand"
-        )
-
-
-def _innovations(belief: Belief) -> Innovations:
-    """Return the accumulated innovations of a belief, or none if it has no such sum."""
-    innovations = getattr(belief, "innovations", None)
-    return innovations if isinstance(innovations, Innovations) else NO_INNOVATIONS
-
-
-def _follow(callers: dict[int, Gaussian], scan: Scan, belief: Belief, at: tuple[int, int]) -> None:
-    """Store the positions of moving callers in sight at step k."""
-    found, (k, steps) = answer(belief, "moving") if scan.moving.size else None, at
-    if found is None:
-        return
-    moving = in_sight(found)
-    for row in range(moving.landmark.size):
-        nowhere = Gaussian(mean=np.full((steps, 2), nan), covariance=np.full((steps, 2, 2), nan))
-        track = callers.setdefault(int(moving.landmark[row]), nowhere)
-        track.mean[k], track.covariance[k] = moving.mean[row], moving.covariance[row]
-
-
-def _retraced(callers: dict[int, Gaussian], belief: Belief, steps: int) -> Mapping[int, Gaussian]:
-    """Replace online tracks of callers by the revised tracks of the final belief, if any."""
-    revised = answer(belief, "tracks") if callers else None
-    if revised is None:
-        return callers
-    tracks = dict(revised)
-    for label, track in tracks.items():
-        found, expected = (np.shape(track.mean), np.shape(track.covariance)), (steps, 2)
-        if found != (expected, (*expected, 2)):
-            raise InputError(
-                f"tracks: found arrays of {found[0]} and {found[1]} for caller {label}, expected "
-                f"{expected} and {(*expected, 2)}: the start and every control step"
-            )
-        if label in callers:
-            tracks[label] = _filled_up(track, callers[label])
-    return tracks
-
-
-def _filled_up(track: Gaussian, online: Gaussian) -> Gaussian:
-    """Fill the gaps of a caller's revised track with its online positions."""
-    none = np.isnan(track.mean[:, :1])
-    return Gaussian(
-        mean=np.where(none, online.mean, track.mean),
-        covariance=np.where(none[..., np.newaxis], online.covariance, track.covariance),
-    )
-
-
-def _steps_of(scans: Sequence[Scan], time: Float[np.ndarray, " t"]) -> list[int]:
-    """Return the time index of each scan; raise if scans are out of order or off the time steps."""
-    heard = np.array([scan.time for scan in scans], dtype=float)
-    steps = np.searchsorted(time, heard)
-    on_time = time[np.minimum(steps, time.size - 1)] == heard
-    if not on_time.all():
-        stray = scans[int(np.argmin(on_time))]
-        raise InputError(f"scan at {stray.time} s: expected the time of the end of a step")
-    if np.any(np.diff(steps) < 0):
-        late = int(np.argmax(np.diff(steps) < 0))
-        raise InputError(
-            f"scan at {scans[late + 1].time} s: follows one at {scans[late].time} s; expected "
-            "scans in the order of time"
-        )
-    return steps.tolist()
-
-
-NOT_KNOWN: Mapping[Strategy, None] = {}
-"""No true labels of measurements."""
 Watch = Callable[[str, str, Scan, Belief], None]
 """Called with strategy, filter, scan and the belief after it."""
 
@@ -254,29 +89,30 @@ def run_mission(
     kept = {"strategies": len(strategies), "filters": len(filters)}
     scenario = checked_scenario(config, world=world, **kept)
     passive, drive = any(one != "active" for one in strategies), drive_of(scenario, config)
-    apart = tuple(each_its_own(config, filters))
-    for own, names in apart:
+    groups = tuple(each_its_own(config, filters))
+    for own, names in groups:
         check_memory(names, len(standing_landmarks(scenario)[0]), own, passive=passive)
         check_filters(names, drive.motion, own, drive.moving.values())
-    labels = all(own.association.method == KNOWN for own, _ in apart)
+
+    labels = all(own.association.method == KNOWN for own, _ in groups)
     radius = config.emitter.radius
     (heard,) = listen(scenario, config, (radius,), labels=labels, keep=keep, progress=progress)
-    there, trials = HeardWorld(scenario, config, {radius: heard}), []
-    for own, names in apart:
-        scans = {strategy: there.scans(own, strategy) for strategy in strategies}
-        causes = {strategy: there.causes(own, strategy) for strategy in strategies}
-        bounds: dict[str, Float[np.ndarray, "t 3 3"]] = {
-            strategy: there.bound(own, strategy) for strategy in strategies
-        }
-        done = run_trials(
-            names, drive_of(scenario, own), scans, own, causes=causes, progress=progress,
-            watch=watch,
-        )  # fmt: skip
-        trials += [replace(t, scores=with_bound(t.scores, bounds[t.strategy])) for t in done]
+
+    there = HeardWorld(scenario, config, {radius: heard})
+    trials: dict[tuple[str, str], TrialResult] = {}
+    for (own, names), strategy in product(groups, strategies):
+        scans, causes = there.scans(own, strategy), there.causes(own, strategy)
+        given, bound = drive_of(scenario, own), there.bound(own, strategy)
+        for name in names:
+            case = Case(strategy=strategy, filter=name)
+            trial = try_trial(
+                case, given, scans, own, causes=causes, progress=progress, watch=watch
+            )
+            trials[strategy, name] = replace(trial, scores=with_bound(trial.scores, bound))
     return Mission(
         config=config,
         drive=drive,
-        trials=in_order(trials, strategies, filters),
+        trials=tuple(trials[pair] for pair in product(strategies, filters)),
         beamwidth=beamwidth_of(config),
         callers=scenario.callers[VEHICLE + 1 :],
         scenario=scenario,
@@ -285,46 +121,36 @@ def run_mission(
     )
 
 
-def in_order(
-    trials: Sequence[TrialResult], strategies: Sequence[Strategy], filters: Sequence[str]
-) -> tuple[TrialResult, ...]:
-    """Sort trials by strategy, then by filter."""
-    done = {(trial.strategy, trial.filter): trial for trial in trials}
-    return tuple(done[pair] for pair in product(strategies, filters))
-
-
-def run_trials(
-    filters: Sequence[str],
+def try_trial(
+    case: Case,
     drive: Drive,
-    heard: Mapping[Strategy, Sequence[Scan]],
+    scans: Sequence[Scan],
     config: Config,
     *,
-    causes: Mapping[Strategy, Causes | None] = NOT_KNOWN,
+    causes: Causes | None = None,
     progress: Progress | None = None,
     watch: Watch | None = None,
-) -> tuple[TrialResult, ...]:
-    """Run each estimator on the scans of each strategy; return a result for each pair.
-
-    `causes` are the true labels, as in `run_trial`. If an estimator from outside fails, its path is
-    NaN and its result contains the error.
-    """
-
-    def tried(case: Case, scans: Sequence[Scan]) -> TrialResult:
-        try:
-            return run_trial(
-                case, drive, scans, config, causes=causes.get(case.strategy), progress=progress,
-                watch=watch,
-            )  # fmt: skip
-        except Exception as error:
-            if isinstance(error, InputError) and case.filter in CATALOGUE:
-                raise  # a user's mistake
-            return failed_trial(case, drive, scans, error)
-
-    return tuple(
-        tried(Case(strategy=strategy, filter=name), scans)
-        for strategy, scans in heard.items()
-        for name in filters
-    )
+) -> TrialResult:
+    """Run a trial; if an estimator from outside fails, its poses are NaN, with the error."""
+    try:
+        return run_trial(case, drive, scans, config, causes=causes, progress=progress, watch=watch)
+    except Exception as error:
+        if isinstance(error, InputError) and case.filter in CATALOGUE:
+            raise  # a user's mistake
+        let_interruptions_pass(error)
+        k, scans = drive.time.size, tuple(scans)
+        nowhere = Gaussian(mean=np.full((k, 3), nan), covariance=np.full((k, 3, 3), nan))
+        track = Track(time=drive.time, pose=nowhere, landmarks=no_landmarks(), gated=0)
+        return TrialResult(
+            strategy=case.strategy,
+            filter=case.filter,
+            track=track,
+            heard=scans,
+            scans=scans,
+            scores=score(track, drive.truth, scans, 0.0),
+            wall_s=0.0,
+            error=located(error),
+        )
 
 
 def run_trial(
@@ -398,6 +224,24 @@ def run_trial(
     )
 
 
+def with_moving(
+    scans: Sequence[Scan], drive: Drive, *, follows: bool, known: bool = True
+) -> Sequence[Scan]:
+    """Mark moving callers in scans, or remove their measurements.
+
+    Without known labels callers are marked by their numbers, and nothing is removed.
+    """
+    if not drive.moving:
+        return scans
+    moving = np.array([*drive.moving])
+    if not known:
+        numbers = np.flatnonzero(np.isin(drive.callers, moving))
+        return [replace(scan, moving=numbers) if scan.direct.size else scan for scan in scans]
+    if follows:
+        return [replace(scan, moving=moving) for scan in scans]
+    return [rows_of(scan, ~np.isin(scan.landmark, moving)) for scan in scans]
+
+
 def _named(track: Track, used: Sequence[Scan], drive: Drive) -> Track:
     """Rename a track's callers from the association's labels to the labels of the drive."""
     if not track.callers:
@@ -431,19 +275,158 @@ def _scored(
     return with_association(scores, track.landmarks, found, truth, motion), mapped
 
 
-def with_moving(
-    scans: Sequence[Scan], drive: Drive, *, follows: bool, known: bool = True
-) -> Sequence[Scan]:
-    """Mark moving callers in scans, or remove their measurements.
+def run_filter(
+    estimator: Estimator[B],
+    drive: Drive,
+    scans: Sequence[Scan],
+    rng: np.random.Generator,
+    *,
+    association: Association | None = None,
+    noise: ConstantNoise | None = None,
+    progress: Callable[[int, int], None] | None = None,
+    watch: Callable[[Scan, B], None] | None = None,
+) -> Track:
+    """Run an estimator over a drive: predict to each scan, update with it, keep every pose.
 
-    Without known labels callers are marked by their numbers, and nothing is removed.
+    If the belief revises its path (it has ``path``), the track is the final revised path, and the
+    poses estimated at each time are kept as ``online``. Revised tracks of callers (``tracks``)
+    replace the online ones.
+
+    Parameters
+    ----------
+    estimator : Estimator
+    drive : Drive
+    scans : sequence of Scan
+        In order, at times of the drive.
+    rng : Generator
+    association, noise : optional
+        See `Session`.
+    progress, watch : callable, optional
+        Called with the number of scans done and the total, and with each scan, as the estimator
+        used it, and the belief after it.
+
+    Raises
+    ------
+    InputError
+        For an unusable measurement or label, scans out of order or at other times than the drive's,
+        moving landmarks known beforehand, or a wrong number of poses.
     """
-    if not drive.moving:
-        return scans
-    moving = np.array([*drive.moving])
-    if not known:
-        numbers = np.flatnonzero(np.isin(drive.callers, moving))
-        return [replace(scan, moving=numbers) if scan.direct.size else scan for scan in scans]
-    if follows:
-        return [replace(scan, moving=moving) for scan in scans]
-    return [rows_of(scan, ~np.isin(scan.landmark, moving)) for scan in scans]
+    time = drive.time
+    steps = _steps_of(scans, time)
+    _check_known(drive, scans)
+    session = Session(
+        estimator, drive.start, rng, known=drive.known, callers=drive.callers,
+        association=association, noise=noise,
+    )  # fmt: skip
+    path = Gaussian(mean=np.empty((time.size, 3)), covariance=np.empty((time.size, 3, 3)))
+    path.mean[0], path.covariance[0] = drive.start.mean, drive.start.covariance
+    callers: dict[int, Gaussian] = {}
+    done = 0
+    for number, (k, scan) in enumerate(zip(steps, scans, strict=True), start=1):
+        _move(session, drive, done, k, path)
+        done, used = k, session.hear(scan)
+        pose = session.belief.pose()
+        path.mean[k], path.covariance[k] = pose.mean, pose.covariance
+        _follow(callers, scan, session.belief, (k, time.size))
+        if watch:
+            watch(used, session.belief)
+        if progress:
+            progress(number, len(scans))
+    _move(session, drive, done, len(drive.controls), path)
+    track = _track_of(session.belief, time, path, callers)
+    if association is None:
+        return track
+    return replace(track, landmarks=session.landmarks(), labels=tuple(session.labels))
+
+
+def _steps_of(scans: Sequence[Scan], time: Float[np.ndarray, " t"]) -> list[int]:
+    """Return the time index of each scan; raise if scans are out of order or off the time steps."""
+    heard = np.array([scan.time for scan in scans], dtype=float)
+    steps = np.searchsorted(time, heard)
+    on_time = time[np.minimum(steps, time.size - 1)] == heard
+    if not on_time.all():
+        stray = scans[int(np.argmin(on_time))]
+        raise InputError(f"scan at {stray.time} s: expected the time of the end of a step")
+    if np.any(np.diff(steps) < 0):
+        late = int(np.argmax(np.diff(steps) < 0))
+        raise InputError(
+            f"scan at {scans[late + 1].time} s: follows one at {scans[late].time} s; expected "
+            "scans in the order of time"
+        )
+    return steps.tolist()
+
+
+def _check_known(drive: Drive, scans: Sequence[Scan]) -> None:
+    """Raise if landmarks known beforehand move."""
+    labelled = (scan for scan in scans if not scan.direct.size)
+    moving = {*drive.moving, *(label for scan in labelled for label in scan.moving.tolist())}
+    if roving := sorted(moving.intersection(drive.known.landmark.tolist())):
+        raise InputError(
+            f"landmarks known beforehand: found {roving}, which move; expected some that stand"
+        )
+
+
+def _move(session: Session[B], drive: Drive, first: int, last: int, path: Gaussian) -> None:
+    """Predict a session over some steps of a drive, and store the pose after each."""
+    if last == first:
+        return
+    dt = np.diff(drive.time[first : last + 1])
+    poses, after = session.move(drive.controls[first:last], dt), slice(first + 1, last + 1)
+    path.mean[after], path.covariance[after] = poses.mean, poses.covariance
+
+
+def _follow(callers: dict[int, Gaussian], scan: Scan, belief: Belief, at: tuple[int, int]) -> None:
+    """Store the positions of moving callers in sight at step k."""
+    found, (k, steps) = answer(belief, "moving") if scan.moving.size else None, at
+    if found is None:
+        return
+    moving = in_sight(found)
+    for row in range(moving.landmark.size):
+        nowhere = Gaussian(mean=np.full((steps, 2), nan), covariance=np.full((steps, 2, 2), nan))
+        track = callers.setdefault(int(moving.landmark[row]), nowhere)
+        track.mean[k], track.covariance[k] = moving.mean[row], moving.covariance[row]
+
+
+def _track_of(
+    belief: Belief, time: Float[np.ndarray, " k"], path: Gaussian, callers: dict[int, Gaussian]
+) -> Track:
+    """Return the track of a drive from its final belief and its online estimates."""
+    online = replace(path, invariant=belief.pose().invariant)
+    revised, cloud = answer(belief, "path"), answer(belief, "cloud")
+    if revised is not None:
+        check_poses("path", revised, time.size)
+    innovations = getattr(belief, "innovations", None)
+    return Track(
+        time=time,
+        pose=revised or online,
+        landmarks=belief.landmarks(),
+        gated=belief.gated,
+        innovations=innovations if isinstance(innovations, Innovations) else NO_INNOVATIONS,
+        cloud=cloud,
+        full=None if cloud is None else getattr(belief, "full", None),
+        online=online if revised else None,
+        calibration=answer(belief, "calibration") or {},
+        callers=_retraced(callers, belief, time.size),
+    )
+
+
+def _retraced(callers: dict[int, Gaussian], belief: Belief, steps: int) -> Mapping[int, Gaussian]:
+    """Replace online tracks of callers by revised tracks, and fill the gaps of these."""
+    revised = answer(belief, "tracks") if callers else None
+    if revised is None:
+        return callers
+    tracks = dict(revised)
+    for label, track in tracks.items():
+        found, expected = (np.shape(track.mean), np.shape(track.covariance)), (steps, 2)
+        if found != (expected, (*expected, 2)):
+            raise InputError(
+                f"tracks: found arrays of {found[0]} and {found[1]} for caller {label}, expected "
+                f"{expected} and {(*expected, 2)}: the start and every control step"
+            )
+        if label in callers:
+            online, gap = callers[label], np.isnan(track.mean[:, :1])
+            tracks[label] = Gaussian(
+                mean=np.where(gap, online.mean, track.mean),
+                covariance=np.where(gap[..., np.newaxis], online.covariance, track.covariance),
+            )
+    return tracks

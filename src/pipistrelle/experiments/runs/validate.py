@@ -1,8 +1,4 @@
-"""Checks of estimators and settings before a mission, warnings, and records of failed estimators.
-
-A failed trial does not stop the trials of other estimators. Missions and every combination of a
-study pass the same checks.
-"""
+"""Checks of estimators and settings before a mission or a study, warnings, and texts of errors."""
 
 import math
 from collections.abc import Iterable, Sequence
@@ -17,16 +13,12 @@ from pipistrelle.arrays.layout import Scattered, layout_of
 from pipistrelle.arrays.sampling import off_raster, sampling
 from pipistrelle.config import SQUARE, Config, InputError, Section
 from pipistrelle.detection.front_end import front_end
-from pipistrelle.detection.scans import Scan
-from pipistrelle.estimation.beliefs import Belief, Gaussian, Track, no_landmarks
+from pipistrelle.estimation.beliefs import Belief, Gaussian
 from pipistrelle.estimation.catalogue import CATALOGUE, check_distinct, entry, worded
 from pipistrelle.estimation.data_association.sequential import association_of
 from pipistrelle.estimation.motion import Motion
-from pipistrelle.experiments.drives import Drive
 from pipistrelle.experiments.hearing.scenario import ALL_DRAWN, Scenario, World, world_of
 from pipistrelle.experiments.machine import check_length, check_recording
-from pipistrelle.experiments.named_settings import Case
-from pipistrelle.experiments.results.scores import TrialResult, score
 from pipistrelle.kernel_clock import judging
 
 
@@ -38,18 +30,29 @@ def check_filters(
     `moving`: names of the moving callers.
     """
     check_distinct(filters)
-    followed = () if association_of(config) is None or not config.listening.timing else moving
+    known = association_of(config) is None or not config.listening.timing
+    roving, asked = "" if known else ", ".join(moving), ", ".join(config.filter.calibrate)
     for name in filters:
-        check_follows(name, followed)
+        if roving and not entry(name).follows:
+            able = ", ".join(one.name for one in CATALOGUE.values() if one.follows)
+            raise InputError(
+                f"association.method: found callers that move ({roving}) with the filter {name}, "
+                f"which follows none; take {able}, or add --listening.timing false"
+            )
+        if name in CATALOGUE and asked and not CATALOGUE[name].calibrates:
+            able = ", ".join(one.name for one in CATALOGUE.values() if one.calibrates)
+            raise InputError(
+                f"filter.calibrate: found {asked} with the filter {name}, which calibrates "
+                f"nothing; take {able}, or leave it out (in a plan, name it under [own.{able}])"
+            )
         if name in CATALOGUE:
-            check_calibrates(name, config)
             continue
         try:
             belief = first_belief(name, motion, config)
         except InputError:
             raise
         except Exception as error:
-            raise InputError(f"filter {name}: init fails: {_placed(error)}") from error
+            raise InputError(f"filter {name}: init fails: {located(error)}") from error
         parts = ("pose", "landmarks", "gated")
         if lacking := [part for part in parts if not hasattr(belief, part)]:
             raise InputError(
@@ -57,68 +60,18 @@ def check_filters(
                 f"has {', '.join(parts)}"
             )
         methods = ("pose", "landmarks", "path", "cloud")
-        if fixed := [part for part in methods if not callable(getattr(belief, part, _nothing))]:
+        present = (part for part in methods if hasattr(belief, part))
+        if fixed := [part for part in present if not callable(getattr(belief, part))]:
             raise InputError(
                 f"filter {name}: init returns a belief whose {', '.join(fixed)} cannot be called; "
                 f"of a belief {', '.join(methods)} are methods, the last two where it has them"
             )
 
 
-def check_calibrates(name: str, config: Config) -> None:
-    """Raise if ``filter.calibrate`` is set for an estimator that cannot calibrate."""
-    asked = config.filter.calibrate
-    if asked and not CATALOGUE[name].calibrates:
-        able = ", ".join(known.name for known in CATALOGUE.values() if known.calibrates)
-        raise InputError(
-            f"filter.calibrate: found {', '.join(asked)} with the filter {name}, which calibrates "
-            f"nothing; take {able}, or leave it out (in a plan, name it under [own.{able}])"
-        )
-
-
-def check_follows(name: str, moving: Iterable[str]) -> None:
-    """Raise if moving callers are to be associated with a filter that tracks none.
-
-    >>> check_follows("iekf", ["boat"])
-    """
-    if (names := ", ".join(moving)) and not entry(name).follows:
-        able = ", ".join(known.name for known in CATALOGUE.values() if known.follows)
-        raise InputError(
-            f"association.method: found callers that move ({names}) with the filter {name}, which "
-            f"follows none; take {able}, or add --listening.timing false"
-        )
-
-
-def _nothing() -> None:
-    """Callable default for an optional method of a belief."""
-
-
 @judging()
 def first_belief(name: str, motion: Motion, config: Config) -> Belief:
-    """Return the initial belief of an estimator, before any motion or measurement.
-
-    >>> still = Motion(model="unicycle", control_std=(0.1, 0.1))
-    >>> first_belief("fastslam", still, Config()).landmarks().landmark.size
-    0
-    """
+    """Return the initial belief of an estimator, before any motion or measurement."""
     return entry(name).build(config, motion).init(Gaussian(mean=np.zeros(3), covariance=np.eye(3)))
-
-
-def failed_trial(case: Case, drive: Drive, scans: Sequence[Scan], error: Exception) -> TrialResult:
-    """Return the result of an estimator that failed: NaN poses, no map, and the error."""
-    let_interruptions_pass(error)
-    k = drive.time.size
-    nowhere = Gaussian(mean=np.full((k, 3), np.nan), covariance=np.full((k, 3, 3), np.nan))
-    track = Track(time=drive.time, pose=nowhere, landmarks=no_landmarks(), gated=0)
-    return TrialResult(
-        strategy=case.strategy,
-        filter=case.filter,
-        track=track,
-        heard=tuple(scans),
-        scans=tuple(scans),
-        scores=score(track, drive.truth, scans, 0.0),
-        wall_s=0.0,
-        error=_placed(error),
-    )
 
 
 def failure_text(error: Exception) -> str:
@@ -136,8 +89,8 @@ def let_interruptions_pass(error: Exception) -> None:
         behind = behind.__cause__ or behind.__context__
 
 
-def _placed(error: Exception) -> str:
-    """Return the message of an estimator's error, with file and line."""
+def located(error: Exception) -> str:
+    """Return the message of an error, with file and line."""
     place = extract_tb(error.__traceback__)[-1]
     return f"{worded(error)} ({Path(place.filename).name}, line {place.lineno})"
 
@@ -163,15 +116,6 @@ def checked_scenario(
 
     Memory is checked for the numbers of strategies and filters, and of workers on this machine (0
     for a cluster).
-
-    >>> from pipistrelle.config import EmitterConfig, ReceiverConfig
-    >>> len(checked_scenario(Config()).landmarks)
-    50
-    >>> sums = ReceiverConfig(engine="block")
-    >>> checked_scenario(Config(emitter=EmitterConfig(frequency=36e3), receiver=sums))
-    Traceback (most recent call last):
-    pipistrelle.config.InputError: emitter.frequency: found 36000 Hz, expected a multiple of 5000 Hz
-    (the nearest that are free: 25000 and 35000 Hz)
     """
     check_length(config.scenario, strategies=strategies, filters=filters, workers=workers)
     scenario = world_of(config, world=world)
@@ -192,14 +136,6 @@ def warnings_of(config: Config, callers: Sequence[Caller] = ()) -> tuple[str, ..
     .. math:: \sin\theta_g = \sin\theta - \lambda / d .
 
     Van Trees, Optimum Array Processing (2002), Sec. 2.4.
-
-    >>> from pipistrelle.config import ReceiverConfig
-    >>> warnings_of(Config())
-    ()
-    >>> print(warnings_of(Config(receiver=ReceiverConfig(spacing=0.007)))[0])
-    receiver.spacing: 0.007 m is 0.71 of a wave at emitter.frequency (35000 Hz): echoes 26 degrees
-    off a face's normal or more look as if from the other side, as from -75 degrees; expected half a
-    wave (0.0049 m)
     """
     spacing, rate = config.receiver.spacing, config.receiver.sample_rate
     layout = layout_of(config)
@@ -228,12 +164,7 @@ def warnings_of(config: Config, callers: Sequence[Caller] = ()) -> tuple[str, ..
 
 
 def _kilohertz(section: Section, place: str = "") -> list[str]:
-    """Warn of frequencies below 1 kHz, in all settings with the unit hertz.
-
-    >>> from pipistrelle.config import EmitterConfig
-    >>> _kilohertz(Config(emitter=EmitterConfig(frequency=40.0)))
-    ['emitter.frequency: 40 Hz is below 1 kHz; is it in kHz? 40 kHz are 40000 Hz']
-    """
+    """Warn of frequencies below 1 kHz, in all settings with the unit hertz."""
     warnings = []
     for name, field in type(section).model_fields.items():
         key, value = f"{place}{name}", getattr(section, name)
@@ -251,13 +182,7 @@ def _kilohertz(section: Section, place: str = "") -> list[str]:
 
 
 def _of_the_other_medium(config: Config) -> list[str]:
-    """Warn of settings for an unused medium and, in water, of settings that fit only air.
-
-    >>> from pipistrelle.config import WaterConfig
-    >>> config = Config(water=WaterConfig(salinity=0.0))
-    >>> print(_of_the_other_medium(config)[0])
-    water.salinity: counts for nothing where scenario.medium is "air"; expected it to be "water"
-    """
+    """Warn of settings for an unused medium and, in water, of settings that fit only air."""
     medium = config.scenario.medium
     other = "air" if medium == "water" else "water"
     warnings = [

@@ -17,7 +17,7 @@ from contextlib import contextmanager
 from typing import Any
 
 from pipistrelle.config import InputError
-from pipistrelle.experiments.studies.world import EndedTrial
+from pipistrelle.experiments.studies.world import Outcome
 
 AHEAD = 1000
 """Worlds submitted to a cluster before the first of them is done."""
@@ -26,11 +26,11 @@ _NO_PAGES = {f"distributed.{who}.http.routes": [] for who in ("scheduler", "work
 """Settings of a local cluster that disable Dask's web pages."""
 
 
-Task = Callable[[int], list[EndedTrial]]
+Task = Callable[[int], list[Outcome]]
 """Computes a world, writes its results, and returns the outcome of its trials."""
-Ended = tuple[int, "Future[list[EndedTrial]]"]
+Ended = tuple[int, "Future[list[Outcome]]"]
 """Number of a finished world, and the future of its trials."""
-Results = Generator[list[EndedTrial], None, None]
+Results = Generator[list[Outcome], None, None]
 """The trials of each world, in the order in which the worlds end."""
 
 
@@ -39,15 +39,8 @@ def ended(executor: Executor, task: Task, waiting: deque[int], ahead: int) -> It
 
     At most `ahead` worlds are pending. Once the executor is broken, no more are submitted, and the
     rest stays in ``waiting``.
-
-    >>> from concurrent.futures import ThreadPoolExecutor
-    >>> def task(world):
-    ...     return [EndedTrial("fused", None if world else "at sea")]
-    >>> with ThreadPoolExecutor() as pool:
-    ...     [(world, its.result()[0].error) for world, its in ended(pool, task, deque([3, 0]), 1)]
-    [(3, None), (0, 'at sea')]
     """
-    running: dict[Future[list[EndedTrial]], int] = {}
+    running: dict[Future[list[Outcome]], int] = {}
     try:
         while running or (waiting and ahead):
             try:
@@ -86,7 +79,7 @@ def in_processes(task: Task, give_up: Task, waiting: deque[int], workers: int) -
 
 def _in_pool(
     task: Task, waiting: deque[int], workers: int, broken: deque[int]
-) -> Generator[list[EndedTrial], None, bool]:
+) -> Generator[list[Outcome], None, bool]:
     """Run worlds until a process dies; put the unfinished running worlds into `broken`.
 
     Returns whether any world has finished.

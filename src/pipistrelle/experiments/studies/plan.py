@@ -8,9 +8,11 @@ the piston with that beamwidth, so both forms describe the same study.
 """
 
 import json
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field
 from decimal import ROUND_FLOOR, Context
+from functools import partial
 from hashlib import sha256
 from importlib.resources import files
 from itertools import product
@@ -32,7 +34,7 @@ from pipistrelle.estimation.catalogue import (
     check_distinct,
     check_name,
 )
-from pipistrelle.experiments.hearing.caller_paths import routes_read, with_routes
+from pipistrelle.experiments.hearing.caller_paths import with_routes
 from pipistrelle.experiments.hearing.scenario import ALL_DRAWN, World
 from pipistrelle.experiments.hearing.world_folder import (
     laid_over,
@@ -53,7 +55,6 @@ from pipistrelle.settings import (
     Given,
     Key,
     Layer,
-    beside,
     derived,
     from_flags,
     known_settings,
@@ -109,14 +110,7 @@ class PlannedCase(Case):
 
 
 def cases_of(plan: Plan) -> tuple[PlannedCase, ...]:
-    """Return the cases of a plan, in order of their numbers.
-
-    >>> grid = {"emitter.radius": (0.0025, 0.025)}
-    >>> ways = {"strategies": ("active", "passive"), "filters": ("ekf",)}
-    >>> plan = Plan(name="two", iterations=1, config=Config(), grid=grid, **ways)
-    >>> [(case.strategy, case.values["emitter.radius"]) for case in cases_of(plan)]
-    [('active', 0.0025), ('active', 0.025), ('passive', None)]
-    """
+    """Return the cases of a plan, in order of their numbers."""
     settled = from_flags(plan.config.model_dump(mode="json"))
     narrowest = max(plan.grid.get(RADIUS, (plan.config.emitter.radius,)))
     cases: list[PlannedCase] = []
@@ -137,21 +131,19 @@ def cases_of(plan: Plan) -> tuple[PlannedCase, ...]:
 
 
 def own_config(plan: Plan, name: str, config: Config) -> Config:
-    """Return settings with a filter's overrides from the plan applied.
-
-    >>> own = {"iekf": {"filter.noise": "measured"}}
-    >>> ways = {"strategies": ("fused",), "filters": ("ekf", "iekf")}
-    >>> plan = Plan(name="two", iterations=1, config=Config(), grid={}, own=own, **ways)
-    >>> [case.config.filter.noise for case in cases_of(plan)]
-    ['constant', 'measured']
-    """
+    """Return settings with a filter's overrides from the plan applied."""
     if name not in plan.own:
         return config
-    own = {
-        cast(Key, tuple(key.split("."))): Given(value, f"own.{name}.{key}")
-        for key, value in plan.own[name].items()
-    }
+    own = _dotted(plan.own[name], f"own.{name}.")
     return resolve(from_flags(config.model_dump(mode="json")) | own)
+
+
+def _dotted(values: Mapping[str, Any], prefix: str) -> Layer:
+    """Return the layer of settings by dotted names; `prefix` precedes a name in messages."""
+    return {
+        cast(Key, tuple(name.split("."))): Given(value, prefix + name)
+        for name, value in values.items()
+    }
 
 
 def common(plan: Plan, values: Mapping[str, Any]) -> Config:
@@ -184,10 +176,7 @@ def combinations(
     """
     for values in product(*grid.values()):
         named = dict(zip(grid, values, strict=True))
-        varied = {
-            cast(Key, tuple(name.split("."))): Given(value, prefix + name)
-            for name, value in named.items()
-        }
+        varied = _dotted(named, prefix)
         world = worlds[named[WORLD]] if WORLD in named else None
         over = layer | varied if world is None else laid_over(world, layer, varied)
         yield named, resolve(over)
@@ -210,14 +199,20 @@ def with_radii(
     """Replace the beamwidths of a grid by piston radii, in the same order.
 
     `layer` contains the plan's settings, which give the tone and the speed of sound.
-
-    >>> with_radii("grid", {"beamwidth": [180, 11.4], "seed": []}, ["active"], {})
-    {'emitter.radius': [0.0025210352264, 0.0253830203249], 'seed': []}
     """
     if BEAMWIDTH not in grid:
         return dict(grid)
-    _check_alone(where, grid, strategies, layer)
     widths, place = grid[BEAMWIDTH], f"{where}.{BEAMWIDTH}"
+    names = {".".join(key) for key, _ in leaves(grid)}
+    if RADIUS in names:
+        raise InputError(f"{place}: is {RADIUS} in other words; vary one of them")
+    makers = MAKERS[: -1 if ("air", "speed_of_sound") in layer else None]
+    if varied := [name for name in makers if name in names]:
+        why = f"a beamwidth is no one radius where {varied[0]} varies too; vary {RADIUS}"
+        raise InputError(f"{place}: {why}")
+    if set(strategies) == {"passive"}:
+        why = "the beam is that of the vehicle's call, which passive sensing does not hear"
+        raise InputError(f"{place}: {why}; add another strategy or take it out")
     if not isinstance(widths, list) or not widths:
         raise refusal(place, shown(widths), "a list of degrees", "write it as [180, 33, 11]")
     config = resolve(layer)
@@ -229,27 +224,8 @@ def with_radii(
         radii[radius] = width
     widest = max(radii)
     resolve(layer | {("emitter", "radius"): Given(widest, f"{place}: radius of {radii[widest]}")})
-    varied = {RADIUS if name == BEAMWIDTH else name: values for name, values in grid.items()}
-    return varied | {RADIUS: [*radii]}
-
-
-def _check_alone(
-    where: str, grid: Mapping[str, Any], strategies: Sequence[str], layer: Layer
-) -> None:
-    """Raise if a grid's beamwidths conflict with radii, other settings or passive sensing only."""
-    emitter = grid.get("emitter")
-    if RADIUS in grid or (isinstance(emitter, dict) and "radius" in emitter):
-        raise InputError(f"{where}.{BEAMWIDTH}: is {RADIUS} in other words; vary one of them")
-    given = ("air", "speed_of_sound") in layer
-    for name in MAKERS[: -1 if given else None]:
-        section, _, leaf = name.partition(".")
-        table = grid.get(section)
-        if name in grid or (isinstance(table, dict) and leaf in table):
-            why = f"a beamwidth is no one radius where {name} varies too; vary {RADIUS}"
-            raise InputError(f"{where}.{BEAMWIDTH}: {why}")
-    if set(strategies) == {"passive"}:
-        why = "the beam is that of the vehicle's call, which passive sensing does not hear"
-        raise InputError(f"{where}.{BEAMWIDTH}: {why}; add another strategy or take it out")
+    renamed = {RADIUS if name == BEAMWIDTH else name: values for name, values in grid.items()}
+    return renamed | {RADIUS: [*radii]}
 
 
 def _radius(where: str, width: Any, config: Config) -> float:
@@ -267,36 +243,54 @@ def _radius(where: str, width: Any, config: Config) -> float:
 FORMAT = 1
 
 
-def _named(found: Any) -> str:
-    """Validate the name of an estimator; an external estimator need not be installed."""
-    try:
-        return check_name(str(found))
-    except InputError:
-        expected = ", ".join(f"'{name}'" for name in CATALOGUE) + " or module:Class"
-        raise PydanticCustomError(
-            "filter", "Input should be {expected}", {"expected": expected}
-        ) from None
+def _checked(expected: str, valid: Callable[[Any], bool]) -> PlainValidator:
+    """Return the validator of a key of a plan file, which raises unless a value is `valid`."""
+
+    def check(found: Any) -> Any:
+        if valid(found):
+            return found
+        raise PydanticCustomError("key", "Input should be {expected}", {"expected": expected})
+
+    return PlainValidator(check)
 
 
-class _Head(Section):
-    """Keys of a plan file, except settings and grid."""
+def _names_filter(found: Any) -> bool:
+    """Return whether a value names an estimator, also if it is external and not installed."""
+    with suppress(InputError):
+        return bool(check_name(str(found)))
+    return False
+
+
+def _is_table(found: Any, inner: type = object) -> bool:
+    """Return whether a value is a table with values of a type."""
+    return isinstance(found, dict) and all(isinstance(each, inner) for each in found.values())
+
+
+_FILTERS = ", ".join(f"'{name}'" for name in CATALOGUE) + " or module:Class"
+_Filter = Annotated[str, _checked(_FILTERS, _names_filter)]
+_Table = Annotated[dict[str, Any], _checked("a table of settings", _is_table)]
+_Tables = Annotated[
+    dict[str, Any], _checked("a table for each filter", partial(_is_table, inner=dict))
+]
+
+
+class _PlanFile(Section):
+    """Keys of a plan file; the settings in its tables are validated with their places later."""
 
     format: Literal[1]
     name: Annotated[str, Field(pattern=r"^\w[\w.-]*$")]
     iterations: Annotated[int, Field(ge=1, le=MOST_WORLDS)]
     planned: int = 0
     strategies: Annotated[tuple[Strategy, ...], Field(min_length=1)] = STRATEGIES
-    filters: Annotated[tuple[Annotated[str, PlainValidator(_named)], ...], Field(min_length=1)] = (
-        PAPERS
-    )
+    filters: Annotated[tuple[_Filter, ...], Field(min_length=1)] = PAPERS
+    settings: Any = None
+    config: _Table = Field(default_factory=dict)
+    grid: _Table = Field(default_factory=dict)
+    own: _Tables = Field(default_factory=dict)
 
 
 def find_plan(word: str) -> Path:
-    """Return the path of a plan given by a name of `PLANS` or a path.
-
-    >>> find_plan("paper").name
-    'paper.toml'
-    """
+    """Return the path of a plan given by a name of `PLANS` or a path."""
     path = Path(word)
     if word in PLANS:
         return Path(str(files("pipistrelle.experiments.studies") / f"{word}.toml"))
@@ -335,16 +329,11 @@ def plan_of(
     """
     over = over or {}
     named, usual = _beneath(path, table, over)
-    head = _head(path, {"filters": usual, **table} if usual else table, iterations)
-    within = {"config": table.get("config", {}), "grid": table.get("grid", {})}
-    for name, settings in within.items():
-        if not isinstance(settings, dict):
-            raise InputError(
-                f"{path}: {name}: found {shown(settings)}, expected a table of settings"
-            )
+    file = _plan_file(path, {"filters": usual, **table} if usual else table, iterations)
+    tables = {name: table.get(name, {}) for name in ("config", "grid", "own")}
     worlds: dict[str, World] = {}
-    layer = _laid(path, within["config"], over, worlds)
-    radii = with_radii(f"{path}: grid", within["grid"], head.strategies, layer)
+    layer = _laid(path, tables["config"], over, worlds)
+    radii = with_radii(f"{path}: grid", tables["grid"], file.strategies, layer)
     asked = [
         (key, name, _read(path, key, values, worlds))
         for key, name, values in _settings(path, "grid", radii)
@@ -353,21 +342,21 @@ def plan_of(
     named = {k: given for k, given in named.items() if not {k, k[2:]} & varied}
     layer, own = parted(laid(named, layer))
     lengths = [len(values) for _, _, values in asked if isinstance(values, list)]
-    most = prod(lengths) * len(head.strategies) * len(head.filters)
+    most = prod(lengths) * len(file.strategies) * len(file.filters)
     if most > MOST_CASES:
         raise InputError(f"{path}: grid: found {most} cases, expected at most {MOST_CASES}")
     grid = {name: _values(path, name, key, values, layer) for key, name, values in asked}
-    _check_unvaried(path, layer, grid, over, BEAMWIDTH in within["grid"])
-    tables = _with_named(table.get("own", {}), own, head.filters)
+    _check_unvaried(path, layer, grid, over, BEAMWIDTH in tables["grid"])
+    own = {name: own[name] for name in file.filters if name in own}
     plan = Plan(
-        name=head.name,
-        iterations=head.iterations,
-        planned=max(head.iterations, head.planned),
-        strategies=head.strategies,
-        filters=head.filters,
+        name=file.name,
+        iterations=file.iterations,
+        planned=max(file.iterations, file.planned),
+        strategies=file.strategies,
+        filters=file.filters,
         config=resolve(layer),
         grid=grid,
-        own=_own(path, tables, head.filters, grid, layer, worlds),
+        own=_own(path, tables["own"], own, file.filters, grid, layer, worlds),
         worlds=worlds,
     )
     for _ in combinations(layer, grid, f"{path}: grid.", worlds):
@@ -396,18 +385,6 @@ def _beneath(path: Path, table: Mapping[str, Any], over: Layer) -> tuple[Layer, 
     return over_named(*({SETTINGS: one} for one in given))
 
 
-def _with_named(own: Any, named: Mapping[str, Layer], filters: Sequence[str]) -> Any:
-    """Merge a plan's settings for single filters over the preset's."""
-    if not isinstance(own, dict) or not all(isinstance(one, dict) for one in own.values()):
-        return own  # rejected later with all values
-    beneath = {
-        name: {".".join(key): given.value for key, given in named[name].items()}
-        for name in filters
-        if name in named
-    }
-    return {name: beneath.get(name, {}) | own.get(name, {}) for name in {**own, **beneath}}
-
-
 def _laid(path: Path, table: Mapping[str, Any], over: Layer, worlds: dict[str, World]) -> Layer:
     """Merge the settings of a world, a plan and `over`, in rising priority; read named files."""
     layer: Layer = {
@@ -426,14 +403,11 @@ def _read(path: Path, key: Key, values: Any, worlds: dict[str, World]) -> Any:
     """Read the files that a grid names: worlds, arrays, and callers' routes."""
     if key == WORLD_KEY:
         return _worlds(path, values, worlds)
-    if key == CALLERS and isinstance(values, list):
-        where = f"{path}: grid.callers"
-        return [routes_read(beside(path, callers), where) for callers in values]
-    if key == ARRAY_KEY and isinstance(values, list):
-        where = f"{path}: grid.{'.'.join(key)}"
-        placed = [with_places(path, {key: Given(value, where)}) for value in values]
-        return [with_array(layer)[key].value for layer in placed]
-    return values
+    if key not in (CALLERS, ARRAY_KEY) or not isinstance(values, list):
+        return values
+    given = (Given(value, f"{path}: grid.{'.'.join(key)}") for value in values)
+    layers = (with_array(with_routes(with_places(path, {key: one}))) for one in given)
+    return [layer[key].value for layer in layers]
 
 
 def _worlds(path: Path, folders: Any, worlds: dict[str, World]) -> Any:
@@ -453,24 +427,24 @@ def _worlds(path: Path, folders: Any, worlds: dict[str, World]) -> Any:
 
 def _own(
     path: Path,
-    table: Any,
+    tables: Mapping[str, Mapping[str, Any]],
+    named: Mapping[str, Layer],
     filters: Sequence[str],
     grid: Mapping[str, Any],
     layer: Layer,
     worlds: Mapping[str, World],
 ) -> dict[str, dict[str, Any]]:
-    """Validate settings for single filters, which must not change the simulated measurements."""
-    if not isinstance(table, dict) or not all(
-        isinstance(settings, dict) for settings in table.values()
-    ):
-        raise InputError(f"{path}: own: found {shown(table)}, expected a table for each filter")
+    """Merge settings for single filters, which must not change the simulated measurements.
+
+    `tables` are the plan's; `named` are the preset's, with lower priority.
+    """
     own: dict[str, dict[str, Any]] = {}
-    for name, settings in table.items():
+    for name in dict.fromkeys((*tables, *named)):
         where = f"{path}: own.{name}"
         if name not in filters:
             raise InputError(f"{where}: no filter of this plan; {_meant(name, filters)}")
-        given: Layer = {}
-        for key, setting, value in _settings(path, f"own.{name}", settings):
+        given = dict(named.get(name, {}))
+        for key, setting, value in _settings(path, f"own.{name}", tables.get(name, {})):
             if key[0] not in SECTIONS:
                 sections = ", ".join(SECTIONS)
                 why = f"this setting changes what is heard; expected one of the sections {sections}"
@@ -488,56 +462,37 @@ def _own(
 
 
 def plan_text(plan: Plan) -> str:
-    """Format a plan as TOML that lists every setting and can be read back as the same plan.
-
-    >>> print(plan_text(read_plan(find_plan("paper"), iterations=3)).splitlines()[2])
-    iterations = 3
-    """
+    """Format a plan as TOML that lists every setting and can be read back as the same plan."""
     import tomli_w
 
     return tomli_w.dumps(_as_table(plan))
 
 
 def changed_settings(there: Plan, asked: Plan) -> list[str]:
-    """List the differences between two plans, except the number of worlds.
-
-    >>> plans = [
-    ...     read_plan(find_plan("paper"), from_flags({"seed": seed}), seed) for seed in (1, 2)
-    ... ]
-    >>> changed_settings(*plans)
-    ['config.seed: 1 there, 2 asked for']
-    """
+    """List the differences between two plans, except the number of worlds."""
     old, new = plan_settings(there), plan_settings(asked)
+
+    def worded(table: Mapping[str, Any], name: str) -> str:
+        return json.dumps(table[name]) if name in table else "nothing"
+
     return [
-        f"{name}: {_worded(old, name)} there, {_worded(new, name)} asked for"
+        f"{name}: {worded(old, name)} there, {worded(new, name)} asked for"
         for name in dict.fromkeys((*old, *new))
         if name != "iterations" and (name not in old or name not in new or old[name] != new[name])
     ]
 
 
-def _digest(world: World) -> str:
-    """Return 16 hexadecimal digits that identify the files of a world."""
-    digest = sha256()
-    for name in sorted(world.files):
-        digest.update(f"{name}\n{len(world.files[name])}\n".encode() + world.files[name])
-    return digest.hexdigest()[:16]
-
-
 def plan_settings(plan: Plan) -> dict[str, Any]:
-    """Return all settings of a plan by dotted names, with derived values and its worlds' digests.
-
-    >>> plan_settings(read_plan(find_plan("paper")))["iterations"]
-    115
-    """
+    """Return a plan's settings by dotted names, with derived values and its worlds' digests."""
     table = {".".join(key): value for key, value in leaves(_as_table(plan)) if key != ("planned",)}
-    worlds = {f"worlds/{name}": _digest(world) for name, world in plan.worlds.items()}
+    worlds = {}
+    for name, world in plan.worlds.items():
+        digest = sha256()
+        for file, content in sorted(world.files.items()):
+            digest.update(f"{file}\n{len(content)}\n".encode() + content)
+        worlds[f"worlds/{name}"] = digest.hexdigest()[:16]
     values = {f"config.{'.'.join(key)}": value for key, value in derived(plan.config).items()}
     return table | worlds | values
-
-
-def _worded(table: Mapping[str, Any], name: str) -> str:
-    """Format a plan's value as JSON, or "nothing" if it is missing."""
-    return json.dumps(table[name]) if name in table else "nothing"
 
 
 def _as_table(plan: Plan) -> dict[str, Any]:
@@ -566,30 +521,23 @@ def _as_table(plan: Plan) -> dict[str, Any]:
     }
 
 
-def _head(path: Path, table: Mapping[str, Any], iterations: int | None) -> _Head:
-    """Validate the keys of a plan, except settings and grid."""
-    keys = (*_Head.model_fields, "settings", "config", "grid", "own")
-    for name in table:
-        if name not in keys:
-            raise InputError(f"{path}: {name}: no such key of a plan; {_meant(name, keys)}")
-    given = {"name": text_of(path.stem)} | {
-        k: v for k, v in table.items() if k in _Head.model_fields
-    }
+def _plan_file(path: Path, table: Mapping[str, Any], iterations: int | None) -> _PlanFile:
+    """Validate the keys of a plan file."""
+    given = {"name": text_of(path.stem), **table}
     if iterations is not None:
         if isinstance(given.get("iterations"), int):
             given.setdefault("planned", given["iterations"])
         given["iterations"] = iterations
     try:
-        head = _Head.model_validate_json(json.dumps(given, default=str), strict=True)
+        file = _PlanFile.model_validate_json(json.dumps(given, default=str), strict=True)
     except ValidationError as refused:
         wrong = refused.errors(include_url=False)  # also lists of only invalid items are too short
         wrong = [error for error in wrong if error["type"] != "too_short" or error["input"] == []]
-        problems = [_problem(path, error) for error in wrong]
-        raise InputError("\n".join(problems)) from None
+        raise InputError("\n".join(_problem(path, error) for error in wrong)) from None
     for name in ("strategies", "filters"):
-        _check_distinct(f"{path}: {name}", getattr(head, name))
-    check_distinct(head.filters, f"{path}: filters")
-    return head
+        _check_distinct(f"{path}: {name}", getattr(file, name))
+    check_distinct(file.filters, f"{path}: filters")
+    return file
 
 
 def _problem(path: Path, error: Any) -> str:
@@ -598,6 +546,8 @@ def _problem(path: Path, error: Any) -> str:
     if error["type"] == "missing":
         example = {"format": FORMAT, "iterations": 20}.get(name)
         return f"{path}: no key {name!r}; add {name}" + f" = {example}" * (example is not None)
+    if error["type"] == "extra_forbidden":
+        return f"{path}: {name}: no such key of a plan; {_meant(name, _PlanFile.model_fields)}"
     expected = expectation(error)
     if error["type"] == "string_pattern_mismatch":
         expected = "letters, digits, _ . and -, for it names a folder"
@@ -632,14 +582,11 @@ def _values(path: Path, name: str, key: Key, values: Any, layer: Layer) -> tuple
         table: Any = resolve(layer | {key: Given(value, where)}).model_dump(mode="json")
         for part in key:
             table = table[part]
-        checked.append(_stated(table) if key == CALLERS else table)
+        if key == CALLERS:
+            table = [{k: v for k, v in each.items() if v is not None} for each in table]
+        checked.append(table)
     _check_distinct(where, checked)
     return tuple(checked)
-
-
-def _stated(callers: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
-    """Return the tables of callers without keys that are None."""
-    return [{k: v for k, v in caller.items() if v is not None} for caller in callers]
 
 
 def _check_distinct(where: str, values: Sequence[Any]) -> None:
@@ -653,12 +600,8 @@ def _check_distinct(where: str, values: Sequence[Any]) -> None:
 
 
 def _meant(name: str, names: Iterable[str]) -> str:
-    """Suggest the name that was probably meant."""
+    """Suggest the name that was probably meant, or list up to nine names."""
     names = list(names)
     near = meant(name, names)
-    return f"did you mean {near}?" if near else f"expected one of {_some(names)}"
-
-
-def _some(names: Sequence[str]) -> str:
-    """Format up to nine names, or refer to the command that lists them."""
-    return ", ".join(names) if len(names) < 10 else "those of `pipistrelle config show`"
+    listed = ", ".join(names) if len(names) < 10 else "those of `pipistrelle config show`"
+    return f"did you mean {near}?" if near else f"expected one of {listed}"

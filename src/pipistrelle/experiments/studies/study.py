@@ -44,12 +44,13 @@ from pipistrelle.experiments.studies.plan import (
 )
 from pipistrelle.experiments.studies.world import (
     TABLES,
-    EndedTrial,
+    Outcome,
+    TrialRecord,
     check_world,
     done_worlds,
     failed_records,
     heard_together,
-    read_ended_trials,
+    read_outcomes,
     refuse_strange,
     run_world,
     scan_tables,
@@ -104,15 +105,7 @@ class StoredStudy:
 
 
 def open_store(folder: Path, plan: Plan) -> None:
-    """Create a study's folder, or accept the folder of the same plan, also with fewer iterations.
-
-    >>> import tempfile
-    >>> from pipistrelle.experiments.studies.plan import find_plan
-    >>> with tempfile.TemporaryDirectory() as name:
-    ...     open_store(Path(name), read_plan(find_plan("paper")))
-    ...     sorted(path.name for path in Path(name).iterdir())
-    ['README.md', 'config.toml', 'landmarks', 'plan.toml', 'steps', 'trials']
-    """
+    """Create a study's folder, or accept a folder of the same plan, also with fewer iterations."""
     kept = folder / "plan.toml"
     try:
         folder.mkdir(parents=True, exist_ok=True)
@@ -147,7 +140,7 @@ def open_store(folder: Path, plan: Plan) -> None:
 
 
 def _keep_plan(folder: Path, there: Plan | None, plan: Plan) -> None:
-    """Write a plan into its folder, with the larger of the old and new numbers of worlds."""
+    """Write a plan and its worlds, with the larger of the old and new numbers of worlds."""
     kept = folder / "plan.toml"
     if there is not None:
         if not _is_ours(kept, there):
@@ -159,12 +152,6 @@ def _keep_plan(folder: Path, there: Plan | None, plan: Plan) -> None:
             )
         most = max(there.iterations, plan.iterations)
         plan = replace(plan, iterations=most, planned=max(there.planned, plan.planned))
-    _keep_worlds(folder, plan)
-    write_whole(kept, plan_text(plan).encode())
-
-
-def _keep_worlds(folder: Path, plan: Plan) -> None:
-    """Copy the worlds that a plan names into its folder."""
     for world in plan.worlds.values():
         _, files = kept_world(plan.config, world)
         for name, content in files.items():
@@ -175,6 +162,7 @@ def _keep_worlds(folder: Path, plan: Plan) -> None:
                 )
             path.parent.mkdir(parents=True, exist_ok=True)
             write_whole(path, content)
+    write_whole(kept, plan_text(plan).encode())
 
 
 def _refuse_strange(folder: Path, there: Plan | None, strange: Sequence[str]) -> None:
@@ -259,16 +247,6 @@ def run_study(
     world from world i on. The scheduler is "local" or the address of a Dask scheduler; an executor
     is any other object with ``submit``. `progress` is called with the state at the start and after
     each world.
-
-    >>> import tempfile
-    >>> from pipistrelle.config import Config, ScenarioConfig
-    >>> ways = {"strategies": ("fused",), "filters": ("ekf",)}
-    >>> config = Config(scenario=ScenarioConfig(steps=8, landmarks=12))
-    >>> plan = Plan(name="one", iterations=2, config=config, grid={}, **ways)
-    >>> with tempfile.TemporaryDirectory() as name:
-    ...     so_far = run_study(plan, Path(name))
-    >>> so_far.done, so_far.ended
-    (2, {'fused': 2})
     """
     if scheduler is not None:
         check_cluster(scheduler)
@@ -280,8 +258,8 @@ def run_study(
     so_far = _nothing_done(plan, len(worlds))
     waiting: deque[int] = deque()
     for iteration in worlds:
-        trials = read_ended_trials(folder, plan, iteration) if iteration in done else None
-        if trials is None or (retry_failed and any(trial.error for trial in trials)):
+        trials = read_outcomes(folder, plan, iteration) if iteration in done else None
+        if trials is None or (retry_failed and any(error for _, error in trials)):
             waiting.append(iteration)
         else:
             so_far = _advanced(so_far, trials)
@@ -360,11 +338,11 @@ def _nothing_done(plan: Plan, worlds: int) -> StudyProgress:
     )
 
 
-def _advanced(so_far: StudyProgress, trials: Sequence[EndedTrial]) -> StudyProgress:
+def _advanced(so_far: StudyProgress, trials: Sequence[Outcome]) -> StudyProgress:
     """Return the state of a study after another finished world."""
-    errors = [trial.error for trial in trials if trial.error is not None]
-    ended = Counter(trial.strategy for trial in trials)
-    failed = Counter(trial.strategy for trial in trials if trial.error is not None)
+    errors = [error for _, error in trials if error is not None]
+    ended = Counter(strategy for strategy, _ in trials)
+    failed = Counter(strategy for strategy, error in trials if error is not None)
     error = errors[0].strip().splitlines()[-1] if errors else None
     return replace(
         so_far,
@@ -375,18 +353,22 @@ def _advanced(so_far: StudyProgress, trials: Sequence[EndedTrial]) -> StudyProgr
     )
 
 
-def _work(folder: Path, plan: Plan, here: Path, iteration: int) -> list[EndedTrial]:
+def _work(folder: Path, plan: Plan, here: Path, iteration: int) -> list[Outcome]:
     """Compute a world and write its results, in any worker."""
     keep_freed_memory()
     if not CATALOGUE.keys() >= set(plan.filters):
         look_in(here)
-    records = run_world(plan, iteration)
-    write_world(folder, plan, iteration, records)
-    return [EndedTrial(record.case.strategy, record.error) for record in records]
+    return _kept(folder, plan, iteration, run_world(plan, iteration))
 
 
-def _give_up(folder: Path, plan: Plan, iteration: int) -> list[EndedTrial]:
+def _give_up(folder: Path, plan: Plan, iteration: int) -> list[Outcome]:
     """Record all trials of a world as failed, as its process died."""
-    records = failed_records(plan, KILLED)
+    return _kept(folder, plan, iteration, failed_records(plan, KILLED))
+
+
+def _kept(
+    folder: Path, plan: Plan, iteration: int, records: Sequence[TrialRecord]
+) -> list[Outcome]:
+    """Write a world's results, and return the outcome of each trial."""
     write_world(folder, plan, iteration, records)
-    return [EndedTrial(record.case.strategy, record.error) for record in records]
+    return [(record.case.strategy, record.row.get("error")) for record in records]

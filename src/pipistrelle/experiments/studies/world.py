@@ -18,7 +18,7 @@ from hashlib import sha256
 from itertools import chain, product
 from math import degrees
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -36,19 +36,12 @@ from pipistrelle.evaluation.accuracy import (
     pose_error,
     position_error,
 )
-from pipistrelle.evaluation.bound import (
-    nees_of_exact_start,
-)
+from pipistrelle.evaluation.bound import nees_of_exact_start
 from pipistrelle.evaluation.consistency import track_nees
 from pipistrelle.experiments.hearing.listening import listen
 from pipistrelle.experiments.hearing.scenario import Scenario, World, standing_landmarks, world_of
 from pipistrelle.experiments.hearing.trajectories import motion_of
-from pipistrelle.experiments.results.scores import (
-    OF_ASSOCIATION,
-    PathScores,
-    Scores,
-    with_bound,
-)
+from pipistrelle.experiments.results.scores import OF_ASSOCIATION, Scores, with_bound
 from pipistrelle.experiments.results.writing import calibration_of
 from pipistrelle.experiments.runs.heard_world import HeardWorld, drive_of
 from pipistrelle.experiments.runs.trial import run_trial
@@ -71,39 +64,24 @@ if TYPE_CHECKING:
 ONLINE = ("position_rmse_m", "heading_rmse_rad", "nees_mean", "nees_max")
 """Scores that are also stored for the online path, if the filter revises its path."""
 
-NEES_OF_DRAWN_START = (3.0, 6.0)
-"""Mean and variance of a consistent filter's NEES: chi-square with three degrees of freedom."""
 STEPS = ("position_error_m", "heading_error_rad", "nees", "nees_expected", "nees_variance")
 """Columns for each frame: errors, NEES, and mean and variance of a consistent filter's NEES."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class TrialRecord:
-    """Results of a trial that a study stores."""
+    """Results of a trial that a study stores: its row, its frames and its landmarks."""
 
     case: PlannedCase
-    beamwidth_deg: float | None
-    error: str | None = None
-    """Traceback of a failed trial, with the message as its last line. A failed trial has no
-    scores and no rows in the other tables."""
-    scores: Scores | None = None
-    online: PathScores | None = None
-    """Scores of the online path, if the filter revises its path."""
-    calibration: Mapping[str, float] = field(default_factory=dict)
-    """Estimated calibration parameters, and ``NAME_std`` of each."""
-    landmarks_full_mean: float | None = None
-    """Number of fully initialised landmarks; for a particle filter the mean over its particles."""
-    clutter_per_frame: float | None = None
-    """Mean number of detections without a label."""
-    wall_s: float = 0.0
-    cpu_s: float = 0.0
-    steps: Float[np.ndarray, "k 5"]
-    """Position error [m], heading error [rad] and NEES at each frame, and mean and variance of a
-    consistent filter's NEES."""
-    landmark: Int[np.ndarray, " n"]
-    full: Bool[np.ndarray, " n"]
+    row: Mapping[str, Any]
+    """Columns of the table of trials besides those of the case. A failed trial has only its
+    ``error``, a traceback with the message as its last line."""
+    steps: Float[np.ndarray, "k 5"] = field(default_factory=lambda: np.empty((0, len(STEPS))))
+    """Columns `STEPS` at each frame."""
+    landmark: Int[np.ndarray, " n"] = field(default_factory=lambda: np.empty(0, int))
+    full: Bool[np.ndarray, " n"] = field(default_factory=lambda: np.empty(0, bool))
     """Whether each landmark of the map is fully initialised."""
-    landmark_error: Float[np.ndarray, " n"]
+    landmark_error: Float[np.ndarray, " n"] = field(default_factory=lambda: np.empty(0))
     """Distance of each from the true position [m]."""
 
 
@@ -111,13 +89,6 @@ def run_world(plan: Plan, iteration: int) -> tuple[TrialRecord, ...]:
     """Draw a world, simulate its sound once for all beamwidths, and try every case of a plan.
 
     A trial that raises an exception becomes a failed record, as do all trials of a world that does.
-
-    >>> from pipistrelle.config import ScenarioConfig
-    >>> ways = {"strategies": ("fused",), "filters": ("ekf",)}
-    >>> config = Config(scenario=ScenarioConfig(steps=8, landmarks=12))
-    >>> plan = Plan(name="one", iterations=1, config=config, grid={}, **ways)
-    >>> [record.steps.shape for record in run_world(plan, 0)]
-    [(2, 5)]
     """
     records = [
         record
@@ -128,14 +99,7 @@ def run_world(plan: Plan, iteration: int) -> tuple[TrialRecord, ...]:
 
 
 def heard_together(plan: Plan) -> tuple[tuple[PlannedCase, ...], ...]:
-    """Group the cases of a plan that share the drawing and the simulated sound of a world.
-
-    >>> grid = {"filter.gate": (0.9, 1.0), "emitter.radius": (0.0025, 0.025)}
-    >>> ways = {"strategies": ("fused",), "filters": ("ekf",)}
-    >>> plan = Plan(name="four", iterations=1, config=Config(), grid=grid, **ways)
-    >>> [len(cases) for cases in heard_together(plan)]
-    [4]
-    """
+    """Group the cases of a plan that share the drawing and the simulated sound of a world."""
     together: dict[str, list[PlannedCase]] = {}
     for case in cases_of(plan):
         together.setdefault(heard_settings(case.config), []).append(case)
@@ -144,7 +108,7 @@ def heard_together(plan: Plan) -> tuple[tuple[PlannedCase, ...], ...]:
 
 def failed_records(plan: Plan, error: str) -> tuple[TrialRecord, ...]:
     """Return a failed record for every case of a world that could not be computed."""
-    return tuple(_failed(case, error) for case in cases_of(plan))
+    return tuple(TrialRecord(case=case, row={"error": error}) for case in cases_of(plan))
 
 
 def world_tables(
@@ -154,7 +118,8 @@ def world_tables(
     import polars as pl
 
     schemas = world_schemas(plan)
-    rows = [_row(iteration, record, list(schemas["trials"])) for record in records]
+    rows = [_row(iteration, record) for record in records]
+    rows = [{column: row.get(column) for column in schemas["trials"]} for row in rows]
 
     def joined(name: str, columns: dict[str, list[np.ndarray]]) -> pl.DataFrame:
         lengths = [len(part) for part in next(iter(columns.values()))]
@@ -188,11 +153,16 @@ def world_schemas(plan: Plan) -> "dict[str, dict[str, Any]]":
         name: pl.Float64 if isinstance(_cell(values[0]), (int, float)) else pl.String
         for name, values in plan.grid.items()
     }
+    configs = [case.config for case in cases_of(plan)]
     # Older studies lack these columns and can still be read.
-    known = all(case.config.association.method == KNOWN for case in cases_of(plan))
+    known = all(config.association.method == KNOWN for config in configs)
     left = {"nis_mean", *(OF_ASSOCIATION if known else ())}
     kept = (field.name for field in fields(Scores) if field.name not in left)
     scores = dict.fromkeys(kept, pl.Float64)
+    motion = motion_of(plan.config.motion)
+    beliefs = (first_belief(name, motion, plan.config) for name in plan.filters)
+    online = any(hasattr(belief, "path") for belief in beliefs)
+    estimated = numbers_of({name for config in configs for name in config.filter.calibrate})
     counts = dict.fromkeys(("landmarks_full", "landmarks_total", "gated"), pl.Int32)
     last = ("landmarks_full_mean", "clutter_per_frame", "wall_s", "cpu_s")
     return {
@@ -207,31 +177,12 @@ def world_schemas(plan: Plan) -> "dict[str, dict[str, Any]]":
             "error": pl.String,
             **(scores | counts | {"diverged": pl.Boolean}),
             **dict.fromkeys(last, pl.Float64),
-            **dict.fromkeys(_online_columns(plan), pl.Float64),
-            **dict.fromkeys(_calibration_columns(plan), pl.Float64),
+            **dict.fromkeys((f"online_{score}" for score in ONLINE if online), pl.Float64),
+            **dict.fromkeys((c for n in estimated for c in (n, f"{n}_std")), pl.Float64),
         },
-        "steps": {
-            **world,
-            "frame": pl.UInt16,
-            **dict.fromkeys(STEPS, pl.Float32),
-        },
+        "steps": {**world, "frame": pl.UInt16, **dict.fromkeys(STEPS, pl.Float32)},
         "landmarks": {**world, "landmark": pl.Int16, "full": pl.Boolean, "error_m": pl.Float32},
     }
-
-
-def _online_columns(plan: Plan) -> tuple[str, ...]:
-    """Name the columns of online scores; empty if no filter of the plan revises its path."""
-    motion = motion_of(plan.config.motion)
-    for name in plan.filters:
-        if hasattr(first_belief(name, motion, plan.config), "path"):
-            return tuple(f"online_{score}" for score in ONLINE)
-    return ()
-
-
-def _calibration_columns(plan: Plan) -> tuple[str, ...]:
-    """Name the columns of the calibration parameters that the filters of a plan estimate."""
-    asked = {name for case in cases_of(plan) for name in case.config.filter.calibrate}
-    return tuple(column for name in numbers_of(asked) for column in (name, f"{name}_std"))
 
 
 def heard_settings(config: Config) -> str:
@@ -252,10 +203,44 @@ def _run_cases(cases: Sequence[PlannedCase], iteration: int, world: World) -> li
         labels = all(case.config.association.method == KNOWN for case in cases)
         heard = listen(scenario, config, radii, iteration=iteration, labels=labels)
     except Exception as failure:
-        error = failure_text(failure)
-        return [_failed(case, error) for case in cases]
+        error = {"error": failure_text(failure)}
+        return [TrialRecord(case=case, row=error) for case in cases]
     shared = HeardWorld(scenario, config, dict(zip(radii, heard, strict=True)))
     return [_try_case(case, shared, iteration) for case in cases]
+
+
+def _try_case(case: PlannedCase, shared: HeardWorld, iteration: int) -> TrialRecord:
+    """Run a trial; an error becomes a failed record."""
+    config, strategy, scenario = case.config, case.strategy, shared.scenario
+    try:
+        drive, scans = drive_of(scenario, config, iteration), shared.scans(config, strategy)
+        heard, causes = shared.beams[config.emitter.radius], shared.causes(config, strategy)
+        began = kernel_clock.cpu_s()
+        result = run_trial(replace(case, iteration=iteration), drive, scans, config, causes=causes)
+        cpu_s = kernel_clock.cpu_s() - began
+        estimate = heaviest(result.mapped or result.track.landmarks)
+        scores, full = result.scores, result.track.full
+        clutter = sum(frame.clutter for frame in heard) / len(heard) if heard else None
+        row = {
+            **asdict(with_bound(scores, shared.bound(config, strategy))),
+            "landmarks_full_mean": float(scores.landmarks_full if full is None else full),
+            "clutter_per_frame": clutter,
+            "wall_s": result.wall_s,
+            "cpu_s": cpu_s,
+            **{f"online_{name}": result.online and result.online[name] for name in ONLINE},
+            **calibration_of(result.track),
+        }
+        errors = _frame_errors(result.track, scenario, config)
+        return TrialRecord(
+            case=case,
+            row=row,
+            steps=np.column_stack([errors, _consistent(case, shared)]),
+            landmark=estimate.landmark,
+            full=estimate.full,
+            landmark_error=landmark_error(estimate, *standing_landmarks(scenario)),
+        )
+    except Exception as failure:
+        return TrialRecord(case=case, row={"error": failure_text(failure)})
 
 
 def _consistent(case: PlannedCase, shared: HeardWorld) -> Float[np.ndarray, "k 2"]:
@@ -263,49 +248,12 @@ def _consistent(case: PlannedCase, shared: HeardWorld) -> Float[np.ndarray, "k 2
     config, settings = case.config, case.config.filter
     frames = slice(None, None, config.scenario.steps_per_frame)
     path = shared.scenario.path[frames]
-    if settings.first_pose == "drawn":
-        return np.tile(np.array(NEES_OF_DRAWN_START, np.float32), (len(path) - 1, 1))
+    if settings.first_pose == "drawn":  # chi-square with three degrees of freedom
+        return np.tile(np.array((3.0, 6.0), np.float32), (len(path) - 1, 1))
     bound = shared.stated_bound(config, case.strategy)[frames]
     start_covariance = np.diag(np.square(settings.initial_pose_std))
     expected = nees_of_exact_start(bound, path, start_covariance)
     return np.column_stack(expected)[1:].astype(np.float32)
-
-
-def _try_case(case: PlannedCase, shared: HeardWorld, iteration: int) -> TrialRecord:
-    """Run a trial; an error becomes a failed record."""
-    try:
-        scenario = shared.scenario
-        drive, scans = (
-            drive_of(scenario, case.config, iteration),
-            shared.scans(case.config, case.strategy),
-        )
-        heard = shared.beams[case.config.emitter.radius]
-        causes = shared.causes(case.config, case.strategy)
-        began = kernel_clock.cpu_s()
-        result = run_trial(
-            replace(case, iteration=iteration), drive, scans, case.config, causes=causes
-        )
-        cpu_s = kernel_clock.cpu_s() - began
-        estimate = heaviest(result.mapped or result.track.landmarks)
-        full = result.track.full
-        frames = _frame_errors(result.track, scenario, case.config)
-        return TrialRecord(
-            case=case,
-            beamwidth_deg=_beamwidth_deg(case),
-            scores=with_bound(result.scores, shared.bound(case.config, case.strategy)),
-            online=result.online,
-            calibration=calibration_of(result.track),
-            landmarks_full_mean=float(result.scores.landmarks_full if full is None else full),
-            clutter_per_frame=sum(h.clutter for h in heard) / len(heard) if heard else None,
-            wall_s=result.wall_s,
-            cpu_s=cpu_s,
-            steps=np.column_stack([frames, _consistent(case, shared)]),
-            landmark=estimate.landmark,
-            full=estimate.full,
-            landmark_error=landmark_error(estimate, *standing_landmarks(scenario)),
-        )
-    except Exception as failure:
-        return _failed(case, failure_text(failure))
 
 
 @np.errstate(over="ignore", invalid="ignore")
@@ -319,58 +267,27 @@ def _frame_errors(track: Track, scenario: Scenario, config: Config) -> Float[np.
     return np.column_stack(columns).astype(np.float32)
 
 
-def _failed(case: PlannedCase, error: str) -> TrialRecord:
-    """Create the record of a failed trial."""
-    return TrialRecord(
-        case=case,
-        beamwidth_deg=_beamwidth_deg(case),
-        error=error,
-        steps=np.empty((0, len(STEPS)), np.float32),
-        landmark=np.empty(0, int),
-        full=np.empty(0, bool),
-        landmark_error=np.empty(0),
-    )
-
-
-def _beamwidth_deg(case: PlannedCase) -> float | None:
-    """Return the half-power beamwidth of the vehicle's call [deg]; None for passive."""
-    if case.strategy == "passive":
-        return None
-    return degrees(beamwidth_of(case.config))
-
-
-def _row(iteration: int, record: TrialRecord, columns: Sequence[str]) -> dict[str, Any]:
-    """Return a trial's row of the table of trials."""
-    case, scores, online = record.case, record.scores, record.online
-    nothing = dict.fromkeys(field.name for field in fields(Scores))
-    row = {
+def _row(iteration: int, record: TrialRecord) -> dict[str, Any]:
+    """Return a trial's row of the table of trials; missing columns are null."""
+    case = record.case
+    return {
         "iteration": iteration,
         "case": case.number,
         "strategy": case.strategy,
         "filter": case.filter,
         **{name: _cell(value) for name, value in case.values.items()},
-        "beamwidth_deg": record.beamwidth_deg,
+        "beamwidth_deg": None if case.strategy == "passive" else degrees(beamwidth_of(case.config)),
         "seed": case.config.seed,
-        "status": "done" if record.error is None else "failed",
-        "error": record.error,
-        **(nothing if scores is None else asdict(scores)),
-        "landmarks_full_mean": record.landmarks_full_mean,
-        "clutter_per_frame": record.clutter_per_frame,
-        "wall_s": record.wall_s,
-        "cpu_s": record.cpu_s,
-        **{f"online_{name}": online and getattr(online, name) for name in ONLINE},
-        **record.calibration,
+        "status": "failed" if record.row.get("error") else "done",
+        **{"wall_s": 0.0, "cpu_s": 0.0},
+        **record.row,
     }
-    return {column: row.get(column) for column in columns}
 
 
 def _cell(value: Any) -> Any:
     """Convert a grid's value to a table cell: a number, or text."""
     return value if value is None or isinstance(value, (int, float, str)) else json.dumps(value)
 
-
-if TYPE_CHECKING:
-    import polars as pl
 
 TABLES = ("steps", "landmarks", "trials")
 """Names of the tables, in the order of writing."""
@@ -382,19 +299,12 @@ _WORLD, _PLAN = "pipistrelle.iteration", "pipistrelle.plan"
 """Metadata keys of the world's number and the plan's SHA-256."""
 
 
-class EndedTrial(NamedTuple):
-    """Outcome of a trial, as returned by a worker."""
-
-    strategy: str
-    error: str | None
+Outcome = tuple[str, str | None]
+"""Strategy and error of a trial, as returned by a worker."""
 
 
 def world_file(folder: Path, table: str, iteration: int) -> Path:
-    """Return the path of a table of a world.
-
-    >>> world_file(Path("study"), "trials", 7).as_posix()
-    'study/trials/iteration_00007.parquet'
-    """
+    """Return the path of a table of a world, such as ``trials/iteration_00007.parquet``."""
     return folder / table / f"iteration_{iteration:05d}.parquet"
 
 
@@ -512,14 +422,13 @@ def _plan_sum(plan: Plan) -> str:
     return sha256(text.encode()).hexdigest()
 
 
-def read_ended_trials(folder: Path, plan: Plan, iteration: int) -> list[EndedTrial]:
+def read_outcomes(folder: Path, plan: Plan, iteration: int) -> list[Outcome]:
     """Return the outcomes of a finished world's trials; raise if its files were changed."""
     import polars as pl
 
     file = check_world(folder, plan, iteration)
     try:
-        trials = pl.read_parquet(file, columns=[*EndedTrial._fields])
-        return [EndedTrial(*row) for row in trials.rows()]
+        return pl.read_parquet(file, columns=["strategy", "error"]).rows()
     except pl.exceptions.PolarsError:
         flaw = "has not the columns of this study"
         raise damaged(folder, "trials", iteration, flaw) from None
