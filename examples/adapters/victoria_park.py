@@ -97,7 +97,7 @@ def score(files: Path, result: Path, picture: Path | None = None) -> None:
 
 def draw(gps: np.ndarray, path: np.ndarray, trees: np.ndarray, picture: Path) -> None:
     """Draw track and map beside the GPS."""
-    from pipistrelle.figures.picture import picture as figure_of
+    from pipistrelle.figures.style import picture as figure_of
 
     figure = figure_of(6.0, 6.0)
     axes = figure.subplots()

@@ -150,7 +150,7 @@ def _blueprint(playback: Playback) -> Any:
             name=f"{estimate.strategy} {title_of(estimate.filter)}",
             origin="/",
             contents=[f"/{_name(estimate)}/**", "/truth/**"],
-            background=_rgba(PAGE["light"]["paper"]).tolist(),
+            background=_rgba(PAGE["paper"][0]).tolist(),
             eye_controls=_from_above(playback),
         )
         for estimate in playback.estimates

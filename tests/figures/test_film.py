@@ -1,4 +1,4 @@
-"""Films: the recorded frames, the panel of a frame, and the files."""
+"""Films: the panel of a frame, and the files."""
 
 import os
 from dataclasses import replace
@@ -9,19 +9,13 @@ import pytest
 from PIL import Image
 
 from pipistrelle.config import InputError
-from pipistrelle.detection.scans import EXCESS_PATH, make_scan
-from pipistrelle.detection.scans import rows_of as rows_of_scan
-from pipistrelle.estimation.beliefs import Landmarks, placed
-from pipistrelle.figures.film import _stage, animate_mission, film_writer
-from pipistrelle.figures.recorder import (
-    MissionRecorder,
-    Snapshot,
-    callers_at,
-    drawn_excess_paths,
-    pruned,
-)
+from pipistrelle.detection.scans import EXCESS_PATH, make_scan, rows_of
+from pipistrelle.estimation.beliefs import no_landmarks, placed
+from pipistrelle.experiments.drives import NO_TRUTH
+from pipistrelle.figures.film import FilmPanel, animate_mission, film_writer
+from pipistrelle.figures.maps import draw_maps, drawn_excess_paths
+from pipistrelle.figures.recorder import Snapshot, callers_at
 from pipistrelle.geometry import range_and_bearing
-from reference.missions import map_with
 
 PICTURES = [np.full((4, 6, 3), level, np.uint8) for level in (1, 2, 3)]
 
@@ -62,62 +56,44 @@ def test_an_upper_case_ending_will_do(tmp_path):
     assert path.read_bytes()[:6] == b"GIF89a"
 
 
-@pytest.fixture(scope="module")
-def recorder(mission) -> MissionRecorder:
-    watch = MissionRecorder()
-    for strategy, frames in mission.watched.items():
-        for scan, belief in frames:
-            watch(strategy, "ekf", scan, belief)
-    return watch
+def staged(snapshots, truth=NO_TRUTH, callers=(), beamwidth=None):
+    """Return the names in the legend of a film, and its panels."""
+    panels = [FilmPanel(key, seen, beamwidth, truth, callers) for key, seen in snapshots.items()]
+    figure, _ = draw_maps(panels, truth, callers)
+    return [text.get_text() for legend in figure.legends for text in legend.texts], panels
 
 
 @pytest.fixture(scope="module")
-def swarm_recorder(watched_swarms) -> MissionRecorder:
-    watch = MissionRecorder()
-    for scan, belief in watched_swarms["fused"]:
-        watch("fused", "fastslam", scan, belief)
-    return watch
+def snapshots(watched):
+    return watched[1]
 
 
-def rows_of(labels: list[int], x: list[float]) -> Landmarks:
-    mean = np.column_stack([x, np.zeros(len(x))])
-    return map_with(labels, mean, np.tile(np.eye(2), (len(x), 1, 1)))
+@pytest.fixture(scope="module")
+def panels(snapshots, scene):
+    """The panels of all estimates, by strategy and filter."""
+    _, panels = staged(snapshots, **scene)
+    return {panel.case: panel for panel in panels}
 
 
-def test_a_recorder_keeps_every_frame_of_every_strategy(recorder, mission):
-    assert list(recorder.snapshots) == [(s, "ekf") for s in ("active", "fused", "passive")]
-    assert {len(frames) for frames in recorder.snapshots.values()} == {375}
-    scan, belief = mission.watched["passive"][200]
-    kept = recorder.snapshots["passive", "ekf"][200]
-    assert kept.scan is scan
-    assert np.array_equal(kept.pose, belief.pose().mean)
-
-
-def test_a_recorder_keeps_the_particles_of_fastslam(recorder, swarm_recorder, watched_swarms):
-    assert recorder.snapshots["fused", "ekf"][0].cloud is None
-    kept = [frame.cloud for frame in swarm_recorder.snapshots["fused", "fastslam"]]
-    assert np.array_equal(kept, [belief.cloud() for _, belief in watched_swarms["fused"]])
-
-
-def test_a_panel_shows_the_particles_of_its_frame_enlarged(recorder, swarm_recorder, mission):
-    _, panels = _stage(recorder.snapshots | swarm_recorder.snapshots, **mission.scene)
-    assert [panel.closeup is not None for panel in panels] == [False, False, False, True]
-    frame = swarm_recorder.snapshots["fused", "fastslam"][100]
-    panels[3].show_frame(frame.scan.time, 0)
-    dots, _, window = panels[3].closeup.artists
-    assert np.array_equal(dots.get_xydata(), frame.cloud[:, :2])
+def test_a_panel_shows_the_particles_of_its_frame_enlarged(panels, snapshots):
+    with_particles = {case for case, panel in panels.items() if panel.closeup is not None}
+    assert with_particles == {case for case in panels if case[1] == "fastslam"}
+    frame, panel = snapshots["fused", "fastslam"][10], panels["fused", "fastslam"]
+    panel.show_picture(0, frame.scan.time)
+    assert np.array_equal(panel.closeup.dots.get_xydata(), frame.cloud[:, :2])
+    window = panel.closeup.window
     assert np.mean(window.get_xlim()) == pytest.approx(frame.pose[0])
-    assert panels[3].artists[-1] is window, "nothing is drawn over it"
+    assert max(artist.zorder for artist in panel.artists) == window.zorder, "over all others"
 
 
-def test_a_film_redraws_the_window_in_every_picture(swarm_recorder, mission, tmp_path):
-    path = tmp_path / "mission.gif"
-    animate_mission(swarm_recorder.snapshots, path, **mission.scene, pictures=3)
-    _, (panel,) = _stage(swarm_recorder.snapshots, **mission.scene)
-    window = panel.closeup.artists[2]
+def test_a_film_redraws_the_window_in_every_picture(snapshots, scene, panels, tmp_path):
+    path, key = tmp_path / "mission.gif", ("fused", "fastslam")
+    animate_mission({key: snapshots[key]}, path, **scene, pictures=3)
+    _, (panel,) = staged({key: snapshots[key]}, **scene)
+    extents = panel.closeup.window.get_window_extent().extents
     pictures = []
     with Image.open(path) as film:
-        x0, y0, x1, y1 = window.get_window_extent().extents.round().astype(int)
+        x0, y0, x1, y1 = extents.round().astype(int)
         for picture in range(3):
             film.seek(picture)
             whole = np.asarray(film.convert("L"))[::-1]
@@ -129,9 +105,10 @@ def test_a_film_redraws_the_window_in_every_picture(swarm_recorder, mission, tmp
         assert np.mean(picture < 250) > 0.03, "particles, vehicle, bar and words"
 
 
-def test_a_gif_has_the_pictures_asked_for_and_rests_on_the_last(recorder, mission, tmp_path):
+def test_a_gif_has_the_pictures_asked_for_and_rests_on_the_last(snapshots, scene, tmp_path):
     path = tmp_path / "new" / "mission.gif"
-    animate_mission(recorder.snapshots, path, **mission.scene, pictures=6)
+    three = {key: frames for key, frames in snapshots.items() if key[1] == "ekf"}
+    animate_mission(three, path, **scene, pictures=6)
     with Image.open(path) as film:
         assert film.n_frames == 6
         assert film.info["loop"] == 0
@@ -141,95 +118,74 @@ def test_a_gif_has_the_pictures_asked_for_and_rests_on_the_last(recorder, missio
         for picture in range(6):
             film.seek(picture)
             durations.append(film.info["duration"])
+            assert film.convert("RGB").getpixel((0, 0)) == (255, 255, 255), "white stays white"
     assert durations == [80] * 5 + [2000]
 
 
-def test_white_stays_white_in_a_gif(recorder, tmp_path):
+def test_a_short_mission_is_shown_frame_by_frame(snapshots, tmp_path):
     path = tmp_path / "mission.gif"
-    animate_mission({("fused", "ekf"): recorder.snapshots["fused", "ekf"]}, path, pictures=2)
-    with Image.open(path) as film:
-        film.seek(1)
-        assert film.convert("RGB").getpixel((0, 0)) == (255, 255, 255)
-
-
-def test_a_short_mission_is_shown_frame_by_frame(recorder, tmp_path):
-    path = tmp_path / "mission.gif"
-    frames = recorder.snapshots["passive", "ekf"][:4]
-    animate_mission({("passive", "ekf"): frames}, path)
+    animate_mission({("passive", "ekf"): snapshots["passive", "ekf"][:4]}, path)
     with Image.open(path) as film:
         assert film.n_frames == 4
 
 
-def test_a_panel_draws_measurements_along_bearings_up_to_their_ranges(recorder, mission):
-    _, panels = _stage(recorder.snapshots, **mission.scene)
-    frame = recorder.snapshots["fused", "ekf"][100]
-    panels[1]._show_scan(frame)
+def test_a_panel_draws_measurements_along_bearings_up_to_their_ranges(snapshots, panels):
+    frame, panel = snapshots["fused", "ekf"][6], panels["fused", "ekf"]
+    panel.show_picture(0, frame.scan.time)
     ranged = np.isfinite(frame.scan.range)
     assert 0 < ranged.sum() < len(ranged), "the frame has both kinds"
-    tips = np.array([segment[1] for segment in panels[1].ranges.get_segments()])
+    tips = np.array([segment[1] for segment in panel.ranges.get_segments()])
     distance, bearing = range_and_bearing(frame.pose, tips)
     assert distance == pytest.approx(frame.scan.range[ranged])
     assert bearing == pytest.approx(frame.scan.bearing[ranged])
-    tips = np.array([segment[1] for segment in panels[1].bearings.get_segments()])
+    tips = np.array([segment[1] for segment in panel.bearings.get_segments()])
     assert range_and_bearing(frame.pose, tips)[1] == pytest.approx(frame.scan.bearing[~ranged])
 
 
-def test_a_second_excess_path_of_a_landmark_adds_no_line(recorder, mission):
-    frame = recorder.snapshots["fused", "ekf"][100]
+def test_a_second_excess_path_of_a_landmark_adds_no_line(snapshots, scene):
+    frame = snapshots["fused", "ekf"][6]
     old, k = frame.scan, len(frame.scan.landmark)
-    rows = np.append(np.arange(k), 0)
-    more = rows_of_scan(old, rows)
+    more = rows_of(old, np.append(np.arange(k), 0))
     more.numbers[:2, k], more.numbers[EXCESS_PATH, k] = np.nan, 3.0
-    panels = []
+    drawn = []
     for scan in (old, more):
-        _, (panel, *_) = _stage({("fused", "ekf"): [replace(frame, scan=scan)]}, **mission.scene)
-        panel._show_scan(panel.frames[0])
-        panels.append(panel)
+        _, (panel,) = staged({("fused", "ekf"): [replace(frame, scan=scan)]}, **scene)
+        panel.show_picture(0, scan.time)
+        drawn.append(panel)
     for lines in ("ranges", "bearings"):
-        one, other = (getattr(panel, lines).get_segments() for panel in panels)
+        one, other = (getattr(panel, lines).get_segments() for panel in drawn)
         np.testing.assert_array_equal(one, other)
 
 
-def test_a_panel_shows_the_map_and_rings_new_landmarks(recorder, mission):
-    _, panels = _stage(recorder.snapshots, **mission.scene)
-    frames = recorder.snapshots["fused", "ekf"]
+def test_a_panel_shows_the_map_and_rings_new_landmarks(snapshots, scene):
+    frames = snapshots["fused", "ekf"]
+    _, (panel,) = staged({("fused", "ekf"): frames}, **scene)
     sets = [set(f.landmarks.landmark[placed(f.landmarks)].tolist()) for f in frames]
-    step = next(i for i in range(50, 374) if sets[i + 1] > sets[i])
+    step = next(i for i in range(10, 39) if sets[i + 1] > sets[i])
     for picture in range(9):
-        panels[1].show_frame(frames[step].scan.time, picture)
-    assert len(panels[1].rings.get_paths()) == 0
-    panels[1].show_frame(frames[step + 1].scan.time, 9)
-    assert len(panels[1].rings.get_paths()) == len(sets[step + 1] - sets[step])
+        panel.show_picture(picture, frames[step].scan.time)
+    assert len(panel.rings.get_paths()) == 0
+    panel.show_picture(9, frames[step + 1].scan.time)
+    assert len(panel.rings.get_paths()) == len(sets[step + 1] - sets[step])
     rows = frames[step + 1].landmarks
-    assert len(panels[1].members.get_paths()) == int(np.sum(~placed(rows)))
-    assert len(panels[1].full.get_paths()) == len(sets[step + 1])
+    assert len(panel.members.get_paths()) == int(np.sum(~placed(rows)))
+    assert len(panel.full.get_paths()) == len(sets[step + 1])
 
 
-def test_members_without_a_successor_of_their_landmark_are_pruned():
-    before = rows_of([1, 1, 1, 2, 2], [0.7, 2.1, 6.4, 0.0, 5.0])
-    after = rows_of([1, 1, 2, 3], [2.3, 6.0, 4.0, 0.7])
-    assert pruned(before, after).tolist() == [True, False, False, True, False]
-    nothing = rows_of([], [])
-    assert pruned(before, nothing).all()
-    assert len(pruned(nothing, after)) == 0
-
-
-def test_an_mp4_without_ffmpeg_is_rejected_with_a_fix(recorder, tmp_path, monkeypatch):
+@pytest.mark.parametrize(
+    ("name", "message"),
+    [
+        ("mission.mp4", r"no ffmpeg on the PATH.*install ffmpeg or choose .*gif"),
+        ("mission.avi", r"'\.avi', expected \.gif or \.mp4"),
+        ("file/mission.gif", "cannot be written"),
+    ],
+)
+def test_a_file_that_cannot_be_written_is_refused(snapshots, tmp_path, monkeypatch, name, message):
     monkeypatch.setenv("PATH", str(tmp_path))
-    with pytest.raises(InputError, match=r"no ffmpeg on the PATH.*install ffmpeg or choose .*gif"):
-        animate_mission(recorder.snapshots, tmp_path / "mission.mp4")
-
-
-def test_an_unknown_ending_of_a_film_is_rejected(recorder, tmp_path):
-    with pytest.raises(InputError, match=r"'\.avi', expected \.gif or \.mp4"):
-        animate_mission(recorder.snapshots, tmp_path / "mission.avi")
-
-
-def test_a_path_that_cannot_be_written_is_rejected(recorder, tmp_path):
     (tmp_path / "file").touch()
-    frames = {("fused", "ekf"): recorder.snapshots["fused", "ekf"][:2]}
-    with pytest.raises(InputError, match="cannot be written"):
-        animate_mission(frames, tmp_path / "file" / "mission.gif")
+    frames = {("fused", "ekf"): snapshots["fused", "ekf"][:2]}
+    with pytest.raises(InputError, match=message):
+        animate_mission(frames, tmp_path / name)
 
 
 def test_a_film_without_frames_is_an_error(tmp_path):
@@ -237,17 +193,13 @@ def test_a_film_without_frames_is_an_error(tmp_path):
         animate_mission({}, tmp_path / "mission.gif")
 
 
-def test_the_legend_of_a_film_names_the_symbols_of_its_frames(recorder, mission, tmp_path):
-    def named(strategy, frames=slice(None)):
+def test_the_legend_of_a_film_names_the_symbols_of_its_frames(snapshots, scene):
+    full, heard = "placed landmark, 95 %", ["range and bearing", "bearing alone"]
+    rays = ["unresolved ray, 1σ, darker: likelier", "just pruned"]
+    for strategy, measured in (("active", heard[:1]), ("passive", heard[1:]), ("fused", heard)):
         key = strategy, "ekf"
-        figure, _ = _stage({key: recorder.snapshots[key][frames]}, **mission.scene)
-        return [text.get_text() for text in figure.legends[0].texts]
-
-    full = "placed landmark, 95 %"
-    rays = ["ray, 1σ, darker: likelier", "just pruned"]
-    assert named("active") == ["range and bearing", full, "beacon"]
-    assert named("passive") == ["bearing alone", *rays, full, "beacon"]
-    assert named("fused") == ["range and bearing", "bearing alone", *rays, full, "beacon"]
+        names, _ = staged({key: snapshots[key]}, **scene)
+        assert names == [*measured, full, *(rays if strategy != "active" else []), "beacon"]
 
 
 def test_a_film_without_measurements_needs_no_legend(tmp_path):
@@ -255,23 +207,19 @@ def test_a_film_without_measurements_needs_no_legend(tmp_path):
         scan=make_scan(0.0, np.empty(0), np.empty(0)),
         pose=np.zeros(3),
         covariance=np.zeros((3, 3)),
-        landmarks=rows_of([], []),
+        landmarks=no_landmarks(),
     )
     animate_mission({("active", "ekf"): [frame]}, tmp_path / "empty.gif")
     assert (tmp_path / "empty.gif").read_bytes().startswith(b"GIF89a")
 
 
-def test_a_panel_shows_at_most_two_excess_path_ellipses(timed):
-    again, snapshots = timed
-    scene = {"truth": again.drive.truth, "callers": again.callers, "beamwidth": again.beamwidth}
-    figure, panels = _stage(snapshots, **scene)
-    named = [text.get_text() for text in figure.legends[0].texts]
-    assert {"excess-path ellipse and its way", "caller as estimated"} <= set(named)
-    active, fused = panels
+def test_a_panel_shows_at_most_two_excess_path_ellipses(timed, timed_scene):
+    names, (active, fused) = staged(timed[1], **timed_scene)
+    assert {"excess-path ellipse and its way", "caller as estimated"} <= set(names)
     counts = set()
     for frame, label in zip(fused.frames, fused.resolved, strict=True):
-        for panel in panels:
-            panel.show_frame(frame.scan.time, 0)
+        for panel in (active, fused):
+            panel.show_picture(0, frame.scan.time)
         outlines, ways = fused.excess_paths.get_paths(), fused.ways.get_segments()
         expected = drawn_excess_paths(frame, label)[0]
         assert len(outlines) == len(ways) == len(fused.crossing.get_xdata()) + (len(outlines) > 1)
@@ -279,45 +227,36 @@ def test_a_panel_shows_at_most_two_excess_path_ellipses(timed):
             np.testing.assert_array_equal(outline.vertices[:121], ellipse)
         counts.add(len(outlines))
         stars = callers_at(frame).mean
+        stars = stars[np.isfinite(stars).all(axis=1)]
         np.testing.assert_array_equal(fused.callers.get_xydata(), stars)
         assert active.excess_paths.get_paths() == []
     assert {1, 2} <= counts <= {0, 1, 2}
     assert fused.excess_paths.get_clip_on()
 
 
-def test_a_mission_without_timing_shows_no_ellipses_or_callers(recorder, mission):
-    figure, panels = _stage(recorder.snapshots, **mission.scene)
-    assert "excess-path ellipse and its way" not in [t.get_text() for t in figure.legends[0].texts]
-    for panel in panels:
-        frame = panel.frames[200]
-        panel.show_frame(frame.scan.time, 0)
-        drawn = (panel.excess_paths.get_paths(), panel.ways.get_segments())
-        assert drawn == ([], [])
-        assert [len(one.get_xdata()) for one in (panel.callers, panel.crossing, panel.movers)] == [
-            0
-        ] * 3
+def test_a_mission_without_timing_shows_no_ellipses_or_callers(panels, snapshots, scene):
+    names, _ = staged(snapshots, **scene)
+    assert "excess-path ellipse and its way" not in names
+    for panel in panels.values():
+        panel.show_picture(0, panel.frames[20].scan.time)
+        assert (panel.excess_paths.get_paths(), panel.ways.get_segments()) == ([], [])
+        for dots in (panel.callers, panel.crossing, panel.movers):
+            assert len(dots.get_xdata()) == 0
 
 
-def test_a_moving_caller_is_a_star_at_its_current_position(timed):
-    again, snapshots = timed
-    boat = again.callers[2].place
-    _, panels = _stage(snapshots, truth=again.drive.truth, callers=again.callers, beamwidth=None)
+def test_a_moving_caller_is_a_star_and_leaves_its_estimated_track(timed, timed_scene):
+    names, panels = staged(timed[1], **timed_scene)
+    boat, time = timed_scene["callers"][2].place, timed_scene["truth"].time
     frame = panels[0].frames[20]
-    panels[0].show_frame(frame.scan.time, 0)
-    step = np.searchsorted(again.drive.truth.time, frame.scan.time - 1e-9)
+    panels[0].show_picture(0, frame.scan.time)
+    step = np.searchsorted(time, frame.scan.time - 1e-9)
     assert 0 < step < len(boat) - 1
     np.testing.assert_array_equal(panels[0].movers.get_xydata(), boat[[step]])
-
-
-def test_a_tracked_caller_leaves_its_estimated_track(timed):
-    again, snapshots = timed
-    figure, panels = _stage(
-        snapshots, truth=again.drive.truth, callers=again.callers, beamwidth=None
-    )
-    assert "its estimated track" in [text.get_text() for text in figure.legends[0].texts]
+    assert "its estimated track" in names
     panel = panels[1]
-    panel.show_frame(panel.times[30], 0)
+    panel.show_picture(0, panel.times[30])
     trail = panel.trails.get_xydata()
     believed = [frame.moving.mean[0] for frame in panel.frames[:31] if len(frame.moving.mean)]
     np.testing.assert_array_equal(trail[-len(believed) :], believed)
-    assert len(panel.around.get_paths()) == 1
+    full = placed(panel.frames[30].landmarks).sum()
+    assert len(panel.full.get_paths()) == full + 1, "its ellipse"

@@ -41,15 +41,24 @@ def open_stars(axes) -> np.ndarray:
     return np.concatenate([np.empty((0, 2)), *points])
 
 
-@pytest.fixture(scope="module")
-def three(mission):
-    return draw_mission(list(mission.trials.values()), **mission.scene)
+def named(figure) -> list[str]:
+    """Return the names in the legend of a figure."""
+    return [text.get_text() for text in figure.legends[0].texts]
 
 
 @pytest.fixture(scope="module")
-def six(mission, swarms):
-    trials = [trial for s in STRATEGIES for trial in (mission.trials[s], swarms[s])]
-    return draw_mission(trials, **mission.scene)
+def three(ekfs, scene):
+    return draw_mission(ekfs, **scene)
+
+
+@pytest.fixture(scope="module")
+def six(watched, scene):
+    return draw_mission(watched[0].trials, **scene)
+
+
+@pytest.fixture(scope="module")
+def excess(timed, timed_scene):
+    return draw_mission(timed[0].trials, **timed_scene)
 
 
 def test_each_strategy_has_a_map_and_three_rows_of_errors(three):
@@ -57,24 +66,25 @@ def test_each_strategy_has_a_map_and_three_rows_of_errors(three):
     assert len(three.axes) == 3 * 4
 
 
-def test_titles_contain_error_and_counts(three, mission):
-    for axes, strategy in zip(maps(three), STRATEGIES, strict=True):
-        scores = mission.trials[strategy].scores
-        counts = f"{scores.landmarks_full} of 51 landmarks placed"
-        assert words(axes) == [strategy, "EKF", f"RMSE {scores.position_rmse_m:.2f} m · {counts}"]
+def test_titles_contain_error_and_counts(three, ekfs):
+    for axes, trial in zip(maps(three), ekfs, strict=True):
+        scores = trial.scores
+        counts = f"{scores.landmarks_full} of 21 landmarks placed"
+        outcome = f"RMSE {scores.position_rmse_m:.2f} m · {counts}"
+        assert words(axes) == [trial.strategy, "EKF", outcome]
 
 
-@pytest.mark.parametrize("end", [1.0, 5.0, 20.0, 187.5, 1000.0])
-def test_time_labels_of_neighbouring_panels_do_not_touch(mission, end):
-    figure = draw_mission(list(mission.trials.values()), **mission.scene)
+def test_time_labels_of_neighbouring_panels_do_not_touch(ekfs, scene):
+    figure = draw_mission(ekfs, **scene)
     rows = figure.axes[3::4]
-    rows[0].set_xlim(0.0, end)
-    figure.canvas.draw()
-    shown = [label for axes in rows for label in axes.get_xticklabels() if label.get_text()]
-    inside = [label for label in shown if 0.0 <= label.get_position()[0] <= end]
-    boxes = sorted((b.x0, b.x1) for b in (label.get_window_extent() for label in inside))
-    assert len(boxes) >= 9
-    assert all(left[1] + 2.0 < right[0] for left, right in pairwise(boxes))
+    for end in (1.0, 5.0, 20.0, 187.5, 1000.0):
+        rows[0].set_xlim(0.0, end)
+        figure.draw_without_rendering()
+        shown = [label for axes in rows for label in axes.get_xticklabels() if label.get_text()]
+        inside = [label for label in shown if 0.0 <= label.get_position()[0] <= end]
+        boxes = sorted((b.x0, b.x1) for b in (label.get_window_extent() for label in inside))
+        assert len(boxes) >= 9
+        assert all(left[1] + 2.0 < right[0] for left, right in pairwise(boxes))
 
 
 def test_all_panels_have_the_same_scales(three):
@@ -83,28 +93,29 @@ def test_all_panels_have_the_same_scales(three):
         assert len(limits) == 1
 
 
-def test_every_landmark_is_drawn(three, mission):
-    for axes, strategy in zip(maps(three), STRATEGIES, strict=True):
-        rows = mission.trials[strategy].track.landmarks
+def test_every_landmark_is_drawn(three, ekfs):
+    for axes, trial in zip(maps(three), ekfs, strict=True):
+        rows = trial.track.landmarks
         full = int(placed(rows).sum())
         areas = [c for c in axes.collections if isinstance(c, PolyCollection)]
-        assert marks(axes, "o", 5.0) == 51, "true landmarks"
+        assert marks(axes, "o", 5.0) == 21, "true landmarks"
         assert marks(axes, "o", 2.6) == full
         drawn = [len(area.get_paths()) for area in areas if len(area.get_paths())]
         assert drawn == [part for part in (len(rows.landmark) - full, full) if part]
 
 
-def test_each_estimate_is_tied_to_its_landmark(three, mission):
-    rows = mission.trials["passive"].track.landmarks
-    lines = [c for c in maps(three)[2].collections if isinstance(c, LineCollection)]
+def test_each_estimate_is_tied_to_its_landmark(three, ekfs, scene):
+    rows = ekfs[1].track.landmarks
+    lines = [c for c in maps(three)[1].collections if isinstance(c, LineCollection)]
     (ties,) = [part for part in lines if part.zorder == 4.5]
-    true = mission.scene["truth"].landmarks[1][rows.landmark[placed(rows)] - 1]
+    true = scene["truth"].landmarks[1][rows.landmark[placed(rows)] - 1]
+    assert len(true) > 1
     assert np.allclose([path.vertices[1] for path in ties.get_paths()], true)
     assert np.allclose([path.vertices[0] for path in ties.get_paths()], rows.mean[placed(rows)])
 
 
-def test_heavier_members_of_a_ray_are_more_opaque(three, mission):
-    rows = mission.trials["passive"].track.landmarks
+def test_heavier_members_of_a_ray_are_more_opaque(three, ekfs):
+    rows = ekfs[2].track.landmarks
     weight = rows.weight[~placed(rows)]
     members = next(c for c in maps(three)[2].collections if isinstance(c, PolyCollection))
     opacity = members.get_facecolor()[:, 3]
@@ -116,42 +127,36 @@ def test_only_strategies_that_call_have_a_beam(three):
     assert patches == [2, 2, 1], "beam and vehicle, beam and vehicle, vehicle"
 
 
-def test_error_rows_show_the_errors_of_the_evaluation(three, mission):
-    track, path = mission.trials["active"].track, mission.scene["truth"].path
+def test_error_rows_show_the_errors_of_the_evaluation(three, ekfs, scene):
+    track, path = ekfs[0].track, scene["truth"].path
     _, position, _, consistency = three.axes[:4]
     assert np.array_equal(position.lines[0].get_ydata(), position_error(track.pose.mean, path))
     first = nees(track.pose.mean - path, track.pose.covariance)[:100]
     assert np.allclose(consistency.lines[0].get_ydata()[:100], first)
 
 
-def test_a_mission_without_truth_has_only_maps(mission):
-    trial = mission.trials["fused"]
-    scores = replace(trial.scores, position_rmse_m=None)
-    figure = draw_mission([replace(trial, scores=scores)])
+def test_a_mission_without_truth_has_only_maps(ekfs):
+    scores = replace(ekfs[1].scores, position_rmse_m=None)
+    figure = draw_mission([replace(ekfs[1], scores=scores)])
     assert len(figure.axes) == 1
     assert "RMSE" not in words(figure.axes[0])[2]
-    names = {text.get_text() for text in figure.legends[0].texts}
-    assert not names & {"true path", "true landmark", "beacon", "its beam"}
+    assert not {*named(figure)} & {"true path", "true landmark", "beacon", "its beam"}
+    box, height = figure.legends[0], figure.get_figheight()
+    figure.draw_without_rendering()
+    below = figure.axes[0].get_position().y0 * height
+    assert below - box.get_window_extent().y1 / figure.dpi < 0.6, "inches"
 
 
-def test_a_caller_that_moves_gets_its_line_in_the_legend_and_the_page_room_for_it(mission, three):
-    (beacon,) = mission.scene["callers"]
+def test_other_callers_have_entries_in_the_legend_and_room_for_them(ekfs, scene, three):
+    (beacon,) = scene["callers"]
     boat = replace(beacon, name="boat", place=np.zeros((9, 2)))
-    truth = mission.scene | {"callers": (beacon, boat)}
-    figure = draw_mission(list(mission.trials.values()), **truth)
-    names = [text.get_text() for text in figure.legends[0].texts]
-    assert len(names) == 9
-    assert names[5:7] == ["beacon", "moving caller"]
+    figure = draw_mission(ekfs, **scene | {"callers": (beacon, boat)})
+    assert len(named(figure)) == 9
+    assert named(figure)[5:7] == ["beacon", "moving caller"]
     assert figure.get_figheight() > three.get_figheight()  # a third row of entries
-
-
-def test_several_fixed_callers_are_a_single_legend_entry(mission, three):
-    (beacon,) = mission.scene["callers"]
     whistle = replace(beacon, name="whistle", place=-beacon.place)
-    truth = mission.scene | {"callers": (beacon, whistle)}
-    figure = draw_mission(list(mission.trials.values()), **truth)
-    names = [text.get_text() for text in figure.legends[0].texts]
-    assert names[5:7] == ["caller", "vehicle at the end"]
+    figure = draw_mission(ekfs, **scene | {"callers": (beacon, whistle)})
+    assert named(figure)[5:7] == ["caller", "vehicle at the end"]
     assert {"beacon", "whistle"} <= set(words(maps(figure)[0]))
     assert "beacon" not in words(maps(three)[0])
 
@@ -166,47 +171,28 @@ RAY, BEAM = "unresolved ray, 1σ, darker: likelier", "its beam"
 TIED, FULL = "placed landmark, 95 %, and its error", "placed landmark, 95 %"
 
 
-def named(trial, **scene) -> set[str]:
-    """What the legend of one map names."""
-    return {text.get_text() for text in draw_mission([trial], **scene).legends[0].texts}
+def names_of(trial, scene, **changes) -> set[str]:
+    """Return the names in the legend of a single map."""
+    return {*named(draw_mission([trial], **scene | changes))}
 
 
-def test_a_map_without_rays_or_without_a_call_names_none(mission):
-    active, passive = (named(mission.trials[s], **mission.scene) for s in ("active", "passive"))
+def test_the_legend_names_the_symbols_of_the_map(ekfs, trials, scene):
+    active, passive = (names_of(ekfs[i], scene) for i in (0, 2))
     assert active ^ passive == {RAY, BEAM}
     assert BEAM in active
     assert TIED in active & passive
-
-
-def test_the_legend_names_landmarks_by_their_symbols(mission):
-    trial, truth = mission.trials["active"], mission.scene["truth"]
-    unknown = mission.scene | {"truth": replace(truth, landmarks=None)}
-    assert {FULL, TIED, "true landmark"} & named(trial, **unknown) == {FULL}
-    empty = replace(trial, track=replace(trial.track, landmarks=no_landmarks()))
-    assert {FULL, TIED, "true landmark"} & named(empty, **mission.scene) == {"true landmark"}
-
-
-def test_particles_are_named_where_there_are_any(mission, swarms):
-    assert "particles" in named(swarms["fused"], **mission.scene)
-    assert "particles" not in named(mission.trials["fused"], **mission.scene)
-
-
-def test_a_vehicle_that_cannot_be_drawn_is_not_named(mission):
-    trial = mission.trials["active"]
-    mean = trial.track.pose.mean.copy()
-    mean[700:] = np.nan
-    pose = replace(trial.track.pose, mean=mean)
-    lost = named(replace(trial, track=replace(trial.track, pose=pose)), **mission.scene)
-    assert not lost & {"vehicle at the end", BEAM}
-    assert "estimated path" in lost
-
-
-def test_the_height_of_a_figure_follows_its_legend(mission):
-    figure = draw_mission([mission.trials["fused"]])
-    box, height = figure.legends[0], figure.get_figheight()
-    figure.canvas.draw()
-    below = figure.axes[0].get_position().y0 * height
-    assert below - box.get_window_extent().y1 / figure.dpi < 0.6, "inches"
+    unknown = replace(scene["truth"], landmarks=None)
+    assert {FULL, TIED, "true landmark"} & names_of(ekfs[0], scene, truth=unknown) == {FULL}
+    track = ekfs[0].track
+    empty = replace(ekfs[0], track=replace(track, landmarks=no_landmarks()))
+    assert {FULL, TIED, "true landmark"} & names_of(empty, scene) == {"true landmark"}
+    assert "particles" in names_of(trials["fused", "fastslam"], scene)
+    assert "particles" not in active
+    mean = track.pose.mean.copy()
+    mean[70:] = np.nan
+    lost = replace(ekfs[0], track=replace(track, pose=replace(track.pose, mean=mean)))
+    assert not names_of(lost, scene) & {"vehicle at the end", BEAM}
+    assert "estimated path" in names_of(lost, scene)
 
 
 def test_each_filter_has_a_row_and_each_strategy_a_column(six):
@@ -219,52 +205,46 @@ def test_each_filter_has_a_row_and_each_strategy_a_column(six):
     assert np.ptp(top, axis=0) == pytest.approx([0.0, 0.0], abs=1e-12)
     assert np.all(top[:, 1] < six.axes[3].get_position().y0), "below the errors of the first row"
     assert six.axes[7].get_position().y0 > 0.0
-
-
-def test_scales_are_written_left_of_each_row_and_nowhere_else(six):
     labelled = [axes.get_ylabel() != "" for axes in maps(six)]
     assert labelled == [True, True, False, False, False, False]
     ticks = [axes.yaxis.get_tick_params()["labelleft"] for axes in maps(six)]
     assert ticks == labelled
 
 
-def test_two_filters_of_a_strategy_are_side_by_side(mission, swarms):
-    left, right = maps(draw_mission([mission.trials["fused"], swarms["fused"]], **mission.scene))
+def test_two_filters_of_a_strategy_are_side_by_side(trials, scene):
+    two = [trials["fused", name] for name in ("ekf", "fastslam")]
+    left, right = maps(draw_mission(two, **scene))
     assert left.get_position().y0 == right.get_position().y0
     assert left.get_position().x1 < right.get_position().x0
 
 
-def test_particles_are_drawn_and_enlarged_where_there_are_any(six, swarms):
-    for axes, particles in zip(maps(six), [0, 40] * 3, strict=True):
+def test_particles_are_drawn_and_enlarged_where_there_are_any(six, three, trials):
+    for axes, particles in zip(maps(six), [0, 100] * 3, strict=True):
         assert marks(axes, "o", 1.6) == particles
         assert len(axes.child_axes) == (particles > 0)
     window = maps(six)[5].child_axes[0]
-    pose = swarms["passive"].track.pose.mean[-1]
+    pose = trials["passive", "fastslam"].track.pose.mean[-1]
     assert np.mean(window.get_xlim()) == pytest.approx(pose[0])
     assert np.mean(window.get_ylim()) == pytest.approx(pose[1])
-
-
-def test_without_particles_there_is_no_window(three):
     assert [axes.child_axes for axes in maps(three)] == [[], [], []]
 
 
-def test_a_nees_of_many_digits_is_written_as_a_power(mission):
-    trial = mission.trials["active"]
-    pose = replace(trial.track.pose, covariance=1e-8 * trial.track.pose.covariance)
-    lost = replace(trial, track=replace(trial.track, pose=pose))
-    figure = draw_mission([lost], **mission.scene)
-    figure.canvas.draw()
+def test_a_nees_of_many_digits_is_written_as_a_power(ekfs, scene):
+    pose = replace(ekfs[0].track.pose, covariance=1e-8 * ekfs[0].track.pose.covariance)
+    lost = replace(ekfs[0], track=replace(ekfs[0].track, pose=pose))
+    figure = draw_mission([lost], **scene)
+    figure.draw_without_rendering()
     labels = [label.get_text() for label in figure.axes[3].get_yticklabels()]
     assert max(len(label.strip("$").replace("10^", "")) for label in labels) <= 4
 
 
-def test_a_trial_with_infinite_errors_is_drawn_as_diverged(mission, tmp_path):
-    trial = mission.trials["active"]
+def test_a_trial_with_infinite_errors_is_drawn_as_diverged(ekfs, scene, tmp_path):
+    trial = ekfs[0]
     mean, covariance = trial.track.pose.mean.copy(), trial.track.pose.covariance.copy()
-    mean[700:], covariance[700:] = np.nan, np.inf
+    mean[70:], covariance[70:] = np.nan, np.inf
     track = replace(trial.track, pose=Gaussian(mean=mean, covariance=covariance))
     scores = replace(trial.scores, diverged=True, position_rmse_m=float("inf"))
-    figure = draw_mission([replace(trial, track=track, scores=scores)], **mission.scene)
+    figure = draw_mission([replace(trial, track=track, scores=scores)], **scene)
     save_figure(figure, tmp_path, "lost")
     assert words(maps(figure)[0])[2] == "diverged · RMSE inf m"
 
@@ -281,14 +261,10 @@ def test_without_trials_there_is_nothing_to_draw():
         draw_mission([])
 
 
-def test_drawing_keeps_the_settings_of_matplotlib(mission):
+def test_a_figure_keeps_the_settings_of_matplotlib_and_is_freed(ekfs, scene):
     before = dict(matplotlib.rcParams)
-    draw_mission([mission.trials["active"]], **mission.scene)
+    figure = weakref.ref(draw_mission(ekfs[:1], **scene))
     assert dict(matplotlib.rcParams) == before
-
-
-def test_a_figure_is_freed_when_it_is_let_go(mission):
-    figure = weakref.ref(draw_mission([mission.trials["active"]], **mission.scene))
     gc.collect()
     assert figure() is None
     assert pyplot.get_fignums() == []
@@ -299,9 +275,8 @@ def test_importing_loads_no_matplotlib_and_drawing_no_pyplot():
 import sys
 import pipistrelle.figures.film, pipistrelle.figures.mission
 print("matplotlib" in sys.modules)
-from matplotlib.figure import Figure
-from pipistrelle.figures.maps import legend
-legend(Figure(), ["beacon"], 1, 0.0, 0.0)
+from pipistrelle.figures.maps import legend_symbols
+legend_symbols()
 print("matplotlib.pyplot" in sys.modules)
 """
     run = subprocess.run(
@@ -310,30 +285,23 @@ print("matplotlib.pyplot" in sys.modules)
     assert run.stdout.split() == ["False", "False"]
 
 
-def test_estimated_callers_are_marked_with_excess_paths(timed, three):
-    again, _ = timed
-    figure = draw_mission(again.trials, truth=again.drive.truth, callers=again.callers)
-    named = [text.get_text() for text in figure.legends[0].texts]
-    assert named.index("caller as estimated") == named.index("caller") + 2, "a moving one between"
-    for axes, trial in zip(maps(figure), again.trials, strict=True):
+def test_estimated_callers_are_marked_with_excess_paths(timed, excess, three):
+    names = named(excess)
+    assert names.index("caller as estimated") == names.index("caller") + 2, "a moving one between"
+    for axes, trial in zip(maps(excess), timed[0].trials, strict=True):
         rows = trial.track.landmarks
         full = placed(rows) & np.isin(rows.landmark, [9, 10])
         assert full.any()
         ends = [caller.mean[-1:] for caller in trial.track.callers.values()]
         np.testing.assert_array_equal(open_stars(axes), np.concatenate([rows.mean[full], *ends]))
-    assert "caller as estimated" not in [text.get_text() for text in three.legends[0].texts]
+    assert "caller as estimated" not in named(three)
     for axes in maps(three):
         assert len(open_stars(axes)) == 0
 
 
-def test_excess_paths_of_the_last_scan_are_ellipses(timed, three, mission):
-    again, _ = timed
-    trial = next(trial for trial in again.trials if trial.strategy == "fused")
-    figure = draw_mission([trial], truth=again.drive.truth, callers=again.callers)
-    assert "excess-path ellipse and its way" in [
-        text.get_text() for text in figure.legends[0].texts
-    ]
-    (axes,), scan = maps(figure), trial.scans[-1]
+def test_excess_paths_of_the_last_scan_are_ellipses(excess, three, timed_fused):
+    assert "excess-path ellipse and its way" in named(excess)
+    axes, trial, scan = maps(excess)[1], timed_fused, timed_fused.scans[-1]
     lines = [part for part in axes.collections if isinstance(part, LineCollection)]
     ways = [way for part in lines for way in part.get_segments() if way.shape == (3, 2)]
     k = int(np.searchsorted(trial.track.time, scan.time))
@@ -342,36 +310,26 @@ def test_excess_paths_of_the_last_scan_are_ellipses(timed, three, mission):
         np.testing.assert_array_equal(vehicle, trial.track.pose.mean[k, :2])
         e = np.hypot(*(spot - caller)) + np.hypot(*(spot - vehicle)) - np.hypot(*(caller - vehicle))
         assert np.nanmin(np.abs(scan.excess_path - e)) < 0.5
-    assert "excess-path ellipse and its way" not in named(
-        mission.trials["passive"], **mission.scene
-    )
+    assert "excess-path ellipse and its way" not in named(three)
 
 
-def test_a_tracked_caller_is_drawn_with_its_track(timed, mission):
-    again, _ = timed
-    figure = draw_mission(again.trials, truth=again.drive.truth, callers=again.callers)
-    assert "its estimated track" in [text.get_text() for text in figure.legends[0].texts]
-    fused = next(trial for trial in again.trials if trial.strategy == "fused")
-    (track,) = fused.track.callers.values()
+def test_a_tracked_caller_is_drawn_with_its_track(excess, three, timed_fused):
+    assert "its estimated track" in named(excess)
+    (track,) = timed_fused.track.callers.values()
     known = track.mean[np.isfinite(track.mean).all(axis=1)]
-    axes = maps(figure)[again.trials.index(fused)]
+    axes = maps(excess)[1]
     drawn = [line.get_xydata() for line in axes.lines if line.get_linestyle() == ":"]
     assert len(known) > 20
     np.testing.assert_array_equal(drawn[0], known)
     np.testing.assert_array_equal(open_stars(axes)[-1], known[-1])
-    assert "its estimated track" not in named(mission.trials["fused"], **mission.scene)
+    assert "its estimated track" not in named(three)
 
 
-def test_a_caller_out_of_sight_at_the_end_has_no_star(timed):
-    again, _ = timed
-    fused = next(trial for trial in again.trials if trial.strategy == "fused")
-    (label,) = fused.track.callers
-    lost = fused.track.callers[label]
+def test_a_caller_out_of_sight_at_the_end_has_no_star(timed_fused, timed_scene):
+    ((label, lost),) = timed_fused.track.callers.items()
     mean = np.where(np.arange(len(lost.mean))[:, None] < 100, lost.mean, np.nan)
-    track = replace(fused.track, callers={label: replace(lost, mean=mean)})
-    figure = draw_mission(
-        [replace(fused, track=track)], truth=again.drive.truth, callers=again.callers
-    )
+    track = replace(timed_fused.track, callers={label: replace(lost, mean=mean)})
+    figure = draw_mission([replace(timed_fused, track=track)], **timed_scene)
     known = mean[np.isfinite(mean).all(axis=1)]
     lines = [line.get_xydata() for line in maps(figure)[0].lines]
     assert any(np.array_equal(line, known) for line in lines)

@@ -1,4 +1,4 @@
-"""The excess paths shown at a frame, and their ellipses through the landmark."""
+"""The recorded frames, the excess paths shown at each, and their ellipses."""
 
 from dataclasses import replace
 
@@ -6,17 +6,16 @@ import numpy as np
 import pytest
 
 from pipistrelle.detection.scans import UNLABELLED, make_scan
-from pipistrelle.estimation.beliefs import some_of
+from pipistrelle.estimation.beliefs import no_landmarks, some_of
 from pipistrelle.estimation.measurement import excess_path_of
+from pipistrelle.figures.maps import drawn_excess_paths
 from pipistrelle.figures.recorder import (
-    MAX_ELLIPSES,
     RECENT_FRAMES,
     Snapshot,
     callers_at,
-    callers_believed,
     callers_marked,
-    drawn_excess_paths,
     excess_paths_at,
+    pruned,
     resolved,
 )
 from reference.missions import map_with
@@ -47,11 +46,36 @@ def frame_of(members, heard, ranged=()):
     )
 
 
+def test_a_recorder_keeps_every_frame_of_every_estimate(watched):
+    done, snapshots = watched
+    assert list(snapshots) == [(trial.strategy, trial.filter) for trial in done.trials]
+    for trial in done.trials:
+        frames = snapshots[trial.strategy, trial.filter]
+        assert len(frames) == 40
+        assert all(frame.scan is scan for frame, scan in zip(frames, trial.scans, strict=True))
+        np.testing.assert_array_equal([frame.pose for frame in frames], trial.track.pose.mean[4::4])
+        if trial.filter == "fastslam":
+            np.testing.assert_array_equal(frames[-1].cloud, trial.track.cloud)
+        else:
+            assert frames[0].cloud is None
+
+
+def test_members_without_a_successor_of_their_landmark_are_pruned():
+    def rows(labels, x):
+        return map_with(labels, np.column_stack([x, np.zeros(len(x))]))
+
+    before = rows([1, 1, 1, 2, 2], [0.7, 2.1, 6.4, 0.0, 5.0])
+    after = rows([1, 1, 2, 3], [2.3, 6.0, 4.0, 0.7])
+    assert pruned(before, after).tolist() == [True, False, False, True, False]
+    assert pruned(before, no_landmarks()).all()
+    assert len(pruned(no_landmarks(), after)) == 0
+
+
 def test_callers_are_believed_where_their_landmark_is_once_it_is_placed():
     rows = map_with(
         [91, 92, 92], [[1.0, 2.0], [3.0, 4.0], [5.0, 6.0]], np.tile(np.eye(2), (3, 1, 1))
     )
-    known = callers_believed(rows, LABELS)
+    known = callers_at(replace(frame_of({}, [(5, 1)]), landmarks=rows))
     np.testing.assert_array_equal(known.mean[1], [1.0, 2.0])
     np.testing.assert_array_equal(known.covariance[1], np.eye(2))
     assert np.isnan(known.mean[[0, 2, 3]]).all(), "the vehicle, a ray, and one never heard"
@@ -70,9 +94,9 @@ def test_an_excess_path_ellipse_passes_through_its_landmark():
 def test_of_three_excess_paths_two_are_drawn_that_cross_most_squarely():
     frame = frame_of({5: 1}, [(5, 2), (5, 3), (5, 1)])
     rows = excess_paths_at(frame)[5]
-    assert len(rows) == 3
-    assert 1 in frame.scan.caller[rows[:MAX_ELLIPSES]], "two and three stand beside each other"
-    assert len(drawn_excess_paths(frame, 5)[0]) == MAX_ELLIPSES == 2
+    assert len(rows) == 2
+    assert 1 in frame.scan.caller[rows], "two and three stand beside each other"
+    assert len(drawn_excess_paths(frame, 5)[0]) == 2
     assert len(drawn_excess_paths(frame_of({5: 1}, [(5, 2), (5, 3)]), 5)[0]) == 2
 
 
@@ -123,10 +147,9 @@ def test_between_equals_the_shown_or_doubly_measured_landmark_wins():
     assert resolved([frame_of({5: 2, 6: 2}, one), frame_of({5: 2, 6: 2}, both)]) == [5, 5]
 
 
-def test_a_mission_without_timing_has_no_ellipse_and_its_one_beacon_no_mark(mission):
-    for frames in mission.watched.values():
-        scans = [scan for scan, _ in frames]
-        assert not callers_marked(scans)
+def test_a_mission_without_timing_has_no_ellipse_and_its_one_beacon_no_mark(watched):
+    for frames in watched[1].values():
+        assert not callers_marked([frame.scan for frame in frames])
     silent = make_scan(0.0, np.array([5]), np.zeros(1))
     assert not callers_marked([replace(silent, callers=LABELS[:2])])
     assert callers_marked([replace(silent, callers=LABELS)]), "several"

@@ -5,6 +5,8 @@ A `Chart` holds panels, a `Panel` holds series over common axes. `draw_chart` dr
 the styles of series for both; a new style is a new row.
 """
 
+import csv
+import io
 import math
 import textwrap
 from collections.abc import Iterable, Sequence
@@ -14,7 +16,7 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 from jaxtyping import Float
 
-from pipistrelle.figures.style import INK, MAX_COLUMNS, STYLE, TRUTH, strategy_colour
+from pipistrelle.figures.style import INK, MAX_COLUMNS, STYLE, TRUTH, picture, strategy_colour
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -71,14 +73,8 @@ WIDTH = {1: 6.0, 2: 9.0, 3: 12.0}
 """Width of a figure by its number of columns [inch]."""
 ROW, REST = 3.3, 0.8
 """Height of a row of panels, and of title and legend together [inch]."""
-TEXT = {"grid": "#8a8a8a"}
-"""Colours of text for roles whose colour is too faint."""
 PLAIN = {"text.parse_math": False}
 """Names are not parsed as mathematics: they may contain dollar signs."""
-LETTER = 0.065
-"""Width of a letter of the legend [inch]."""
-BAND = 0.15
-"""Opacity of a band."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -160,11 +156,6 @@ def ticks(low: float, high: float, log: bool = False) -> tuple[tuple[float, str]
 
     `low` is below `high`, and above 0 on a logarithmic axis. `log`: powers of ten, with 3 in
     between if they are fewer than three; linear ticks if fewer than two remain.
-
-    Examples
-    --------
-    >>> [text for _, text in ticks(0.0, 0.93)], [text for _, text in ticks(0.8, 250.0, log=True)]
-    (['0', '0.2', '0.4', '0.6', '0.8'], ['1', '10', '100'])
     """
     from matplotlib.ticker import LogLocator, MaxNLocator
 
@@ -201,26 +192,14 @@ def linear_axis(label: str, values: Iterable[float], *, floor: float | None = No
 
 
 def log_axis(label: str, values: Iterable[float]) -> Axis:
-    """Return a logarithmic axis that contains all finite positive values.
-
-    Examples
-    --------
-    >>> log_axis("NEES", [1.0, 100.0]).ticks
-    ((1.0, '1'), (10.0, '10'), (100.0, '100'))
-    """
+    """Return a logarithmic axis that contains all finite positive values."""
     finite = [value for value in values if math.isfinite(value) and value > 0.0] or [1.0, 10.0]
     limits = (0.9 * min(finite), 1.12 * max(finite))
     return Axis(label=label, limits=limits, log=True, ticks=ticks(*limits, log=True))
 
 
 def ends(found: Iterable[Series]) -> list[float]:
-    """Return all y values of some series, with the ends of their bands.
-
-    Examples
-    --------
-    >>> ends([Series(name="", role="ink", x=np.zeros(1), y=np.ones(1), high=np.full(1, 2.0))])
-    [1.0, 2.0]
-    """
+    """Return all y values of some series, with the ends of their bands."""
     return [
         float(value)
         for series in found
@@ -235,11 +214,6 @@ def columns_of(count: int) -> int:
 
     Up to `style.MAX_COLUMNS` panels are in a single row; more have that many columns if they fill
     their rows, otherwise two.
-
-    Examples
-    --------
-    >>> [columns_of(count) for count in (1, 3, 4, 6)]
-    [1, 3, 2, 3]
     """
     if count <= MAX_COLUMNS:
         return count
@@ -247,15 +221,7 @@ def columns_of(count: int) -> int:
 
 
 def legend_series(panels: Iterable[Panel]) -> dict[str, Series]:
-    """Return the series of a legend by name; empty for more than `MOST_NAMES` names.
-
-    Examples
-    --------
-    >>> axis = Axis(label="", limits=(0.0, 1.0), ticks=())
-    >>> dot = Series(name="fused", role="fused", x=np.ones(1), y=np.ones(1), style="points")
-    >>> list(legend_series([Panel(title="", x=axis, y=axis, series=(dot,))] * 2))
-    ['fused']
-    """
+    """Return the series of a legend by name; empty for more than `MOST_NAMES` names."""
     named = {s.name: s for panel in panels for s in panel.series if s.listed and explained(s)}
     return named if len(named) <= MOST_NAMES else {}
 
@@ -270,15 +236,6 @@ def csv_rows(chart: Chart, **constant: str) -> list[list[str]]:
     """Return the numbers of a chart with nine digits, a row per point.
 
     `constant`: first columns with the same value in all rows.
-
-    Examples
-    --------
-    >>> axis = Axis(label="", limits=(0.0, 1.0), ticks=())
-    >>> dot = Series(name="fused", role="fused", x=np.array([33.0]), y=np.array([0.25]))
-    >>> panel = Panel(title="EKF", x=axis, y=axis, series=(dot,))
-    >>> chart = Chart(name="", title="", caption="", panels=(panel,), columns=("deg", "m"))
-    >>> csv_rows(chart)[1]
-    ['EKF', 'fused', 'line', '33', '0.25', '', '']
     """
     x, y = chart.columns
     rows = [[*constant, "panel", "series", "kind", x, y, f"{y}_low", f"{y}_high"]]
@@ -304,33 +261,15 @@ def _place(axis: Axis, value: float) -> str:
 
 
 def csv_text(rows: Sequence[Sequence[str]]) -> str:
-    r"""Return rows as CSV, with quotes around fields that need them.
-
-    Examples
-    --------
-    >>> csv_text([["a", "b"], ["1,5", "2"]])
-    'a,b\n"1,5",2\n'
-    """
-    import csv
-    import io
-
+    """Return rows as CSV, with quotes around fields that need them."""
     text = io.StringIO()
     csv.writer(text, lineterminator="\n").writerows(rows)
     return text.getvalue()
 
 
 def draw_chart(chart: Chart) -> "Figure":
-    """Draw a chart; raise ValueError without panels.
-
-    Examples
-    --------
-    >>> draw_chart(Chart(name="", title="", caption="", panels=(), columns=("x", "y")))
-    Traceback (most recent call last):
-    ValueError: a chart's figure needs at least one panel
-    """
+    """Draw a chart; raise ValueError without panels."""
     import matplotlib
-
-    from pipistrelle.figures.picture import picture
 
     count = len(chart.panels)
     if count == 0:
@@ -351,7 +290,7 @@ def draw_chart(chart: Chart) -> "Figure":
             _draw_panel(axes, panel)
         if handles := [_handle(*named) for named in legend_series(chart.panels).items()]:
             longest = max(len(handle.get_label()) for handle in handles)
-            fitting = max(1, int(size[0] / (0.5 + LETTER * longest)))
+            fitting = max(1, int(size[0] / (0.5 + 0.065 * longest)))  # inches of a letter
             ncols = min(len(handles), 6, fitting)
             figure.legend(handles=handles, loc="outside lower left", ncols=ncols)
     return figure
@@ -374,9 +313,9 @@ def _draw_panel(axes: "Axes", panel: Panel) -> None:
     else:
         axes.grid(True)
     axes.set_axisbelow(True)
-    axes.set(xscale=_scale(panel.x), yscale=_scale(panel.y))
-    axes.set(xlim=panel.x.limits, ylim=panel.y.limits, xlabel=panel.x.label, ylabel=panel.y.label)
-    for axis, given in ((axes.xaxis, panel.x), (axes.yaxis, panel.y)):
+    for name, axis, given in (("x", axes.xaxis, panel.x), ("y", axes.yaxis, panel.y)):
+        scale = "log" if given.log else "linear"
+        axes.set(**{f"{name}scale": scale, f"{name}lim": given.limits, f"{name}label": given.label})
         axis.set_minor_locator(NullLocator())
         axis.set_ticks([value for value, _ in given.ticks], [text for _, text in given.ticks])
         if given.slanted:
@@ -392,10 +331,6 @@ def _draw_panel(axes: "Axes", panel: Panel) -> None:
         _draw_series(axes, series, panel.y.limits[1], 2.0 + 0.01 * order)
 
 
-def _scale(axis: Axis) -> str:
-    return "log" if axis.log else "linear"
-
-
 def _draw_series(axes: "Axes", series: Series, top: float, order: float) -> None:
     """Draw a series in the style of its mark."""
     mark = MARKS[series.style]
@@ -403,9 +338,9 @@ def _draw_series(axes: "Axes", series: Series, top: float, order: float) -> None
     given: dict[str, Any] = {"color": colour, "alpha": alpha, "zorder": order}
     x, y = series.x, series.y
     if mark.written:
+        style = {"color": TRUTH if series.role == "grid" else colour, "ha": "center"}
         for at, up, text in zip(x, y, series.tips, strict=True):
-            axes.text(at, up, text, color=TEXT.get(series.role, colour), ha="center", va="center",
-                      fontsize=8, zorder=order)  # fmt: skip
+            axes.text(at, up, text, va="center", fontsize=8, zorder=order, **style)
         return
     if mark.pinned:
         inside = y <= top
@@ -416,11 +351,9 @@ def _draw_series(axes: "Axes", series: Series, top: float, order: float) -> None
     if series.low is not None and series.high is not None:
         if mark.spread == "bars":
             axes.vlines(x, series.low, series.high, lw=1.6, **given)
-        else:
-            below = order - 0.5  # every band under every line
-            axes.fill_between(
-                x, series.low, series.high, color=colour, alpha=BAND, lw=0, zorder=below
-            )
+        else:  # every band under every line
+            band = {"color": colour, "alpha": 0.15, "lw": 0, "zorder": order - 0.5}
+            axes.fill_between(x, series.low, series.high, **band)
     if mark.joined:
         axes.plot(x, y, lw=1.4, ls=(0, (4, 3)) if series.dashed else "-", **given)
     if mark.symbol:

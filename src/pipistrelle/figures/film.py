@@ -10,54 +10,24 @@ import shutil
 import subprocess
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 from jaxtyping import Float, UInt8
 
 from pipistrelle.acoustics.paths import Caller, moves
 from pipistrelle.config import InputError
-from pipistrelle.detection.scans import UNLABELLED
 from pipistrelle.estimation.beliefs import Landmarks, placed
 from pipistrelle.experiments.drives import NO_TRUTH, Truth
-from pipistrelle.figures.maps import (
-    RAY,
-    MapPanel,
-    add_closeups,
-    callers_shown,
-    cells,
-    draw_truth,
-    ellipses,
-    head,
-    legend,
-    shades,
-    view,
-)
-from pipistrelle.figures.recorder import (
-    Snapshot,
-    callers_at,
-    callers_believed,
-    callers_marked,
-    drawn_excess_paths,
-    heard_from,
-    pruned,
-    resolved,
-)
+from pipistrelle.figures.maps import RAY, RIGHT, MapPanel, draw_maps, ellipses, shades
+from pipistrelle.figures.recorder import Snapshot, heard_from, pruned
 from pipistrelle.figures.style import INK, STRATEGY_COLOURS, STYLE
 
 if TYPE_CHECKING:
-    from matplotlib.artist import Artist
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
-    from matplotlib.text import Annotation
     from PIL.Image import Image
 
-WIDTH, LEFT, RIGHT, TOP, BOTTOM, GAP, LINE = 3.66, 0.58, 0.12, 0.58, 0.54, 0.16, 0.19
-"""Width of a panel; margins, the space between panels and a line of the legend [inch]."""
-DPI = 100
-"""Pixels per inch."""
-VEHICLE = 0.055
-"""Length of the vehicle as a share of the map's width."""
 RINGED_PICTURES = 4
 """Pictures in which a landmark is ringed after its initialisation."""
 Pictures = Iterable[UInt8[np.ndarray, "h w 3"]]
@@ -109,10 +79,16 @@ def animate_mission(
     write = film_writer(path)
     if not any(snapshots.values()):
         raise ValueError("an animation needs at least one frame")
+    longest = max(snapshots.values(), key=len)
+    # Evenly spaced from the last frame backwards.
+    chosen = np.linspace(len(longest) - 1, 0, min(pictures, len(longest))).round().astype(int)
+    times = np.array([longest[i].scan.time for i in chosen[::-1]])
+    start = times[0] if truth.path is None else truth.time[0]
+    panels = [
+        FilmPanel(case, frames, beamwidth, truth, callers) for case, frames in snapshots.items()
+    ]
     with matplotlib.rc_context(STYLE):
-        times = _times(snapshots, pictures)
-        start = times[0] if truth.path is None else truth.time[0]
-        figure, panels = _stage(snapshots, truth, callers, beamwidth)
+        figure, _ = draw_maps(panels, truth, callers)
         try:
             write(_play(figure, panels, times, start), path)
         except OSError as error:
@@ -122,191 +98,99 @@ def animate_mission(
             ) from None
 
 
-def _times(
-    snapshots: Mapping[tuple[str, str], Sequence[Snapshot]], pictures: int
-) -> Float[np.ndarray, " p"]:
-    """Return evenly spaced times of the longest recording, with the last."""
-    frames = max(snapshots.values(), key=len)
-    chosen = np.linspace(len(frames) - 1, 0, min(pictures, len(frames))).round().astype(int)[::-1]
-    return np.array([frames[i].scan.time for i in chosen])
-
-
-def _symbols(snapshots: Mapping[tuple[str, str], Sequence[Snapshot]]) -> list[str]:
-    """Return the names of all symbols in any of the frames, in the order of the legend."""
-    recorded = list(snapshots.values())
-    frames = [frame for seen in recorded for frame in seen]
-    ranged = [np.isfinite(heard_from(frame.scan).range) for frame in frames]
-    full = [placed(frame.landmarks) for frame in frames]
-    rays = any(not rows.all() for rows in full)
-    drawn = {
-        "range and bearing": any(rows.any() for rows in ranged),
-        "bearing alone": any(not rows.all() for rows in ranged),
-        "ray, 1σ, darker: likelier": rays,
-        "just pruned": rays,
-        "placed landmark, 95 %": any(rows.any() for rows in full),
-        "excess-path ellipse and its way": any(
-            set(resolved(seen)) - {UNLABELLED} for seen in recorded
-        ),
-        "caller as estimated": any(
-            callers_marked([frame.scan for frame in seen])
-            and any(np.isfinite(callers_at(frame).mean).any() for frame in seen)
-            for seen in recorded
-        ),
-        "its estimated track": any(len(frame.moving.landmark) for frame in frames),
-    }
-    return [name for name, is_drawn in drawn.items() if is_drawn]
-
-
-def _stage(
-    snapshots: Mapping[tuple[str, str], Sequence[Snapshot]],
-    truth: Truth,
-    callers: Sequence[Caller],
-    beamwidth: float | None,
-) -> tuple["Figure", list["_FilmPanel"]]:
-    """Return the figure with its fixed artists, and the panels with the animated ones."""
-    from matplotlib.figure import Figure
-
-    paths = [np.array([frame.pose for frame in frames]) for frames in snapshots.values()]
-    maps = [frames[-1].landmarks for frames in snapshots.values()]
-    limits = view(truth, callers, paths, maps)
-    (left, right), (bottom, top) = limits
-    places = cells(list(snapshots))
-    rows, columns = (1 + max(indices) for indices in zip(*places, strict=True))
-    names = [*_symbols(snapshots), *sorted(callers_shown(callers))]
-    foot = LINE * -(-len(names) // (2 * columns))
-    high = TOP + WIDTH * (top - bottom) / (right - left) + BOTTOM
-    size = np.array([LEFT + RIGHT + columns * (WIDTH + GAP) - GAP, rows * high + foot])
-    width, height = 2.0 * np.ceil(size * DPI / 2.0) / DPI
-    figure = Figure(figsize=(width, height), dpi=DPI)
-    panels = []
-    for (row, column), ((strategy, name), frames) in zip(places, snapshots.items(), strict=True):
-        x, y = LEFT + column * (WIDTH + GAP), height - (row + 1) * high + BOTTOM
-        box = (x / width, y / height, WIDTH / width, (high - TOP - BOTTOM) / height)
-        axes = figure.add_axes(box)
-        axes.set(xlim=limits[0], ylim=limits[1], aspect="equal", xlabel="x [m]")
-        leftmost = (row, column - 1) not in places
-        axes.set_ylabel("y [m]" if leftmost else "")
-        axes.tick_params(labelleft=leftmost)
-        axes.grid(True)
-        axes.set_axisbelow(True)
-        draw_truth(axes, truth.landmarks, callers)
-        line = head(axes, strategy, name)
-        own_beam = None if strategy == "passive" else beamwidth
-        panels.append(_FilmPanel(axes, line, frames, strategy, truth, callers, own_beam))
-    clouds = [[f.cloud for f in frames if f.cloud is not None] for frames in snapshots.values()]
-    add_closeups(panels, clouds, paths, [rows.mean for rows in maps], truth.landmarks)
-    for panel in panels:
-        for artist in panel.artists:
-            artist.set_animated(True)
-    legend(figure, names, 2 * columns, LEFT, RIGHT)
-    return figure, panels
-
-
 def _play(
-    figure: "Figure", panels: Sequence["_FilmPanel"], times: Float[np.ndarray, " p"], start: float
+    figure: "Figure", panels: Sequence["FilmPanel"], times: Float[np.ndarray, " p"], start: float
 ) -> Iterator[UInt8[np.ndarray, "h w 3"]]:
-    """Yield the pictures: the animated artists on copies of the background."""
+    """Yield the pictures: the artists that change, from back to front, on copies of the others."""
+    from matplotlib.artist import Artist
     from matplotlib.backends.backend_agg import FigureCanvasAgg
 
+    figure.set_dpi(100)
     canvas = FigureCanvasAgg(figure)
     place = (1.0 - RIGHT / figure.get_figwidth(), 1.0 - 0.14 / figure.get_figheight())
     clock = figure.text(*place, "", ha="right", va="top", fontsize=12, animated=True)
+    for panel in panels:
+        panel.artists.append(panel.line)
+        for artist in panel.artists:
+            artist.set_animated(True)
     canvas.draw()
     background = canvas.copy_from_bbox(figure.bbox)
     for picture, time in enumerate(times):
         canvas.restore_region(background)
         for panel in panels:
-            panel.show_frame(time, picture)
-            for artist in panel.artists:
+            panel.show_picture(picture, time)
+            for artist in sorted(panel.artists, key=Artist.get_zorder):
                 panel.axes.draw_artist(artist)
         clock.set_text(f"{time - start:.1f} s")
         figure.draw_artist(clock)
-        yield np.asarray(canvas.buffer_rgba())[:, :, :3].copy()
+        drawn = np.asarray(canvas.buffer_rgba())
+        high, wide = (side // 2 * 2 for side in drawn.shape[:2])
+        yield drawn[:high, :wide, :3].copy()
 
 
-class _FilmPanel(MapPanel):
+class FilmPanel(MapPanel):
     """A map with the measurements and the changes of each frame."""
 
     def __init__(
         self,
-        axes: "Axes",
-        line: "Annotation",
+        case: tuple[str, str],
         frames: Sequence[Snapshot],
-        strategy: str,
+        beamwidth: float | None,
         truth: Truth,
         callers: Sequence[Caller],
-        beamwidth: float | None,
     ) -> None:
-        from matplotlib.collections import LineCollection, PolyCollection
-
-        super().__init__(axes, strategy, VEHICLE, beamwidth)
-        self.line, self.frames, self.truth = line, frames, truth
+        super().__init__(case, frames, beamwidth)
         self.times = np.array([frame.scan.time for frame in frames])
-        self.path = np.array([frame.pose for frame in frames])
-        self.resolved = resolved(frames)
-        self.marked = callers_marked([frame.scan for frame in frames])
-        labels = sorted({label for frame in frames for label in frame.moving.landmark.tolist()})
-        self.tracks = [
-            np.array([callers_believed(frame.moving, np.array([n])).mean[0] for frame in frames])
-            for n in labels
-        ]
         paths = [np.asarray(caller.place) for caller in callers if moves(caller)]
         self.moving = [path for path in paths if len(path) == len(truth.time)]
-        self.rows, self.first_picture = frames[0].landmarks, {}
-        star: dict[str, Any] = {"ms": 12, "mfc": INK, "mec": "white", "mew": 0.8}
-        self.pruned = PolyCollection([], fc="none", ec=INK, lw=0.8, ls=":")
-        dashed = {"lw": 0.7, "ls": (0, (4, 3)), "alpha": 0.6}
-        self.bearings = LineCollection([], colors=self.colour, **dashed)
-        self.ranges = LineCollection([], colors=self.colour, lw=1.4)
-        self.rings = PolyCollection([], fc="none", lw=1.6)
-        for artist in (self.pruned, self.bearings, self.ranges, self.rings):
-            axes.add_collection(artist, autolim=False)
-        self.crossing = axes.plot([], [], "o", ms=4.0, mfc=INK, mec="none")[0]
-        self.movers = axes.plot([], [], "*", **star)[0]
+        self.truth, self.rows, self.first_picture = truth, frames[0].landmarks, {}
 
-    @property
-    def artists(self) -> "list[Artist]":
-        """The animated artists, from back to front."""
-        window = self.closeup.artists if self.closeup else ()
-        lit = () if self.beamwidth is None else (self.beam,)
-        return [
-            *lit, self.members, self.pruned, self.true, self.excess_paths, self.ways,
-            self.bearings, self.ranges, self.full, self.dots, self.crossing, self.rings,
-            self.trails, self.around, self.movers, self.callers, self.estimated, self.vehicle,
-            self.line, *window,
-        ]  # fmt: skip
+    def symbols(self) -> set[str]:
+        """Return the names of the symbols in any of the frames."""
+        ranged = [np.isfinite(heard_from(frame.scan).range) for frame in self.frames]
+        drawn = {
+            "range and bearing": any(rows.any() for rows in ranged),
+            "bearing alone": any(not rows.all() for rows in ranged),
+            "just pruned": any(not placed(frame.landmarks).all() for frame in self.frames),
+        }
+        return super().symbols() | {name for name, is_drawn in drawn.items() if is_drawn}
 
-    def show_frame(self, time: float, picture: int) -> None:
-        """Show the latest frame at a time."""
-        now = max(int(np.searchsorted(self.times, time, side="right")) - 1, 0)
-        frame, true = self.frames[now], None
-        if self.truth.path is not None:
-            true = self.truth.path[self.truth.time <= time + 1e-9]
-            positions = [path[len(true) - 1] for path in self.moving]
-            self.movers.set_data(*np.reshape(positions, (-1, 2)).T)
-        outlines, ways = drawn_excess_paths(frame, self.resolved[now])
-        self.show(
-            self.path[: now + 1],
-            frame.landmarks,
-            true_path=true,
-            cloud=frame.cloud,
-            excess_paths=(outlines, ways),
-            callers=callers_at(frame).mean if self.marked else None,
-            moving=frame.moving,
-            trails=[track[: now + 1] for track in self.tracks],
+    def draw_on(self, axes: "Axes") -> None:
+        """Add the artists of the map and of the changes, empty until they are shown."""
+        from matplotlib.collections import LineCollection, PolyCollection
+        from matplotlib.lines import Line2D
+
+        super().draw_on(axes)
+        star = {"marker": "*", "ms": 12, "mfc": INK, "mec": "white", "mew": 0.8}
+        dashed = {"lw": 0.7, "ls": (0, (4, 3)), "alpha": 0.6, "zorder": 3.6}
+        self.pruned = self.add(PolyCollection([], fc="none", ec=INK, lw=0.8, ls=":", zorder=1.9))
+        self.bearings = self.add(LineCollection([], colors=self.colour, **dashed))
+        self.ranges = self.add(LineCollection([], colors=self.colour, lw=1.4, zorder=3.6))
+        self.crossing = self.add(
+            Line2D([], [], ls="", marker="o", ms=4.0, mfc=INK, mec="none", zorder=5.2)
         )
-        self.crossing.set_data(*np.reshape([way[1] for way in ways[:1]], (-1, 2)).T)
-        self._show_scan(frame)
-        self._show_changes(frame.landmarks, picture)
+        self.rings = self.add(PolyCollection([], fc="none", lw=1.6, zorder=5.3))
+        self.movers = self.add(Line2D([], [], ls="", zorder=5.4, **star))
 
-    def _show_scan(self, frame: Snapshot) -> None:
-        """Show ranges as lines of their length, bearings without range as lines out of the map."""
+    def show_picture(self, picture: int, time: float) -> None:
+        """Show the latest frame at a time, and its changes since the last picture."""
+        now = max(int(np.searchsorted(self.times, time, side="right")) - 1, 0)
+        frame, true_path = self.frames[now], None
+        if self.truth.path is not None:
+            true_path = self.truth.path[self.truth.time <= time + 1e-9]
+            positions = [path[len(true_path) - 1] for path in self.moving]
+            self.movers.set_data(*np.reshape(positions, (-1, 2)).T)
+        tracks = [track[: now + 1] for track in self.tracks]
+        self.show(now, self.path[: now + 1], true_path, tracks)
+        crossings = [way[1] for way in self.ways.get_segments()[:1]]
+        self.crossing.set_data(*np.reshape(crossings, (-1, 2)).T)
         scan, origin = heard_from(frame.scan), frame.pose[:2]
         angle, ranged = frame.pose[2] + scan.bearing, np.isfinite(scan.range)
         reach = np.where(ranged, scan.range, self.size)
         tip = origin + reach[:, None] * np.column_stack([np.cos(angle), np.sin(angle)])
         self.ranges.set_segments([np.stack([origin, end]) for end in tip[ranged]])
         self.bearings.set_segments([np.stack([origin, end]) for end in tip[~ranged]])
+        self._show_changes(frame.landmarks, picture)
 
     def _show_changes(self, rows: Landmarks, picture: int) -> None:
         """Show members pruned since the last picture, and rings around new landmarks."""
@@ -327,15 +211,9 @@ class _FilmPanel(MapPanel):
 
 
 def film_writer(path: Path) -> Callable[[Pictures, Path], None]:
-    """Return the writer of a film by the ending of its name.
+    """Return the writer of a film by the ending of its name, .gif or .mp4.
 
-    `path`: ends in .gif or .mp4. Raises InputError for another ending, or for an MP4 without
-    ffmpeg.
-
-    Examples
-    --------
-    >>> film_writer(Path("mission.gif")).__name__
-    'write_gif'
+    Raises InputError for another ending, or for an MP4 without ffmpeg.
     """
     ending = path.suffix.lower()
     if ending == ".gif":
@@ -357,14 +235,6 @@ def write_gif(pictures: Pictures, path: Path) -> None:
     """Write a GIF that repeats after `HOLD` seconds, in a fixed palette against flicker.
 
     `pictures`: at least one.
-
-    Examples
-    --------
-    >>> from tempfile import mkdtemp
-    >>> path = Path(mkdtemp()) / "grey.gif"
-    >>> write_gif([np.full((4, 4, 3), level, np.uint8) for level in (0, 99)], path)
-    >>> path.read_bytes()[:6]
-    b'GIF89a'
     """
     from PIL import Image
 
@@ -381,21 +251,15 @@ def write_gif(pictures: Pictures, path: Path) -> None:
 def write_mp4(pictures: Pictures, path: Path) -> None:
     """Write an MP4 (H.264) through ffmpeg.
 
-    `pictures`: h and w even. Raises InputError with the message of ffmpeg if it fails, ValueError
-    without pictures.
-
-    Examples
-    --------
-    >>> write_mp4([], Path("mission.mp4"))
-    Traceback (most recent call last):
-    ValueError: a film needs at least one picture
+    `pictures`: at least one. Raises InputError with the message of ffmpeg if it fails.
     """
     pictures = iter(pictures)
-    first = next(pictures, None)
-    if first is None:
-        raise ValueError("a film needs at least one picture")
+    first = next(pictures)
+    height, width, _ = first.shape
+    source = f"-f rawvideo -pix_fmt rgb24 -s {width}x{height} -r {RATE} -i -"
+    target = "-c:v libx264 -crf 20 -pix_fmt yuv420p -movflags +faststart"
+    command = ["ffmpeg", "-y", "-loglevel", "error", *source.split(), *target.split(), str(path)]
     path.parent.mkdir(parents=True, exist_ok=True)
-    command = _ffmpeg(first.shape[1], first.shape[0], path)
     with subprocess.Popen(command, stdin=subprocess.PIPE, stderr=subprocess.PIPE) as ffmpeg:
         assert ffmpeg.stdin
         with contextlib.suppress(BrokenPipeError):
@@ -408,13 +272,6 @@ def write_mp4(pictures: Pictures, path: Path) -> None:
             f"({reason[0] if reason else 'no reason given'}); "
             f"mend that or choose {path.with_suffix('.gif').name}"
         )
-
-
-def _ffmpeg(width: int, height: int, path: Path) -> list[str]:
-    """Return the command that converts raw pictures on its input to an MP4."""
-    source = f"-f rawvideo -pix_fmt rgb24 -s {width}x{height} -r {RATE} -i -"
-    target = "-c:v libx264 -crf 20 -pix_fmt yuv420p -movflags +faststart"
-    return ["ffmpeg", "-y", "-loglevel", "error", *source.split(), *target.split(), str(path)]
 
 
 def _palette() -> "Image":

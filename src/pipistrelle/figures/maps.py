@@ -1,20 +1,30 @@
-"""Maps: outlines, limits, the true world, the panel of an estimate, particles, the legend.
+"""The map of an estimate: outlines, limits, the true world, the estimate, particles, the legend.
 
-`MapPanel` holds the artists of an estimate; a figure shows it once, a film frame by frame.
+A figure of maps is laid out by `draw_maps`. A `MapPanel` holds the frames of an estimate and the
+artists that show one of them; `mission` shows the last frame, `film` a frame per picture.
 """
 
-from collections.abc import Sequence
-from itertools import chain
+from collections.abc import Mapping, Sequence
+from types import MappingProxyType
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from jaxtyping import Float
 
 from pipistrelle.acoustics.paths import Caller, moves
-from pipistrelle.estimation.beliefs import Landmarks, placed
+from pipistrelle.detection.scans import UNLABELLED
+from pipistrelle.estimation.beliefs import Landmarks, joined, placed, some_of
 from pipistrelle.estimation.catalogue import title_of
 from pipistrelle.experiments.drives import LabelledPoints, Truth
-from pipistrelle.figures.style import INK, MAX_COLUMNS, TRUTH, strategy_colour
+from pipistrelle.figures.recorder import (
+    Snapshot,
+    callers_at,
+    callers_marked,
+    excess_paths_at,
+    likeliest,
+    resolved,
+)
+from pipistrelle.figures.style import INK, MAX_COLUMNS, TRUTH, picture, strategy_colour
 
 if TYPE_CHECKING:
     from matplotlib.artist import Artist
@@ -26,14 +36,19 @@ PLACED = 0.95
 """Probability inside the ellipse of a landmark that is fully initialised."""
 RAY = 0.3935
 """Probability inside the ellipse of a ray's member: one standard deviation."""
-SIDE, MARGIN = 0.25, 0.015
-"""Side of the window and its distance from the corner, as shares of the map's width."""
 MIN_REACH = 0.05
 """Least reach of a window [m], for particles that coincide."""
 PATH_POSES = 60
 """Number of poses of a path in a window."""
 NOWHERE = np.full((1, 2), np.nan)
 """A point that is not drawn."""
+LEFT, RIGHT, GAP = 0.76, 0.16, 0.2
+"""Margins of a figure and the space between its columns [inch]."""
+TITLE, LABEL, LEGEND = 0.58, 0.42, 0.28
+"""Heights of a panel's title and of its lowest label, and of a line of the legend [inch]."""
+VEHICLE = 0.045
+"""Length of the vehicle as a share of the map's width."""
+TIED = "placed landmark, 95 %, and its error"
 
 
 def ellipses(
@@ -44,28 +59,8 @@ def ellipses(
     .. math:: (x - \mu)^T P^{-1} (x - \mu) = -2 \ln(1 - p)
 
     The unit circle goes through the symmetric square root of P, which for 2 by 2 is
-    (P + s I) / sqrt(tr P + 2 s), s = sqrt(det P).
-
-    Parameters
-    ----------
-    mean : (h, 2) [m]
-    covariance : (h, 2, 2) [m^2]
-        Positive semidefinite; a covariance that is not finite gives an outline that is not.
-    probability : p, between 0 and 1
-
-    Returns
-    -------
-    (h, 49, 2) [m]
-
-    Notes
-    -----
-    The quantile of chi-square with two degrees of freedom is -2 ln(1 - p): 5.991 for 95 %.
-
-    Examples
-    --------
-    >>> outline = ellipses(np.zeros((1, 2)), np.diag([4.0, 1.0])[None], 0.95)
-    >>> (outline.max(axis=1) ** 2).round(3)
-    array([[23.966,  5.991]])
+    (P + s I) / sqrt(tr P + 2 s), s = sqrt(det P). A covariance that is not finite gives an outline
+    that is not.
     """
     angle = np.linspace(0.0, 2.0 * np.pi, 49)
     circle = np.sqrt(-2.0 * np.log1p(-probability)) * np.stack([np.cos(angle), np.sin(angle)])
@@ -77,19 +72,9 @@ def ellipses(
 
 
 def beam(pose: Float[np.ndarray, "3"], beamwidth: float, length: float) -> Float[np.ndarray, "n 2"]:
-    """Return the sector of the vehicle's beam, half the beamwidth to each side.
-
-    `pose` [m, m, rad]. `beamwidth` [rad]. `length` [m]. Returns [m]: first the vehicle, then the
-    arc.
+    """Return the sector of the vehicle's beam [rad], from the vehicle along the arc.
 
     Half-power beamwidth of Bradley & Abaid, Eq. (1).
-
-    Examples
-    --------
-    >>> beam(np.zeros(3), np.pi, 2.0)[[0, 1, -1]].round(9) + 0.0
-    array([[ 0.,  0.],
-           [ 0., -2.],
-           [ 0.,  2.]])
     """
     angle = pose[2] + np.linspace(-0.5, 0.5, 41) * beamwidth
     arc = pose[:2] + length * np.column_stack([np.cos(angle), np.sin(angle)])
@@ -97,15 +82,7 @@ def beam(pose: Float[np.ndarray, "3"], beamwidth: float, length: float) -> Float
 
 
 def vehicle(pose: Float[np.ndarray, "3"], length: float) -> Float[np.ndarray, "4 2"]:
-    """Return the outline of the vehicle, a dart along its heading, the tip first [m].
-
-    `pose` [m, m, rad]. `length` [m].
-
-    Examples
-    --------
-    >>> vehicle(np.array([1.0, 0.0, np.pi / 2]), 2.0)[0].round(9)
-    array([1.  , 1.16])
-    """
+    """Return the outline of the vehicle, a dart along its heading, the tip first."""
     shape = length * np.array([[0.58, 0.0], [-0.42, 0.36], [-0.2, 0.0], [-0.42, -0.36]])
     cos, sin = np.cos(pose[2]), np.sin(pose[2])
     return pose[:2] + shape @ np.array([[cos, sin], [-sin, cos]])
@@ -114,28 +91,11 @@ def vehicle(pose: Float[np.ndarray, "3"], length: float) -> Float[np.ndarray, "4
 def excess_path_ellipse(
     vehicle: Float[np.ndarray, "2"], caller: Float[np.ndarray, "2"], excess_path: float
 ) -> Float[np.ndarray, "121 2"]:
-    r"""Return the ellipse of all points with an excess path, around vehicle and caller.
+    r"""Return the ellipse of all points with an excess path, around vehicle and caller [m].
 
     .. math:: |b - l| + |l - p| = d + e, \qquad d = |b - p|
 
     Its half axes are :math:`(d + e)/2` and :math:`\sqrt{(d + e)^2 - d^2}/2`.
-
-    Parameters
-    ----------
-    vehicle, caller : (2) [m]
-        The foci.
-    excess path : [m]
-
-    Returns
-    -------
-    (121, 2) [m]
-        A closed outline.
-
-    Examples
-    --------
-    >>> outline = excess_path_ellipse(np.zeros(2), np.array([6.0, 0.0]), 4.0)
-    >>> outline.min(axis=0), outline.max(axis=0)
-    (array([-2., -4.]), array([8., 4.]))
     """
     across = caller - vehicle
     straight = np.hypot(*across)
@@ -150,14 +110,7 @@ def excess_path_ellipse(
 def shades(
     colour: str, weight: Float[np.ndarray, " h"], *, least: float = 0.05, most: float = 0.5
 ) -> Float[np.ndarray, "h 4"]:
-    """Return a colour (red, green, blue, opacity) per weight, opaque for large weights.
-
-    Examples
-    --------
-    >>> shades("#ffffff", np.array([0.0, 1.0]))
-    array([[1.  , 1.  , 1.  , 0.05],
-           [1.  , 1.  , 1.  , 0.5 ]])
-    """
+    """Return a colour (red, green, blue, opacity) per weight, opaque for large weights."""
     from matplotlib.colors import to_rgba
 
     rgba = np.tile(to_rgba(colour), (len(weight), 1))
@@ -165,6 +118,7 @@ def shades(
     return rgba
 
 
+@np.errstate(over="ignore", invalid="ignore")
 def view(
     truth: Truth,
     callers: Sequence[Caller],
@@ -176,16 +130,11 @@ def view(
     Ellipses of landmarks and of rays widen the map by at most a quarter to each side; of rays only
     the ellipses count, not the means. The map is at most twice as wide as high, and at most 1.2
     times as high as wide. `callers`: without the vehicle; `paths` [m, m, rad].
-
-    Examples
-    --------
-    >>> from pipistrelle.experiments.drives import NO_TRUTH
-    >>> path = np.array([[0.0, 9.0, 0.0], [10.0, 0.0, 0.0]])
-    >>> beacon = Caller(name="beacon", frequency=30e3, level_db=42.8, place=np.ones(2))
-    >>> np.round(view(NO_TRUTH, [beacon], [path], []), 9)
-    array([[-0.6 , 10.6 ],
-           [-0.54,  9.54]])
     """
+
+    def readable(half: Float[np.ndarray, "2"]) -> Float[np.ndarray, "2"]:
+        return np.maximum(half, half[::-1] / np.array([1.2, 2.0]))
+
     points = paths if truth.path is None else [truth.path]
     marks = [rows.mean[placed(rows)] for rows in maps]
     marks = marks if truth.landmarks is None else [truth.landmarks[1]]
@@ -194,52 +143,43 @@ def view(
     shown = shown[np.isfinite(shown).all(axis=1)]
     shown = shown if len(shown) else np.zeros((1, 2))
     low, high = shown.min(axis=0), shown.max(axis=0)
-    centre, half = (low + high) / 2.0, np.maximum((high - low) / 2.0, 0.5)
-    half = 1.12 * _readable(half)
-    low, high = _around_ellipses(maps, centre, half)
-    centre, half = (low + high) / 2.0, _readable((high - low) / 2.0)
+    centre, half = (low + high) / 2.0, 1.12 * readable(np.maximum((high - low) / 2.0, 0.5))
+    corners = [centre - half, centre + half]
+    for rows in maps:
+        full, near = placed(rows), np.all(np.abs(rows.mean - centre) < 1.5 * half, axis=1)
+        for some, size in ((near & full, PLACED), (near & ~full, RAY)):
+            outlines = ellipses(rows.mean[some], rows.covariance[some], size).reshape(-1, 2)
+            outlines = outlines[np.isfinite(outlines).all(axis=1)]
+            corners.extend(np.clip(outlines, centre - 1.5 * half, centre + 1.5 * half))
+    low, high = np.min(corners, axis=0), np.max(corners, axis=0)
+    centre, half = (low + high) / 2.0, readable((high - low) / 2.0)
     (left, bottom), (right, top) = (centre - half).tolist(), (centre + half).tolist()
     return (left, right), (bottom, top)
 
 
-def _readable(half: Float[np.ndarray, "2"]) -> Float[np.ndarray, "2"]:
-    """Return half width and half height, enlarged to an allowed ratio."""
-    return np.maximum(half, half[::-1] / np.array([1.2, 2.0]))
+def drawn_excess_paths(
+    frame: Snapshot, label: int
+) -> tuple[list[Float[np.ndarray, "121 2"]], list[Float[np.ndarray, "3 2"]]]:
+    """Return at most two ellipses of a landmark's excess paths, and their sound paths [m].
 
-
-@np.errstate(over="ignore", invalid="ignore")
-def _around_ellipses(
-    maps: Sequence[Landmarks], centre: Float[np.ndarray, "2"], half: Float[np.ndarray, "2"]
-) -> tuple[Float[np.ndarray, "2"], Float[np.ndarray, "2"]]:
-    """Return the corners of a rectangle that is enlarged for ellipses within its reach."""
-    corners = [centre - half, centre + half]
-    for rows in maps:
-        full, near = placed(rows), np.all(np.abs(rows.mean - centre) < 1.5 * half, axis=1)
-        for shown, size in ((near & full, PLACED), (near & ~full, RAY)):
-            outlines = ellipses(rows.mean[shown], rows.covariance[shown], size).reshape(-1, 2)
-            outlines = outlines[np.isfinite(outlines).all(axis=1)]
-            corners.extend(np.clip(outlines, centre - 1.5 * half, centre + 1.5 * half))
-    return np.min(corners, axis=0), np.max(corners, axis=0)
+    A sound path leads from the caller by way of the likeliest member to the vehicle.
+    """
+    outlines, ways = [], []
+    for row in excess_paths_at(frame).get(label, []):
+        spot, caller = likeliest(frame, label), callers_at(frame).mean[frame.scan.caller[row]]
+        excess_path = float(frame.scan.excess_path[row])
+        outlines.append(excess_path_ellipse(frame.pose[:2], caller, excess_path))
+        ways.append(np.stack([caller, spot, frame.pose[:2]]))
+    return outlines, ways
 
 
 def draw_truth(
-    axes: "Axes",
-    true_landmarks: LabelledPoints | None,
-    callers: Sequence[Caller],
+    axes: "Axes", true_landmarks: LabelledPoints | None, callers: Sequence[Caller]
 ) -> None:
     """Draw true landmarks as open circles, fixed callers as stars, moving callers as paths.
 
     Callers have labels, except a single beacon. `true_landmarks` [m]: callers may be among them.
     `callers`: without the vehicle.
-
-    Examples
-    --------
-    >>> from matplotlib.figure import Figure
-    >>> axes = Figure().add_subplot()
-    >>> beacon = Caller(name="beacon", frequency=30e3, level_db=42.8, place=np.ones(2))
-    >>> draw_truth(axes, (np.array([1]), np.zeros((1, 2))), [beacon])
-    >>> len(axes.lines)
-    2
     """
     if true_landmarks is not None:
         x, y = true_landmarks[1].T
@@ -258,14 +198,7 @@ def draw_truth(
 
 
 def callers_shown(callers: Sequence[Caller]) -> set[str]:
-    """Return the names of the legend's symbols for callers, without the vehicle.
-
-    Examples
-    --------
-    >>> path = np.zeros((9, 2))
-    >>> callers_shown([Caller(name="boat", frequency=30e3, level_db=42.8, place=path)])
-    {'moving caller'}
-    """
+    """Return the names of the legend's symbols for callers, without the vehicle."""
     standing = [caller.name for caller in callers if not moves(caller)]
     star = "beacon" if standing == ["beacon"] else "caller"
     return {"moving caller" if moves(caller) else star for caller in callers}
@@ -275,13 +208,6 @@ def cells(cases: Sequence[tuple[str, str]]) -> list[tuple[int, int]]:
     """Return row and column of each panel: a column per strategy, a row per filter.
 
     A single strategy or filter, or more than `MAX_COLUMNS` strategies, fill row after row.
-
-    Examples
-    --------
-    >>> cells([("active", "ekf"), ("active", "fastslam"), ("fused", "fastslam")])
-    [(0, 0), (1, 0), (1, 1)]
-    >>> cells([("fused", "ekf"), ("fused", "fastslam")])
-    [(0, 0), (0, 1)]
     """
     strategies, filters = (list(dict.fromkeys(names)) for names in zip(*cases, strict=True))
     if 1 < len(strategies) <= MAX_COLUMNS and len(filters) > 1:
@@ -290,16 +216,7 @@ def cells(cases: Sequence[tuple[str, str]]) -> list[tuple[int, int]]:
 
 
 def head(axes: "Axes", strategy: str, estimator: str, name: str = "") -> "Annotation":
-    """Write strategy and estimator above a panel; return the empty line of text below them.
-
-    `name`: heading in place of the strategy.
-
-    Examples
-    --------
-    >>> from matplotlib.figure import Figure
-    >>> head(Figure().add_subplot(), "fused", "ekf").get_text()
-    ''
-    """
+    """Write strategy, or `name`, and estimator above a panel; return the empty line below them."""
     above: dict[str, Any] = {"xy": (0, 1), "xycoords": "axes fraction"}
     above["textcoords"] = "offset points"
     style = {"color": strategy_colour(strategy), "fontsize": 13, "weight": "bold"}
@@ -310,89 +227,112 @@ def head(axes: "Axes", strategy: str, estimator: str, name: str = "") -> "Annota
 
 
 class MapPanel:
-    """The artists of an estimate on a map, empty until they are shown.
+    """An estimate at its frames, and the artists of its map.
 
-    `length`: of the vehicle, as a share of the map's width. `beamwidth` [rad]: None for no beam.
+    `case`: strategy and filter. `frames`: at least one. `beamwidth` [rad]: None for no beam; a
+    passive strategy has none.
     """
 
+    line: "Annotation"
+    """The text below the panel's title."""
+
     def __init__(
-        self, axes: "Axes", strategy: str, length: float, beamwidth: float | None = None
+        self, case: tuple[str, str], frames: Sequence[Snapshot], beamwidth: float | None
     ) -> None:
+        self.case, self.frames, self.colour = case, frames, strategy_colour(case[0])
+        self.beamwidth = None if case[0] == "passive" else beamwidth
+        self.path = np.array([frame.pose for frame in frames])
+        self.resolved = resolved(frames)
+        self.marked = callers_marked([frame.scan for frame in frames])
+        self.tracks = [
+            np.array(
+                [np.vstack([f.moving.mean[f.moving.landmark == n], NOWHERE])[0] for f in frames]
+            )
+            for n in np.unique([label for frame in frames for label in frame.moving.landmark])
+        ]
+        self.artists: list[Artist] = []
+        """All artists that `show` changes."""
+        self.closeup: Closeup | None = None
+
+    def symbols(self) -> set[str]:
+        """Return the names of the symbols in any of the frames."""
+        full = [placed(frame.landmarks) for frame in self.frames]
+        drawn = {
+            "placed landmark, 95 %": any(rows.any() for rows in full),
+            "unresolved ray, 1σ, darker: likelier": any(not rows.all() for rows in full),
+            "caller as estimated": any(len(self._stars(frame)) for frame in self.frames),
+            "its estimated track": bool(self.tracks),
+            "excess-path ellipse and its way": bool(set(self.resolved) - {UNLABELLED}),
+        }
+        return {name for name, is_drawn in drawn.items() if is_drawn}
+
+    def _stars(self, frame: Snapshot) -> Float[np.ndarray, "c 2"]:
+        """Return the estimated positions of callers to mark."""
+        mean = callers_at(frame).mean if self.marked else frame.moving.mean
+        return mean[np.isfinite(mean).all(axis=1)]
+
+    def add(self, artist: "Artist") -> Any:
+        """Add an artist that `show` changes to the map."""
+        self.artists.append(artist)
+        return self.axes.add_artist(artist)
+
+    def draw_on(self, axes: "Axes") -> None:
+        """Add the artists to a map, empty until they are shown."""
         from matplotlib.collections import LineCollection, PolyCollection
         from matplotlib.lines import Line2D
         from matplotlib.patches import Polygon
 
-        def areas(zorder: float, **style: Any) -> PolyCollection:
-            artist = PolyCollection([], zorder=zorder, **style)
-            axes.add_collection(artist, autolim=False)
-            return artist
-
-        def points(zorder: float, *form: str, **style: Any) -> Line2D:
-            return axes.plot([], [], *form, zorder=zorder, **style)[0]
-
-        self.axes, self.colour, self.beamwidth = axes, strategy_colour(strategy), beamwidth
+        self.axes = axes
         self.size = axes.get_xlim()[1] - axes.get_xlim()[0]
-        self.length = length * self.size
-        self.closeup: Closeup | None = None
-        colour, star = self.colour, {"ms": 12, "mfc": "none", "mec": self.colour, "mew": 1.1}
+        colour, add = self.colour, self.add
+        star: dict[str, Any] = {"marker": "*", "ms": 12, "mfc": "none", "mec": colour, "mew": 1.1}
         filled = {"fc": shades(colour, np.full(1, 0.2)), "ec": colour, "lw": 0.8}
-        self.members = areas(1.0, lw=0.8)
-        self.beam = Polygon(NOWHERE, fc=INK, alpha=0.13, lw=0, zorder=1.8)
-        self.true = points(2.0, color=TRUTH, lw=3.2, alpha=0.45)
-        self.excess_paths = areas(3.5, fc="none", ec=INK, lw=0.9, alpha=0.7)
-        self.ways = LineCollection([], colors=INK, lw=0.9, alpha=0.7, zorder=3.5)
-        axes.add_collection(self.ways, autolim=False)
-        self.full = areas(4.0, **filled)
-        self.around = areas(4.0, **filled)
-        self.dots = points(5.0, "o", ms=2.6, mfc=colour, mec="none")
-        self.trails = points(5.5, color=colour, lw=1.2, ls=":")
-        self.callers = points(5.5, "*", **star)
-        self.estimated = points(6.0, color=colour, lw=1.2)
-        self.vehicle = Polygon(NOWHERE, fc=INK, ec="white", lw=0.8, zorder=8.0)
-        for patch in (self.vehicle, *([] if beamwidth is None else [self.beam])):
-            axes.add_patch(patch)
+        thin: dict[str, Any] = {"lw": 0.9, "alpha": 0.7, "zorder": 3.5}
+        self.members = add(PolyCollection([], lw=0.8, zorder=1.0))
+        if self.beamwidth is not None:
+            self.beam = add(Polygon(NOWHERE, fc=INK, alpha=0.13, lw=0, zorder=1.8))
+        self.true = add(Line2D([], [], color=TRUTH, lw=3.2, alpha=0.45, zorder=2.0))
+        self.excess_paths = add(PolyCollection([], fc="none", ec=INK, **thin))
+        self.ways = add(LineCollection([], colors=INK, **thin))
+        self.full = add(PolyCollection([], zorder=4.0, **filled))
+        self.dots = add(
+            Line2D([], [], ls="", marker="o", ms=2.6, mfc=colour, mec="none", zorder=5.0)
+        )
+        self.trails = add(Line2D([], [], color=colour, lw=1.2, ls=":", zorder=5.5))
+        self.callers = add(Line2D([], [], ls="", zorder=5.5, **star))
+        self.estimated = add(Line2D([], [], color=colour, lw=1.2, zorder=6.0))
+        self.vehicle = add(Polygon(NOWHERE, fc=INK, ec="white", lw=0.8, zorder=8.0))
 
     def show(
         self,
+        now: int,
         path: Float[np.ndarray, "k 3"],
-        landmarks: Landmarks,
-        *,
-        true_path: Float[np.ndarray, "t 3"] | None = None,
-        cloud: Float[np.ndarray, "p 3"] | None = None,
-        excess_paths: tuple[Sequence[np.ndarray], Sequence[np.ndarray]] = ((), ()),
-        callers: Float[np.ndarray, "c 2"] | None = None,
-        moving: Landmarks | None = None,
-        trails: Sequence[Float[np.ndarray, "_ 2"]] = (),
+        true_path: Float[np.ndarray, "t 3"] | None,
+        trails: Sequence[Float[np.ndarray, "_ 2"]],
     ) -> None:
-        """Show an estimate at the end of its path.
-
-        `path`, `true_path`, `cloud` [m, m, rad]. `excess_paths`: ellipses and ways [m]. `callers`
-        [m]: their estimated positions. `moving`: the tracked callers in sight, `trails` [m] the
-        tracks of all.
-        """
+        """Show a frame at the end of a path [m, m, rad], with the tracks of callers so far [m]."""
+        frame = self.frames[now]
+        rows, full = frame.landmarks, placed(frame.landmarks)
         self.estimated.set_data(*path[:, :2].T)
-        self.vehicle.set_xy(vehicle(path[-1], self.length))
+        self.vehicle.set_xy(vehicle(path[-1], VEHICLE * self.size))
         if self.beamwidth is not None:
             self.beam.set_xy(beam(path[-1], self.beamwidth, 0.25 * self.size))
         if true_path is not None:
             self.true.set_data(*true_path[:, :2].T)
-        if self.closeup and cloud is not None:
-            self.closeup.show(cloud, path, true_path)
-        full = placed(landmarks)
-        mean, covariance, weight = landmarks.mean, landmarks.covariance, landmarks.weight[~full]
+        if self.closeup and frame.cloud is not None:
+            self.closeup.show(frame.cloud, path, true_path)
         self.members.set(
-            verts=ellipses(mean[~full], covariance[~full], RAY),
-            facecolor=shades(self.colour, weight),
-            edgecolor=shades(self.colour, weight, most=1.0),
+            verts=ellipses(rows.mean[~full], rows.covariance[~full], RAY),
+            facecolor=shades(self.colour, rows.weight[~full]),
+            edgecolor=shades(self.colour, rows.weight[~full], most=1.0),
         )
-        self.full.set(verts=ellipses(mean[full], covariance[full], PLACED))
-        self.dots.set_data(*mean[full].T)
-        self.excess_paths.set_verts(excess_paths[0])
-        self.ways.set_segments(excess_paths[1])
-        if callers is not None:
-            self.callers.set_data(*callers.T)
-        if moving is not None:
-            self.around.set(verts=ellipses(moving.mean, moving.covariance, PLACED))
+        areas = joined(some_of(rows, full), frame.moving)
+        self.full.set(verts=ellipses(areas.mean, areas.covariance, PLACED))
+        self.dots.set_data(*rows.mean[full].T)
+        outlines, ways = drawn_excess_paths(frame, self.resolved[now])
+        self.excess_paths.set_verts(outlines)
+        self.ways.set_segments(ways)
+        self.callers.set_data(*self._stars(frame).T)
         lines = [part for trail in trails for part in (NOWHERE, trail)]
         self.trails.set_data(*np.concatenate([np.empty((0, 2)), *lines[1:]]).T)
 
@@ -401,41 +341,45 @@ class Closeup:
     """The particles on a map, and enlarged in a window that follows the vehicle.
 
     The window shows particles as translucent darts, the estimated pose as an outline, the last part
-    of the estimated path, and the true path and pose in grey.
+    of the estimated path, and the true path and pose in grey. `box`: in shares of the map.
+    `reach` [m]: half the window's side.
     """
 
     def __init__(
         self,
-        axes: "Axes",
-        colour: str,
+        panel: MapPanel,
         box: tuple[float, float, float, float],
         reach: float,
         particles: int,
     ) -> None:
         from matplotlib.collections import PolyCollection
+        from matplotlib.lines import Line2D
 
-        dots: dict[str, Any] = {"ms": 1.6, "mfc": colour, "mec": "none", "alpha": 0.3}
+        dots: dict[str, Any] = {"marker": "o", "ms": 1.6, "mfc": panel.colour, "mec": "none"}
         self._reach, (x, y, width, height) = reach, box
         self._middle = np.array([x + width / 2.0, y + height / 2.0])
-        self._map = axes
-        self._dots = axes.plot([], [], "o", **dots, zorder=8.5)[0]
-        self._leader = axes.plot([], [], color=INK, lw=0.6, alpha=0.5, zorder=8.6)[0]
-        self._window = axes.inset_axes(box, zorder=9)
-        self._window.set(xticks=[], yticks=[])
-        for spine in self._window.spines.values():
+        self._map = panel.axes
+        self.dots = panel.add(Line2D([], [], ls="", alpha=0.3, zorder=8.5, **dots))
+        self.leader = panel.add(Line2D([], [], color=INK, lw=0.6, alpha=0.5, zorder=8.6))
+        self.window = window = panel.axes.inset_axes(box, zorder=9)
+        panel.artists.append(window)
+        window.set(xticks=[], yticks=[])
+        for spine in window.spines.values():
             spine.set(visible=True, color=INK, linewidth=0.6)
-        self._true = self._window.plot([], [], color=TRUTH, lw=3.2, alpha=0.45)[0]
-        self._path = self._window.plot([], [], color=colour, lw=1.2)[0]
-        self._darts = PolyCollection([], fc=colour, alpha=0.2, lw=0, zorder=3)
-        self._vehicles = PolyCollection([], fc=["none", TRUTH], ec=[INK, "white"], lw=0.8, zorder=4)
-        for darts in (self._darts, self._vehicles):
-            self._window.add_collection(darts, autolim=False)
-        self._label(f"{particles} particle{'s' if particles != 1 else ''}")
-
-    @property
-    def artists(self) -> "tuple[Artist, Artist, Artist]":
-        """The artists on the map, from back to front."""
-        return self._dots, self._leader, self._window
+        self.true = window.plot([], [], color=TRUTH, lw=3.2, alpha=0.45)[0]
+        self.path = window.plot([], [], color=panel.colour, lw=1.2)[0]
+        self.darts = PolyCollection([], fc=panel.colour, alpha=0.2, lw=0, zorder=3)
+        self.vehicles = PolyCollection([], fc=["none", TRUTH], ec=[INK, "white"], lw=0.8, zorder=4)
+        for darts in (self.darts, self.vehicles):
+            window.add_collection(darts, autolim=False)
+        decade = 10.0 ** np.floor(np.log10(reach))
+        bar = next(float(n * decade) for n in (5, 2, 1) if n * decade <= reach)
+        style: dict[str, Any] = {"transform": window.transAxes, "zorder": 5}
+        ends = [0.06, 0.06 + bar / (2.0 * reach)]
+        window.plot(ends, [0.07, 0.07], color=INK, lw=1.4, **style)
+        window.text(0.06, 0.1, f"{bar:g} m", fontsize=7, va="bottom", **style)
+        title = f"{particles} particle{'s' if particles != 1 else ''}"
+        window.text(0.06, 0.95, title, fontsize=7, va="top", **style)
 
     def show(
         self,
@@ -447,51 +391,36 @@ class Closeup:
         cloud, pose = cloud[np.isfinite(cloud).all(axis=1)], path[-1]
         if not np.isfinite(pose).all():
             return
-        self._dots.set_data(*cloud[:, :2].T)
+        self.dots.set_data(*cloud[:, :2].T)
         corner = self._map.transLimits.inverted().transform(self._middle)
-        self._leader.set_data(*np.stack([pose[:2], corner]).T)
+        self.leader.set_data(*np.stack([pose[:2], corner]).T)
         for axis, middle in zip("xy", pose, strict=False):
-            self._window.set(**{f"{axis}lim": (middle - self._reach, middle + self._reach)})
-        self._path.set_data(*path[-PATH_POSES:, :2].T)
-        self._darts.set_verts([vehicle(particle, 0.24 * self._reach) for particle in cloud])
+            self.window.set(**{f"{axis}lim": (middle - self._reach, middle + self._reach)})
+        self.path.set_data(*path[-PATH_POSES:, :2].T)
+        self.darts.set_verts([vehicle(particle, 0.24 * self._reach) for particle in cloud])
         true = path[:0] if true_path is None else true_path[-PATH_POSES:]
-        self._true.set_data(*true[:, :2].T)
+        self.true.set_data(*true[:, :2].T)
         seen = [pose, *(last for last in true[-1:] if np.isfinite(last).all())]
-        self._vehicles.set_verts([vehicle(dart, 0.34 * self._reach) for dart in seen])
-
-    def _label(self, title: str) -> None:
-        """Write the title of the window and draw a bar of a round length."""
-        decade = 10.0 ** np.floor(np.log10(self._reach))
-        bar = next(float(n * decade) for n in (5, 2, 1) if n * decade <= self._reach)
-        style: dict[str, Any] = {"transform": self._window.transAxes, "zorder": 5}
-        share = bar / (2.0 * self._reach)
-        self._window.plot([0.06, 0.06 + share], [0.07, 0.07], color=INK, lw=1.4, **style)
-        self._window.text(0.06, 0.1, f"{bar:g} m", fontsize=7, va="bottom", **style)
-        self._window.text(0.06, 0.95, title, fontsize=7, va="top", **style)
+        self.vehicles.set_verts([vehicle(dart, 0.34 * self._reach) for dart in seen])
 
 
-def add_closeups(
-    panels: Sequence[MapPanel],
-    clouds: Sequence[Sequence[Float[np.ndarray, "p 3"]]],
-    paths: Sequence[Float[np.ndarray, "_ 3"]],
-    landmarks: Sequence[Float[np.ndarray, "_ 2"]],
-    true_landmarks: LabelledPoints | None,
-) -> None:
+def add_closeups(panels: Sequence[MapPanel], true_landmarks: LabelledPoints | None) -> None:
     """Give each panel with particles a window, all of the same scale and in the same corner.
 
-    `panels`: of common limits. `clouds` [m, m, rad]: for each panel the clouds to show in turn, or
-    none. `paths` [m, m, rad]: their ends are not covered. `landmarks` and `true_landmarks` [m]:
-    not covered if possible, as the rest of the paths.
+    `panels`: of common limits. The ends of the paths are not covered; landmarks, the true ones [m]
+    and the rest of the paths are not covered if possible.
     """
-    marks = [*landmarks, *([] if true_landmarks is None else [true_landmarks[1]])]
-    reach = _reach(list(chain.from_iterable(clouds)))
-    box = _free_corner(panels[0].axes, [path[-1:] for path in paths], marks, paths)
+    clouds = [[f.cloud for f in p.frames if f.cloud is not None] for p in panels]
+    paths, marks = [p.path for p in panels], [p.frames[-1].landmarks.mean for p in panels]
+    marks += [] if true_landmarks is None else [true_landmarks[1]]
+    reach = window_reach([cloud for shown in clouds for cloud in shown])
+    box = free_corner(panels[0].axes, [path[-1:] for path in paths], marks, paths)
     for panel, shown in zip(panels, clouds, strict=True):
         if shown:
-            panel.closeup = Closeup(panel.axes, panel.colour, box, reach, len(shown[-1]))
+            panel.closeup = Closeup(panel, box, reach, len(shown[-1]))
 
 
-def _reach(clouds: Sequence[Float[np.ndarray, "p 3"]]) -> float:
+def window_reach(clouds: Sequence[Float[np.ndarray, "p 3"]]) -> float:
     """Return the reach [m] of a window: twice the median reach of the finite clouds.
 
     The reach of a cloud contains 19 of 20 particles.
@@ -501,7 +430,7 @@ def _reach(clouds: Sequence[Float[np.ndarray, "p 3"]]) -> float:
     return max(2.0 * float(np.median(extents)), MIN_REACH) if extents else MIN_REACH
 
 
-def _free_corner(
+def free_corner(
     axes: "Axes", *covered: Sequence[Float[np.ndarray, "_ d"]]
 ) -> tuple[float, float, float, float]:
     """Return the box, in shares of the map, in the corner that hides the fewest points.
@@ -510,7 +439,7 @@ def _free_corner(
     """
     low = np.array([axes.get_xlim()[0], axes.get_ylim()[0]])
     span = np.array([axes.get_xlim()[1], axes.get_ylim()[1]]) - low
-    size, margin = (share * np.array([1.0, span[0] / span[1]]) for share in (SIDE, MARGIN))
+    size, margin = (share * np.array([1.0, span[0] / span[1]]) for share in (0.25, 0.015))
     kinds = [(np.concatenate([p[:, :2] for p in kind]) - low) / span for kind in covered]
 
     def hidden(corner: tuple[float, float]) -> list[int]:
@@ -523,28 +452,75 @@ def _free_corner(
     return *min(corners, key=hidden), *size.tolist()
 
 
-def legend(figure: "Figure", names: Sequence[str], columns: int, left: float, right: float) -> None:
-    """Draw the legend of all panels at the bottom of a figure, if there are names.
+def draw_maps(
+    panels: Sequence[MapPanel],
+    truth: Truth,
+    callers: Sequence[Caller],
+    *,
+    names: Mapping[str, str] = MappingProxyType({}),
+    rows: Mapping[str, float] = MappingProxyType({}),
+) -> tuple["Figure", list[list["Axes"]]]:
+    """Draw the maps of panels on common scales, with a legend; their estimates are not yet shown.
 
-    `left` and `right` [inch]: margins. Raises KeyError for a name without a symbol.
-
-    Examples
-    --------
-    >>> from matplotlib.figure import Figure
-    >>> figure = Figure()
-    >>> legend(figure, ["true path", "beacon"], 2, 0.1, 0.1)
-    >>> [text.get_text() for text in figure.legends[0].texts]
-    ['true path', 'beacon']
+    `names`: headings of strategies. `rows`: label and height [inch] of axes below each map.
+    Returns the figure, and the axes below the map of each panel.
     """
-    if not names:
-        return
+    maps = [panel.frames[-1].landmarks for panel in panels]
+    limits = view(truth, callers, [panel.path for panel in panels], maps)
+    (left, right), (bottom, top) = limits
+    places = cells([panel.case for panel in panels])
+    blocks, columns = (1 + max(indices) for indices in zip(*places, strict=True))
+    drawn = callers_shown(callers).union(*(panel.symbols() for panel in panels))
+    if TIED in drawn:
+        drawn.remove("placed landmark, 95 %")
+    total, entries = {1: (6.4, 2), 2: (9.0, 4)}.get(columns, (12.0, 4))
+    width = (total - LEFT - RIGHT - (columns - 1) * GAP) / columns
+    heights = {"y [m]": width * (top - bottom) / (right - left), **rows}
+    gaps = [TITLE, 0.5, *[0.12] * len(rows)][: len(heights)]
+    block = sum(heights.values()) + sum(gaps) + LABEL
+    page = blocks * block + LEGEND * -(-len(drawn) // entries)
+    figure = picture(total, page)
+    grid: list[list[Axes]] = []
+    for panel, (row, column) in zip(panels, places, strict=True):
+        x, y = LEFT + column * (width + GAP), page - row * block
+        cell: list[Axes] = []
+        for (label, tall), gap in zip(heights.items(), gaps, strict=True):
+            y -= gap + tall
+            first = grid[0][len(cell)] if grid else None
+            axes = figure.add_axes(
+                (x / total, y / page, width / total, tall / page),
+                sharex=cell[1] if len(cell) > 1 else first,
+                sharey=first,
+            )
+            axes.grid(True)
+            axes.set_axisbelow(True)
+            if (row, column - 1) in places:
+                axes.tick_params(labelleft=False)
+            else:
+                axes.set_ylabel(label, multialignment="center")
+                axes.yaxis.set_label_coords(-0.42 / width, 0.5)
+            cell.append(axes)
+        cell[0].set(xlim=limits[0], ylim=limits[1], xlabel="x [m]", aspect="equal")
+        draw_truth(cell[0], truth.landmarks, callers)
+        panel.draw_on(cell[0])
+        panel.line = head(cell[0], *panel.case, names.get(panel.case[0], ""))
+        grid.append(cell)
+    add_closeups(panels, truth.landmarks)
+    if drawn:
+        _draw_legend(figure, drawn, entries)
+    return figure, [cell[1:] for cell in grid]
+
+
+def _draw_legend(figure: "Figure", drawn: set[str], columns: int) -> None:
+    """Draw the legend of all panels at the bottom of a figure."""
+    symbols = legend_symbols()
+    names = sorted(drawn, key=list(symbols).index)
     width, height = figure.get_size_inches()
-    symbols = _symbols()
     figure.legend(
         handles=[symbols[name] for name in names],
         labels=names,
         loc="lower left",
-        bbox_to_anchor=(left / width, 0.07 / height, 1.0 - (left + right) / width, 0.0),
+        bbox_to_anchor=(LEFT / width, 0.07 / height, 1.0 - (LEFT + RIGHT) / width, 0.0),
         mode="expand",
         ncols=columns,
         borderaxespad=0.0,
@@ -552,30 +528,33 @@ def legend(figure: "Figure", names: Sequence[str], columns: int, left: float, ri
     )
 
 
-def _symbols() -> dict[str, "Artist | tuple[Artist, ...]"]:
-    """Return the symbol, or the superimposed symbols, of each name in a legend."""
+def legend_symbols() -> dict[str, "Artist | tuple[Artist, ...]"]:
+    """Return the symbol, or the superimposed symbols, of each name, in the legend's order."""
     from matplotlib.lines import Line2D
     from matplotlib.path import Path
 
     def line(colour: str = INK, **style: Any) -> Line2D:
         return Line2D([], [], color=colour, **style)
 
-    def mark(marker: Any, size: float, face: str, edge: str = "none", **style: Any) -> Line2D:
-        return Line2D([], [], lw=0, marker=marker, ms=size, mfc=face, mec=edge, **style)
+    def mark(marker: Any, size: float, face: str, edge: str = "none") -> Line2D:
+        return Line2D([], [], lw=0, marker=marker, ms=size, mfc=face, mec=edge)
 
     dart, sector = Path(vehicle(np.zeros(3), 1.0)), Path(beam(np.array([-0.5, 0, 0]), 0.8, 1.0))
     member = Path(ellipses(np.zeros((1, 2)), np.array([[[1.0, 0.4], [0.4, 0.4]]]), RAY)[0])
     oval = Path(excess_path_ellipse(np.array([-0.4, 0.0]), np.array([0.4, 0.0]), 0.2))
-    full, tie = mark("o", 7.5, "#33333330", INK), line(lw=0.7)
+    full, star = mark("o", 7.5, "#33333330", INK), mark("*", 11.0, INK, "white")
     return {
         "true path": line(TRUTH, lw=3.2, alpha=0.45),
         "estimated path": line(lw=1.2),
+        "range and bearing": line(lw=1.4),
+        "bearing alone": line(lw=0.7, ls=(0, (4, 3))),
         "true landmark": mark("o", 5.0, "none", TRUTH),
+        TIED: (full, line(lw=0.7)),
         "placed landmark, 95 %": full,
-        "placed landmark, 95 %, and its error": (full, tie),
         "unresolved ray, 1σ, darker: likelier": mark(member, 14.0, "#33333350"),
-        "beacon": mark("*", 11.0, INK, "white"),
-        "caller": mark("*", 11.0, INK, "white"),
+        "just pruned": line(lw=1.0, ls=":"),
+        "beacon": star,
+        "caller": star,
         "moving caller": line(lw=1.0, ls="-."),
         "caller as estimated": mark("*", 11.0, "none", INK),
         "its estimated track": line(lw=1.2, ls=":"),
@@ -583,8 +562,4 @@ def _symbols() -> dict[str, "Artist | tuple[Artist, ...]"]:
         "vehicle at the end": mark(dart, 10.0, INK),
         "its beam": mark(sector, 14.0, "#33333338"),
         "particles": mark(dart, 10.0, "#33333350"),
-        "range and bearing": line(lw=1.4),
-        "bearing alone": line(lw=0.7, ls=(0, (4, 3))),
-        "ray, 1σ, darker: likelier": mark(member, 14.0, "#33333350"),
-        "just pruned": line(lw=1.0, ls=":"),
     }

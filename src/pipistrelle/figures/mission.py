@@ -5,45 +5,28 @@ from types import MappingProxyType
 from typing import TYPE_CHECKING
 
 import numpy as np
-from jaxtyping import Float
 
 from pipistrelle.acoustics.paths import Caller
-from pipistrelle.estimation.beliefs import Landmarks, no_landmarks, placed
+from pipistrelle.detection.scans import make_scan
+from pipistrelle.estimation.beliefs import Landmarks, placed
 from pipistrelle.evaluation.accuracy import heaviest, pose_error, position_error
 from pipistrelle.evaluation.consistency import anees_bounds, track_nees
 from pipistrelle.experiments.drives import NO_TRUTH, LabelledPoints, Truth
 from pipistrelle.experiments.results.scores import TrialResult
-from pipistrelle.figures.maps import (
-    MapPanel,
-    add_closeups,
-    callers_shown,
-    cells,
-    draw_truth,
-    head,
-    legend,
-    view,
-)
-from pipistrelle.figures.recorder import (
-    Snapshot,
-    callers_believed,
-    callers_marked,
-    drawn_excess_paths,
-    resolved,
-)
+from pipistrelle.figures.maps import TIED, MapPanel, draw_maps
+from pipistrelle.figures.recorder import Snapshot, callers_marked
 from pipistrelle.figures.style import INK, STYLE, strategy_colour
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-LEFT, RIGHT, TOP, GAP, LEGEND = 0.76, 0.16, 0.58, 0.2, 0.56
-"""Margins, the space between panels and the height of two rows of legend [inch]."""
-ERRORS = (0.95, 0.95, 0.7)
-"""Heights of the error rows: position, heading, NEES [inch]."""
-LABELS = ("y [m]", "position error\nand 3σ [m]", "heading error\nand 3σ [°]", "NEES\nand 95 %")
-"""Labels of the rows' vertical axes."""
-VEHICLE = 0.045
-"""Length of the vehicle as a share of the map's width."""
+ERRORS = {
+    "position error\nand 3σ [m]": 0.95,
+    "heading error\nand 3σ [°]": 0.95,
+    "NEES\nand 95 %": 0.7,
+}
+"""Labels of the rows of errors, and their heights [inch]."""
 
 
 def draw_mission(
@@ -84,184 +67,75 @@ def draw_mission(
 
     if not trials:
         raise ValueError("a mission's figure needs at least one trial")
-    paths = [trial.track.pose.mean for trial in trials]
-    maps = [trial.track.landmarks for trial in trials]
-    limits = view(truth, callers, paths, maps)
-    places = cells([(trial.strategy, trial.filter) for trial in trials])
-    symbols = _symbols(trials, truth, callers, beamwidth)
+    panels = [_EndPanel(trial, truth, beamwidth) for trial in trials]
+    rows = ERRORS if truth.path is not None else {}
     with matplotlib.rc_context(STYLE):
-        figure, axes = _panels(places, limits, len(symbols), errors=truth.path is not None)
-        panels = []
-        for trial, (on_map, *rows) in zip(trials, axes, strict=True):
-            draw_truth(on_map, truth.landmarks, callers)
-            own_beam = None if trial.strategy == "passive" else beamwidth
-            panels.append(MapPanel(on_map, trial.strategy, VEHICLE, own_beam))
-            name = names.get(trial.strategy, trial.strategy)
-            head(on_map, trial.strategy, trial.filter, name).set_text(outcome(trial, truth))
-            if truth.path is not None:
-                _draw_errors(rows, trial, truth.path)
-        add_closeups(
-            panels,
-            [[] if trial.track.cloud is None else [trial.track.cloud] for trial in trials],
-            paths,
-            [rows.mean for rows in maps],
-            truth.landmarks,
-        )
+        figure, below = draw_maps(panels, truth, callers, names=names, rows=rows)
         for panel, trial in zip(panels, trials, strict=True):
-            _draw_estimate(panel, trial, truth)
+            panel.show_end()
+            panel.line.set_text(outcome(trial, truth))
         if truth.path is not None:
-            _scale_errors([rows for _, *rows in axes])
-        legend(figure, symbols, 4 if figure.get_figwidth() > 8.0 else 2, LEFT, RIGHT)
+            for axes, trial in zip(below, trials, strict=True):
+                _draw_errors(axes, trial, truth.path)
+            _scale_errors(below)
     return figure
 
 
-def _symbols(
-    trials: Sequence[TrialResult],
-    truth: Truth,
-    callers: Sequence[Caller],
-    beamwidth: float | None,
-) -> list[str]:
-    """Return the names of all symbols in the maps, in the order of the legend."""
-    tied = any(_ties(trial, truth.landmarks) for trial in trials)
-    full = [placed(trial.track.landmarks) for trial in trials]
-    ending = [trial for trial in trials if np.isfinite(trial.track.pose.mean[-1]).all()]
-    calling = [trial for trial in ending if trial.strategy != "passive"]
-    shown = callers_shown(callers)
-    drawn = {
-        "true path": truth.path is not None,
-        "estimated path": True,
-        "true landmark": truth.landmarks is not None and len(truth.landmarks[0]) > 0,
-        "placed landmark, 95 %, and its error": tied,
-        "placed landmark, 95 %": not tied and any(rows.any() for rows in full),
-        "unresolved ray, 1σ, darker: likelier": any(not rows.all() for rows in full),
-        **{name: name in shown for name in ("beacon", "caller", "moving caller")},
-        "caller as estimated": any(len(_callers(t)) or t.track.callers for t in trials),
-        "its estimated track": any(trial.track.callers for trial in trials),
-        "excess-path ellipse and its way": any(_excess_paths(trial)[0] for trial in trials),
-        "vehicle at the end": bool(ending),
-        "its beam": beamwidth is not None and bool(calling),
-        "particles": any(trial.track.cloud is not None for trial in ending),
-    }
-    return [name for name, is_drawn in drawn.items() if is_drawn]
+class _EndPanel(MapPanel):
+    """The map of a trial at its end, with the errors of landmarks and the lines of rays."""
 
+    def __init__(self, trial: TrialResult, truth: Truth, beamwidth: float | None) -> None:
+        track = trial.track
+        nothing = make_scan(track.time[-1], np.empty(0), np.empty(0))
+        scan = trial.scans[-1] if trial.scans else nothing
+        k = min(int(np.searchsorted(track.time, scan.time)), len(track.time) - 1)
+        tracks, ends = [], []
+        for label, caller in track.callers.items():
+            known = np.flatnonzero(np.isfinite(caller.mean).all(axis=1))
+            tracks.append(caller.mean[known])
+            if track.time[known[-1]] >= scan.time:
+                ends.append((label, caller.mean[known[-1]], caller.covariance[known[-1]]))
+        moving = Landmarks(
+            landmark=np.array([label for label, _, _ in ends], int),
+            mean=np.reshape([mean for _, mean, _ in ends], (-1, 2)),
+            covariance=np.reshape([covariance for _, _, covariance in ends], (-1, 2, 2)),
+            weight=np.ones(len(ends)),
+        )
+        end = Snapshot(
+            scan=scan,
+            pose=track.pose.mean[k],
+            covariance=track.pose.covariance[k],
+            landmarks=track.landmarks,
+            moving=moving,
+            cloud=track.cloud,
+        )
+        super().__init__((trial.strategy, trial.filter), [end], beamwidth)
+        self.path, self.tracks, self.marked = track.pose.mean, tracks, callers_marked(trial.scans)
+        self.truth, self.ties = truth, _ties(trial, truth.landmarks)
 
-def _panels(
-    places: Sequence[tuple[int, int]],
-    limits: tuple[tuple[float, float], tuple[float, float]],
-    names: int,
-    *,
-    errors: bool,
-) -> tuple["Figure", list[list["Axes"]]]:
-    """Return a figure with a map and error rows for each trial."""
-    from pipistrelle.figures.picture import picture
+    def symbols(self) -> set[str]:
+        """Return the names of all symbols."""
+        ends, truth = bool(np.isfinite(self.path[-1]).all()), self.truth
+        drawn = {
+            "true path": truth.path is not None,
+            "estimated path": True,
+            "true landmark": truth.landmarks is not None and len(truth.landmarks[0]) > 0,
+            TIED: bool(self.ties),
+            "vehicle at the end": ends,
+            "its beam": ends and self.beamwidth is not None,
+            "particles": ends and self.frames[0].cloud is not None,
+        }
+        return super().symbols() | {name for name, is_drawn in drawn.items() if is_drawn}
 
-    (left, right), (bottom, top) = limits
-    blocks, columns = (1 + max(indices) for indices in zip(*places, strict=True))
-    total = {1: 6.4, 2: 9.0}.get(columns, 12.0)
-    width = (total - LEFT - RIGHT - (columns - 1) * GAP) / columns
-    height = width * (top - bottom) / (right - left)
-    heights = (height, *ERRORS) if errors else (height,)
-    gaps = [0.0, 0.5, 0.12, 0.12][: len(heights)]
-    block = TOP + sum(heights) + sum(gaps) + 0.42
-    entries = 4 if total > 8.0 else 2
-    page = blocks * block + LEGEND * -(-names // entries) / 2
-    figure = picture(total, page)
-    panels: list[list[Axes]] = []
-    for row, column in places:
-        x, y = LEFT + column * (width + GAP), page - row * block - TOP
-        panel: list[Axes] = []
-        for tall, gap, label in zip(heights, gaps, LABELS, strict=False):
-            y -= gap + tall
-            first = panels[0][len(panel)] if panels else None
-            axes = figure.add_axes(
-                (x / total, y / page, width / total, tall / page),
-                sharex=panel[1] if len(panel) > 1 else first,
-                sharey=first,
-            )
-            axes.grid(True)
-            axes.set_axisbelow(True)
-            if (row, column - 1) in places:
-                axes.tick_params(labelleft=False)
-            else:
-                axes.set_ylabel(label, multialignment="center")
-                axes.yaxis.set_label_coords(-0.42 / width, 0.5)
-            panel.append(axes)
-        panel[0].set(xlim=limits[0], ylim=limits[1], xlabel="x [m]", aspect="equal")
-        panels.append(panel)
-    return figure, panels
+    def show_end(self) -> None:
+        """Show the estimate, its errors and the lines of its rays."""
+        from matplotlib.collections import LineCollection
 
-
-def _draw_estimate(panel: MapPanel, trial: TrialResult, truth: Truth) -> None:
-    """Draw an estimate at the end, the errors of its landmarks and the lines of its rays."""
-    from matplotlib.collections import LineCollection
-
-    track, colour = trial.track, panel.colour
-    moving, trails = _tracked(trial)
-    panel.show(
-        track.pose.mean,
-        track.landmarks,
-        true_path=truth.path,
-        cloud=track.cloud,
-        excess_paths=_excess_paths(trial),
-        callers=np.concatenate([_callers(trial), moving.mean]),
-        moving=moving,
-        trails=trails,
-    )
-    rows, full = track.landmarks, placed(track.landmarks)
-    ties = LineCollection(_ties(trial, truth.landmarks), colors=INK, lw=0.7, zorder=4.5)
-    panel.axes.add_collection(ties)
-    rays = [rows.mean[rows.landmark == label] for label in np.unique(rows.landmark[~full])]
-    lines = LineCollection(rays, colors=colour, lw=0.6, alpha=0.45, zorder=1.5)
-    panel.axes.add_collection(lines)
-
-
-def _tracked(trial: TrialResult) -> tuple[Landmarks, list[Float[np.ndarray, "_ 2"]]]:
-    """Return the tracked callers in sight at the end, and the tracks of all."""
-    ends, trails = {}, []
-    for label, track in trial.track.callers.items():
-        known = np.isfinite(track.mean).all(axis=1)
-        trails.append(track.mean[known])
-        if trial.track.time[known][-1] >= trial.scans[-1].time:
-            ends[label] = track.mean[known][-1], track.covariance[known][-1]
-    return _landmarks_of(ends), trails
-
-
-def _landmarks_of(positions: Mapping[int, tuple[np.ndarray, np.ndarray]]) -> Landmarks:
-    """Return Gaussians by label as fully initialised landmarks."""
-    if not positions:
-        return no_landmarks()
-    mean, covariance = map(np.array, zip(*positions.values(), strict=True))
-    weight = np.ones(len(positions))
-    return Landmarks(
-        landmark=np.array(list(positions)), mean=mean, covariance=covariance, weight=weight
-    )
-
-
-def _callers(trial: TrialResult) -> Float[np.ndarray, "c 2"]:
-    """Return the estimated positions of the callers to mark at the end."""
-    if not callers_marked(trial.scans):
-        return np.empty((0, 2))
-    mean = callers_believed(trial.track.landmarks, trial.scans[-1].callers).mean
-    return mean[np.isfinite(mean).all(axis=1)]
-
-
-def _excess_paths(trial: TrialResult) -> tuple[list[np.ndarray], list[np.ndarray]]:
-    """Return ellipses and ways of a landmark's excess paths in the last scan."""
-    track, scan = trial.track, trial.scans[-1] if trial.scans else None
-    if scan is None or not np.isfinite(scan.excess_path).any():
-        return [], []
-    k = int(np.searchsorted(track.time, scan.time))
-    tracks = track.callers.items()
-    end = Snapshot(
-        scan=scan,
-        pose=track.pose.mean[k],
-        covariance=track.pose.covariance[k],
-        landmarks=track.landmarks,
-        moving=_landmarks_of(
-            {n: (t.mean[k], t.covariance[k]) for n, t in tracks if np.isfinite(t.mean[k]).all()}
-        ),
-    )
-    return drawn_excess_paths(end, resolved([end])[0])
+        self.show(0, self.path, self.truth.path, self.tracks)
+        self.add(LineCollection(self.ties, colors=INK, lw=0.7, zorder=4.5))
+        rows = self.frames[0].landmarks
+        rays = [rows.mean[rows.landmark == n] for n in np.unique(rows.landmark[~placed(rows)])]
+        self.add(LineCollection(rays, colors=self.colour, lw=0.6, alpha=0.45, zorder=1.5))
 
 
 def _ties(trial: TrialResult, true_landmarks: LabelledPoints | None) -> list[np.ndarray]:

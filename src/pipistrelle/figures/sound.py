@@ -1,7 +1,7 @@
 """Figures of a microphone array and of the echoes in a recording."""
 
 import math
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -19,13 +19,7 @@ FLOOR_DB = -30.0
 """Least level in a beam pattern [dB]."""
 MOST_NUMBERS = 64
 """Most microphones that are labelled with their channels."""
-SNR = 100.0
-"""Power ratio at each microphone for the standard deviations: 20 dB."""
 _COLOURS = (*STRATEGY_COLOURS.values(), INK)
-NEARLY_ALL, SILENCE = 0.98, 1.1
-"""Share of the echoes' levels within the axis, and the margin behind them."""
-_QUIETEST, _LOUDEST = 0.0, 50.0
-"""Levels of white and black [dB]."""
 
 
 def draw_array(
@@ -70,18 +64,12 @@ def _draw_places(axes: "Axes", microphones: Microphones, layout: Scattered) -> N
         if not math.isnan(normal := layout.normal[g]):
             size = 0.15 * max(np.ptp(x), np.ptp(y))
             start = y[members].mean(), x[members].mean()
-            ahead = size * math.sin(normal), size * math.cos(normal)
-            axes.annotate(
-                "",
-                (start[0] + ahead[0], start[1] + ahead[1]),
-                start,
-                arrowprops={"arrowstyle": "->", "color": colour},
-            )
+            tip = start[0] + size * math.sin(normal), start[1] + size * math.cos(normal)
+            axes.annotate("", tip, start, arrowprops={"arrowstyle": "->", "color": colour})
     if len(x) <= MOST_NUMBERS:
+        style: dict[str, Any] = {"textcoords": "offset points", "fontsize": 6.5}
         for number, across, along in zip(microphones.channel, y, x, strict=True):
-            axes.annotate(
-                str(number), (across, along), (3, 3), textcoords="offset points", fontsize=6.5
-            )
+            axes.annotate(str(number), (across, along), (3, 3), **style)
     axes.plot([0.0], [0.0], "+", color=TRUTH, ms=9, label="vehicle")
     axes.set(xlabel="y, to the left [mm]", ylabel="x, ahead [mm]", aspect="equal")
     axes.margins(0.2)
@@ -127,7 +115,7 @@ def _draw_stds(axes: "Axes", layout: Scattered, wave: dict[str, float]) -> None:
             around = normal + np.radians(np.linspace(-75.0, 75.0, 301))
         weight = layout.amplitude[members] / np.linalg.norm(layout.amplitude[members])
         spread = np.maximum(spread_towards(around, layout.position[members], weight), 1e-12)
-        power = SNR * np.sum(layout.amplitude[members] ** 2)
+        power = 100.0 * np.sum(layout.amplitude[members] ** 2)  # 20 dB at each microphone
         std = np.degrees((2.0 * power * spread) ** -0.5 / turn)
         top = 4.0 * float(np.median(std))
         axes.plot(around, np.minimum(std, top), color=_COLOURS[g % len(_COLOURS)], lw=1.1)
@@ -162,7 +150,7 @@ def draw_hearing(overview: Overview) -> "Figure":
 
 
 def _end(overview: Overview) -> float:
-    """Return the delay that contains nearly all echoes, weighted by level [ms].
+    """Return the delay that contains 98 % of the echoes, weighted by level, and 10 % more [ms].
 
     Weighting keeps the faint detections of noise, at any delay, from extending the axis.
     """
@@ -172,10 +160,8 @@ def _end(overview: Overview) -> float:
     power = np.concatenate([found.power for found in overview.detections])
     order, level = np.argsort(delay), np.log(np.maximum(power, 1.0))
     heard = np.cumsum(level[order])
-    last = delay[order][np.searchsorted(heard, NEARLY_ALL * heard[-1])]
-    return 1e3 * float(
-        min(SILENCE * last, max(found[-1] for found in overview.delay if found.size))
-    )
+    last = delay[order][np.searchsorted(heard, 0.98 * heard[-1])]
+    return 1e3 * float(min(1.1 * last, max(found[-1] for found in overview.delay if found.size)))
 
 
 def _output(axes: "Axes", overview: Overview, number: int) -> None:
@@ -185,12 +171,9 @@ def _output(axes: "Axes", overview: Overview, number: int) -> None:
         return
     end = max(delay[-1] for delay in overview.delay if delay.size)
     grid = np.linspace(0.0, end, 400)
-    image = np.array(
-        [
-            np.interp(grid, delay, level[:, number], left=np.nan, right=np.nan)
-            for delay, level in zip(overview.delay, overview.level_db, strict=True)
-        ]
-    )
+    levels = zip(overview.delay, overview.level_db, strict=True)
+    beyond = {"left": np.nan, "right": np.nan}
+    image = [np.interp(grid, delay, level[:, number], **beyond) for delay, level in levels]
     rows = np.array(overview.time)
     step = float(np.median(np.diff(rows))) if rows.size > 1 else 1.0
     shaded = axes.imshow(
@@ -199,16 +182,15 @@ def _output(axes: "Axes", overview: Overview, number: int) -> None:
         origin="lower",
         extent=(0.0, 1e3 * end, rows[0] - 0.5 * step, rows[-1] + 0.5 * step),
         cmap="Greys",
-        vmin=_QUIETEST,
-        vmax=_LOUDEST,
+        vmin=0.0,
+        vmax=50.0,
         interpolation="nearest",
     )
     axes.figure.colorbar(shaded, ax=axes, label="over the noise [dB]", pad=0.01)
     for time, found in zip(overview.time, overview.detections, strict=True):
         own = found.caller == number
-        axes.plot(
-            1e3 * found.delay[own], np.full(own.sum(), time), ".", ms=2.5, color=_colour(number)
-        )
+        times = np.full(own.sum(), time)
+        axes.plot(1e3 * found.delay[own], times, ".", ms=2.5, color=_colour(number))
     axes.plot(1e3 * overview.direct(number), rows, "|", ms=5, color=INK, alpha=0.7)
 
 

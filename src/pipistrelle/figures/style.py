@@ -1,5 +1,6 @@
 """The style of all figures: colours, sizes of type, and the saving of a figure."""
 
+from io import BytesIO
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -13,46 +14,26 @@ INK = "#333333"
 TRUTH = "#8a8a8a"
 """Colour of the true path and landmarks."""
 PAGE = {
-    "light": {
-        "paper": "#fbfaf7",
-        "card": "#ffffff",
-        "ink": "#22262b",
-        "soft": "#5d646d",
-        "line": "#e3e0d8",
-        "grid": "#e9e7e1",
-        "truth": TRUTH,
-        "span": "#dcd9d1",
-        "accent": "#b8384b",
-        "good": "#1c7a4d",
-        "bad": "#b3363f",
-        "wait": "#80630f",
-        "good-wash": "#e6f3ec",
-        "bad-wash": "#fae9ea",
-        "wait-wash": "#f8f0da",
-        **STRATEGY_COLOURS,
-    },
-    "dark": {
-        "paper": "#14171b",
-        "card": "#1b1f24",
-        "ink": "#e8e6e1",
-        "soft": "#a3a9b1",
-        "line": "#30353c",
-        "grid": "#2a2f36",
-        "truth": "#9a9fa6",
-        "span": "#343a42",
-        "accent": "#f2838f",
-        "good": "#6fcf9c",
-        "bad": "#f08b92",
-        "wait": "#e0bd5c",
-        "good-wash": "#17301f",
-        "bad-wash": "#3a1d20",
-        "wait-wash": "#332a12",
-        "active": "#7fb0f2",
-        "fused": "#f2838f",
-        "passive": "#f0bd45",
-    },
+    "paper": ("#fbfaf7", "#14171b"),
+    "card": ("#ffffff", "#1b1f24"),
+    "ink": ("#22262b", "#e8e6e1"),
+    "soft": ("#5d646d", "#a3a9b1"),
+    "line": ("#e3e0d8", "#30353c"),
+    "grid": ("#e9e7e1", "#2a2f36"),
+    "truth": (TRUTH, "#9a9fa6"),
+    "span": ("#dcd9d1", "#343a42"),
+    "accent": ("#b8384b", "#f2838f"),
+    "good": ("#1c7a4d", "#6fcf9c"),
+    "bad": ("#b3363f", "#f08b92"),
+    "wait": ("#80630f", "#e0bd5c"),
+    "good-wash": ("#e6f3ec", "#17301f"),
+    "bad-wash": ("#fae9ea", "#3a1d20"),
+    "wait-wash": ("#f8f0da", "#332a12"),
+    "active": (STRATEGY_COLOURS["active"], "#7fb0f2"),
+    "fused": (STRATEGY_COLOURS["fused"], "#f2838f"),
+    "passive": (STRATEGY_COLOURS["passive"], "#f0bd45"),
 }
-"""Colours of a page in its light and dark scheme."""
+"""Colours of a page in its light and its dark scheme."""
 MAX_COLUMNS = 3
 """Most panels in a row."""
 
@@ -82,31 +63,32 @@ STYLE = {
 """Settings of matplotlib while a figure is made or saved."""
 
 
-def strategy_colour(strategy: str) -> str:
-    """Return the colour of a strategy, the same in every figure.
+def picture(width: float, height: float) -> "Figure":
+    """Return an empty figure of a width and a height [inch] that a notebook displays."""
+    from matplotlib.figure import Figure
 
-    Examples
-    --------
-    >>> strategy_colour("fused")
-    '#d1495b'
-    """
+    class Picture(Figure):
+        def _repr_png_(self) -> bytes:
+            file = BytesIO()
+            self.savefig(file, format="png", dpi=80)
+            return file.getvalue()
+
+    return Picture(figsize=(width, height))
+
+
+def strategy_colour(strategy: str) -> str:
+    """Return the colour of a strategy, the same in every figure."""
     return STRATEGY_COLOURS.get(strategy, INK)
 
 
 def page_colours() -> str:
-    """Return the colours of a page as CSS variables, light unless the reader prefers dark.
-
-    Examples
-    --------
-    >>> print(page_colours()[:25])
-    :root { --paper: #fbfaf7;
-    """
-
-    def root(scheme: str) -> str:
-        stated = " ".join(f"--{name}: {colour};" for name, colour in PAGE[scheme].items())
-        return f":root {{ {stated} }}"
-
-    return f"{root('light')}\n@media (prefers-color-scheme: dark) {{ {root('dark')} }}"
+    """Return the colours of a page as CSS variables, light unless the reader prefers dark."""
+    light, dark = (
+        " ".join(f"--{name}: {colours[scheme]};" for name, colours in PAGE.items())
+        for scheme in (0, 1)
+    )
+    dark = f"@media (prefers-color-scheme: dark) {{ :root {{ {dark} }} }}"
+    return f":root {{ {light} }}\n{dark}"
 
 
 def save_figure(figure: "Figure", folder: Path, name: str) -> tuple[Path, Path]:

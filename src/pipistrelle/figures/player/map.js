@@ -187,14 +187,15 @@ const drawVehicle = (map, d, estimate, frame, pose) => {
   d.spread = outline({ ...pose, xx, xy, yy }, mission.scales.pose);
   d.vehicle = dart(pose, DART_PIXELS * map.pixel);
   const { left, right } = wholeWorld();
-  if (estimate.calls && mission.beamwidth !== null) {
+  if (estimate.strategy !== "passive" && mission.beamwidth) {
     d.beam = sector(pose, mission.beamwidth, BEAM_SHARE * (right - left));
   }
 };
 
 const cloudAt = ({ cloud }, frame) => {
   if (!cloud) return [];
-  return Array.from({ length: cloud.particles }, (_, i) => poseOf(cloud.pose, frame * cloud.particles + i));
+  const particles = cloud.length / (3 * FRAMES);
+  return Array.from({ length: particles }, (_, i) => poseOf(cloud, frame * particles + i));
 };
 
 // The chosen landmark, all guesses of it or a ring, and the way of the sound that tells of it.

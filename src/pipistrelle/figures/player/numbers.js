@@ -23,7 +23,7 @@ const wrapped = (angle) => Math.atan2(Math.sin(angle), Math.cos(angle));
 
 // The rows of a frame: each the landmark's label and its numbers.
 const rowsOf = (rows, frame) => {
-  const found = [], { columns, landmark, numbers } = rows;
+  const found = [], { landmark, numbers } = rows, columns = numbers.length / landmark.length;
   for (let i = rows.first[frame]; i < rows.first[frame + 1]; i++) {
     found.push({ landmark: landmark[i], numbers: numbers.subarray(columns * i, columns * (i + 1)) });
   }
@@ -66,7 +66,6 @@ const callerAt = ({ callers }, caller, frame) => {
 
 // The excess paths of a frame that are shown: two at most, of the chosen landmark or of one they resolve.
 const excessPathsShown = ({ excessPaths, resolved }, frame, chosen) => {
-  if (!excessPaths) return [];
   const heard = rowsOf(excessPaths, frame).map(({ landmark, numbers: [caller, excessPath] }) =>
     ({ landmark, caller, excessPath }));
   const own = heard.filter(({ landmark }) => landmark === chosen);
@@ -75,8 +74,9 @@ const excessPathsShown = ({ excessPaths, resolved }, frame, chosen) => {
 
 const trueLandmarks = new Map();
 if (mission.landmarks) {
-  mission.landmarks.label.forEach((label, i) => {
-    const [x, y] = mission.landmarks.place.subarray(2 * i, 2 * i + 2);
+  const [labels, places] = mission.landmarks;
+  labels.forEach((label, i) => {
+    const [x, y] = places.subarray(2 * i, 2 * i + 2);
     trueLandmarks.set(label, { x, y });
   });
 }

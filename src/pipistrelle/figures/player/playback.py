@@ -9,27 +9,28 @@ embedded, and all text is escaped by the template. A script for another viewer i
 import base64
 import json
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, is_dataclass, replace
 from importlib.resources import files
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
 from jaxtyping import Float, Int
 from markupsafe import Markup
+from pydantic.alias_generators import to_camel
 
 from pipistrelle import __version__
 from pipistrelle.acoustics.paths import moves
 from pipistrelle.config import InputError
 from pipistrelle.detection.scans import UNLABELLED
-from pipistrelle.estimation.beliefs import Landmarks, some_of
+from pipistrelle.estimation.beliefs import Gaussian, Landmarks, no_landmarks, some_of
 from pipistrelle.estimation.catalogue import title_of
-from pipistrelle.experiments.drives import LabelledPoints
+from pipistrelle.experiments.drives import LabelledPoints, Truth
 from pipistrelle.experiments.results.scores import TrialResult
 from pipistrelle.experiments.runs.heard_world import Mission
 from pipistrelle.figures.maps import PLACED, RAY, view
 from pipistrelle.figures.mission import outcome
 from pipistrelle.figures.recorder import (
-    MAX_ELLIPSES,
     Snapshot,
     callers_at,
     callers_marked,
@@ -144,36 +145,39 @@ def playback(
         why = "; ".join(f"{t.strategy} {t.filter}: {t.error}" for t in done.trials if t.error)
         raise InputError(f"no estimate has a frame to show ({why or 'nothing was heard'})")
     longest = max((snapshots[t.strategy, t.filter] for t in trials), key=len)
-    chosen = np.unique(
-        np.linspace(0, len(longest) - 1, min(most, len(longest))).round().astype(int)
-    )
-    clock, time = trials[0].track.time, np.array([longest[i].scan.time for i in chosen.tolist()])
+    chosen = np.linspace(0, len(longest) - 1, min(most, len(longest))).round().astype(int)
+    clock = trials[0].track.time
+    time = np.array([longest[i].scan.time for i in np.unique(chosen).tolist()])
     steps = np.minimum(np.searchsorted(clock, time), len(clock) - 1)
-    origin = _origin(trials)
-    estimates = []
-    for trial in trials:
-        frames = snapshots[trial.strategy, trial.filter]
-        estimates.append(_estimate(trial, frames, time, steps, done, origin))
-    true, points = done.drive.truth.path, done.drive.truth.landmarks
-    title, facts = _title_and_facts(done, len(longest), len(time))
+    start = trials[0].track.pose.mean[0, :2]
+    far = np.isfinite(start) & (np.abs(start) > MAX_COORDINATE)
+    origin = np.where(far, np.round(start, -2), 0.0)
+    truth, (x, y) = done.drive.truth, origin.tolist()
+    true_path = None if truth.path is None else truth.path - [x, y, 0.0]
+    paths = [trial.track.pose.mean for trial in trials]
+    maps = [trial.track.landmarks for trial in trials]
+    (left, right), (bottom, top) = view(truth, done.callers, paths, maps)
     return Playback(
-        title=title,
-        facts=facts,
+        title=f"Log {spelt(done.log.name)}" if done.log else f"Mission of seed {done.config.seed}",
+        facts=_facts(done, len(longest), len(time)),
         time=time - clock[0],
         origin=origin,
-        limits=_limits(done, trials, origin),
-        true_start=None if true is None else _moved(true[0], origin),
-        true_pose=None if true is None else _moved(true[steps], origin),
-        landmarks=points and (points[0], points[1] - origin),
+        limits=((left - x, right - x), (bottom - y, top - y)),
+        true_start=None if true_path is None else true_path[0],
+        true_pose=None if true_path is None else true_path[steps],
+        landmarks=truth.landmarks and (truth.landmarks[0], truth.landmarks[1] - origin),
         callers=_callers(done, steps, origin),
         beamwidth=done.beamwidth,
         farthest=done.config.rays.range_bounds[1],
-        estimates=tuple(estimates),
+        estimates=tuple(
+            _estimate(trial, snapshots[trial.strategy, trial.filter], time, steps, truth, origin)
+            for trial in trials
+        ),
     )
 
 
-def _title_and_facts(done: Mission, frames: int, shown: int) -> tuple[str, tuple[str, ...]]:
-    """Return title and facts of a mission."""
+def _facts(done: Mission, frames: int, shown: int) -> tuple[str, ...]:
+    """Return facts about a mission."""
     time = done.trials[0].track.time
     facts = [f"{time[-1] - time[0]:.1f} s", f"{frames} frames"]
     if shown < frames:
@@ -185,34 +189,7 @@ def _title_and_facts(done: Mission, frames: int, shown: int) -> tuple[str, tuple
         facts.append(f"{len(done.drive.truth.landmarks[0])} landmarks")
     if done.drive.truth.path is None:
         facts.append("no truth known")
-    title = f"Log {spelt(done.log.name)}" if done.log else f"Mission of seed {done.config.seed}"
-    return title, tuple(facts)
-
-
-def _origin(trials: Sequence[TrialResult]) -> Float[np.ndarray, "2"]:
-    """Return the origin of coordinates: 0 unless the start is far from it."""
-    start = trials[0].track.pose.mean[0, :2]
-    far = np.isfinite(start) & (np.abs(start) > MAX_COORDINATE)
-    return np.where(far, np.round(start, -2), 0.0)
-
-
-def _moved(poses: Float[np.ndarray, "*n d"], origin: Float[np.ndarray, "2"]) -> np.ndarray:
-    """Return poses or points relative to an origin."""
-    shift = np.zeros(poses.shape[-1])
-    shift[:2] = origin
-    return poses - shift
-
-
-def _limits(
-    done: Mission, trials: Sequence[TrialResult], origin: Float[np.ndarray, "2"]
-) -> tuple[tuple[float, float], tuple[float, float]]:
-    """Return the limits of the mission's figure."""
-    paths = [trial.track.pose.mean for trial in trials]
-    (left, right), (bottom, top) = view(
-        done.drive.truth, done.callers, paths, [trial.track.landmarks for trial in trials]
-    )
-    x, y = origin.tolist()
-    return (left - x, right - x), (bottom - y, top - y)
+    return tuple(facts)
 
 
 def _callers(
@@ -237,7 +214,7 @@ def _estimate(
     frames: Sequence[Snapshot],
     time: Float[np.ndarray, " n"],
     steps: Int[np.ndarray, " n"],
-    done: Mission,
+    truth: Truth,
     origin: Float[np.ndarray, "2"],
 ) -> Estimate:
     """Return an estimate at each time, by the latest of its frames."""
@@ -248,30 +225,44 @@ def _estimate(
     shown = [frames[i] for i in at.tolist()]
     if trial.track.online is not None:
         shown[-1] = replace(shown[-1], landmarks=trial.track.landmarks)
-    covariance = np.array([frame.covariance for frame in shown])
-    before = [None, *(frame.landmarks for frame in shown[:-1])]
-    gone = [_gone(old, frame.landmarks) for old, frame in zip(before, shown, strict=True)]
-    first = trial.track.online or trial.track.pose
-    revised_at, revised = _revised(trial, frames, at, steps, origin)
+    covariance, shift = np.array([frame.covariance for frame in shown]), np.append(origin, 0.0)
+    scans, heard = [frame.scan for frame in shown], [heard_from(frame.scan) for frame in shown]
+    maps, nothing = [frame.landmarks for frame in shown], no_landmarks()
+    gone = [
+        nothing if old is new else some_of(old, pruned(old, new))
+        for old, new in pairwise([nothing, *maps])
+    ]
+    timed = [[row for rows in excess_paths_at(frame).values() for row in rows] for frame in shown]
+    clouds = [frame.cloud for frame in shown if frame.cloud is not None]
+    whole = len(clouds) == len(shown) and len({len(cloud) for cloud in clouds}) == 1
+    every = -(-len(clouds[0]) // MAX_PARTICLES) if whole else 1
+    revised_at, paths = _revised(trial, frames, at, steps)
 
-    def named(rows: Rows) -> Rows:
-        return replace(rows, landmark=_named(rows.landmark, trial))
+    def moments(of: Gaussian | Landmarks) -> Float[np.ndarray, "h 5"]:
+        return np.column_stack([of.mean - origin, of.covariance[:, (0, 0, 1), (0, 1, 1)]])
 
+    callers = np.array([moments(callers_at(frame))[1:] for frame in shown])
     return Estimate(
         strategy=trial.strategy,
         filter=trial.filter,
-        outcome=f"failed: {trial.error}" if trial.error else outcome(trial, done.drive.truth),
-        start=_moved(first.mean[0], origin),
-        pose=_moved(np.array([frame.pose for frame in shown]), origin),
+        outcome=f"failed: {trial.error}" if trial.error else outcome(trial, truth),
+        start=(trial.track.online or trial.track.pose).mean[0] - shift,
+        pose=np.array([frame.pose for frame in shown]) - shift,
         spread=covariance[:, (0, 0, 1, 2), (0, 1, 1, 2)],
-        heard=named(_heard(shown)),
-        mapped=named(_mapped([frame.landmarks for frame in shown], origin)),
-        pruned=named(_mapped(gone, origin)),
-        cloud=_cloud(shown, origin),
+        heard=_rows(trial, [(scan.landmark, scan.bearing, scan.range) for scan in heard]),
+        mapped=_rows(trial, [(m.landmark, moments(m), m.weight) for m in maps]),
+        pruned=_rows(trial, [(m.landmark, moments(m), m.weight) for m in gone]),
+        cloud=np.array([cloud[::every] for cloud in clouds]) - shift if whole else None,
         revised_at=revised_at,
-        revised=revised,
-        callers=_callers_believed(shown, origin) if callers_marked(trial.scans) else None,
-        excess_paths=named(_excess_paths(shown)),
+        revised=_rows(trial, [(np.zeros(len(path), int), path - origin) for path in paths]),
+        callers=callers if callers_marked(trial.scans) else None,
+        excess_paths=_rows(
+            trial,
+            [
+                (scan.landmark[rows], scan.caller[rows] - 1, scan.excess_path[rows])
+                for scan, rows in zip(scans, timed, strict=True)
+            ],
+        ),
         resolved=_named(np.array(resolved(frames), dtype=int)[at], trial),
     )
 
@@ -287,77 +278,15 @@ def _named(labels: Int[np.ndarray, " n"], trial: TrialResult) -> Int[np.ndarray,
     return np.array([names.get(label, -2 - label) for label in labels.tolist()], dtype=int)
 
 
-def _rows(landmarks: Sequence[np.ndarray], numbers: Sequence[np.ndarray], columns: int) -> Rows:
-    """Return the rows of all frames, concatenated."""
+def _rows(trial: TrialResult, frames: Sequence[tuple[np.ndarray, ...]]) -> Rows:
+    """Return the rows of all frames, given the labels and the columns of numbers of each."""
+    labels = np.concatenate([np.empty(0, int), *(labels.astype(int) for labels, *_ in frames)])
+    numbers = [np.column_stack(columns) for _, *columns in frames]
     return Rows(
         first=np.cumsum([0, *map(len, numbers)]),
-        landmark=np.concatenate([np.empty(0, int), *landmarks]),
-        numbers=np.concatenate([np.empty((0, columns)), *numbers]),
+        landmark=_named(labels, trial),
+        numbers=np.concatenate(numbers) if numbers else np.empty((0, 2)),
     )
-
-
-def _heard(frames: Sequence[Snapshot]) -> Rows:
-    """Return bearings and ranges of all frames."""
-    scans = [heard_from(frame.scan) for frame in frames]
-    numbers = [np.column_stack([scan.bearing, scan.range]) for scan in scans]
-    return _rows([scan.landmark for scan in scans], numbers, 2)
-
-
-def _callers_believed(
-    frames: Sequence[Snapshot], origin: Float[np.ndarray, "2"]
-) -> Float[np.ndarray, "n c 5"]:
-    """Return mean and covariance of the callers' positions at all frames."""
-    believed = [callers_at(frame) for frame in frames]
-    return np.array(
-        [
-            np.column_stack([b.mean - origin, b.covariance[:, (0, 0, 1), (0, 1, 1)]])[1:]
-            for b in believed
-        ]
-    )
-
-
-def _excess_paths(frames: Sequence[Snapshot]) -> Rows:
-    """Return caller, without the vehicle, and excess path of the ellipses of all frames."""
-    labels, numbers = [], []
-    for frame in frames:
-        rows = [
-            row
-            for found in excess_paths_at(frame).values()
-            for row in found[:MAX_ELLIPSES].tolist()
-        ]
-        scan = frame.scan
-        labels.append(scan.landmark[rows].astype(int))
-        numbers.append(np.column_stack([scan.caller[rows] - 1, scan.excess_path[rows]]))
-    return _rows(labels, numbers, 2)
-
-
-def _mapped(maps: Sequence[Landmarks], origin: Float[np.ndarray, "2"]) -> Rows:
-    """Return mean, covariance and weight of all Gaussian hypotheses of the frames' maps."""
-    numbers = [
-        np.column_stack([rows.mean - origin, rows.covariance[:, (0, 0, 1), (0, 1, 1)], rows.weight])
-        for rows in maps
-    ]
-    return _rows([rows.landmark for rows in maps], numbers, 6)
-
-
-def _gone(before: Landmarks | None, after: Landmarks) -> Landmarks:
-    """Return the members of a map that the next map lacks."""
-    rows = after if before is None else before
-    kept = np.zeros(len(rows.landmark), bool)
-    if before is not None and before is not after:
-        kept = pruned(before, after)
-    return some_of(rows, kept)
-
-
-def _cloud(
-    frames: Sequence[Snapshot], origin: Float[np.ndarray, "2"]
-) -> Float[np.ndarray, "n p 3"] | None:
-    """Return at most MAX_PARTICLES particles of all frames."""
-    clouds = [frame.cloud for frame in frames if frame.cloud is not None]
-    if len(clouds) < len(frames) or len({len(cloud) for cloud in clouds}) != 1:
-        return None
-    every = -(-len(clouds[0]) // MAX_PARTICLES)
-    return _moved(np.array([cloud[::every] for cloud in clouds]), origin)
 
 
 def _revised(
@@ -365,20 +294,21 @@ def _revised(
     frames: Sequence[Snapshot],
     at: Int[np.ndarray, " n"],
     steps: Int[np.ndarray, " n"],
-    origin: Float[np.ndarray, "2"],
-) -> tuple[Int[np.ndarray, " j"], Rows]:
-    """Return the frames with a revised path, and the paths from the start to each."""
-    revised = [(i, frame.path) for i, frame in enumerate(frames) if frame.path is not None]
-    found = [(int(np.searchsorted(at, i)), path) for i, path in revised]
+) -> tuple[Int[np.ndarray, " j"], list[Float[np.ndarray, "_ 2"]]]:
+    """Return the frames with a revised path, and the paths from the start to each [m]."""
+    found = [
+        (int(np.searchsorted(at, i)), frame.path)
+        for i, frame in enumerate(frames)
+        if frame.path is not None
+    ]
     found = [(shown, path) for shown, path in found if shown < len(at) - 1]
     if trial.track.online is not None:
         found.append((len(at) - 1, trial.track.pose.mean[:, :2]))
-    points = []
+    paths = []
     for shown, path in found:
         so_far = np.concatenate([[0], steps[: shown + 1]])
-        points.append(path[so_far[so_far < len(path)]] - origin)
-    nobody = [np.zeros(len(part), int) for part in points]
-    return np.array([shown for shown, _ in found], dtype=int), _rows(nobody, points, 2)
+        paths.append(path[so_far[so_far < len(path)]])
+    return np.array([shown for shown, _ in found], dtype=int), paths
 
 
 def page(playback: Playback) -> str:
@@ -390,7 +320,7 @@ def page(playback: Playback) -> str:
         autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True
     )
     template = environment.from_string((here / "page.html").read_text(encoding="utf-8"))
-    script = "".join((here / name).read_text(encoding="utf-8") for name in SCRIPTS)
+    numbers = json.dumps(_numbers(playback), allow_nan=False, separators=(",", ":"))
     text = template.render(
         title=playback.title,
         excess_paths=any(len(estimate.excess_paths.landmark) for estimate in playback.estimates),
@@ -398,91 +328,50 @@ def page(playback: Playback) -> str:
         version=__version__,
         colours=Markup(page_colours()),
         style=Markup((here / "page.css").read_text(encoding="utf-8")),
-        script=Markup(script),
-        numbers=Markup(_json(_numbers(playback))),
+        script=Markup("".join((here / name).read_text(encoding="utf-8") for name in SCRIPTS)),
+        # No character may end the element of the page.
+        numbers=Markup(numbers.replace("<", "\\u003c").replace("&", "\\u0026")),
     )
     return upright(text)
 
 
 def _numbers(playback: Playback) -> dict[str, Any]:
     """Return the input of the page's script."""
-    landmarks, true = playback.landmarks, playback.true_pose
-    return {
-        "time": _packed(playback.time),
-        "origin": playback.origin.tolist(),
-        "limits": playback.limits,
-        "trueStart": None if playback.true_start is None else _packed(playback.true_start),
-        "truePose": None if true is None else _packed(true),
-        "landmarks": None
-        if landmarks is None
-        else {"label": _packed(landmarks[0]), "place": _packed(landmarks[1])},
+    return _packed(replace(playback, callers=(), estimates=())) | {
         "callers": [
-            {
-                "label": label,
-                "name": upright(name),
-                "moves": place.ndim == 2,
-                "place": _packed(place),
-            }
+            {"label": label, "name": upright(name), "moves": place.ndim == 2}
+            | {"place": _packed(place)}
             for label, name, place in playback.callers
         ],
-        "beamwidth": playback.beamwidth,
-        "farthest": playback.farthest,
         "scales": {"placed": _scale(PLACED), "ray": _scale(RAY), "pose": POSE_STDS},
-        "estimates": [_packed_estimate(estimate) for estimate in playback.estimates],
+        "estimates": [
+            _packed(estimate)
+            | {
+                "name": f"{estimate.strategy} · {title_of(estimate.filter)}",
+                "role": estimate.strategy if estimate.strategy in STRATEGY_COLOURS else "ink",
+            }
+            for estimate in playback.estimates
+        ],
     }
-
-
-def _packed_estimate(estimate: Estimate) -> dict[str, Any]:
-    """Return the input of the page's script for an estimate."""
-    known = estimate.strategy in STRATEGY_COLOURS
-    optional = {}
-    if estimate.callers is not None:
-        optional["callers"] = _packed(estimate.callers)
-    if len(estimate.excess_paths.landmark):
-        optional |= {
-            "excessPaths": _packed_rows(estimate.excess_paths),
-            "resolved": _packed(estimate.resolved),
-        }
-    return optional | {
-        "name": f"{estimate.strategy} · {title_of(estimate.filter)}",
-        "role": estimate.strategy if known else "ink",
-        "calls": estimate.strategy != "passive",
-        "outcome": upright(estimate.outcome),
-        "start": _packed(estimate.start),
-        "pose": _packed(estimate.pose),
-        "spread": _packed(estimate.spread),
-        "heard": _packed_rows(estimate.heard),
-        "mapped": _packed_rows(estimate.mapped),
-        "pruned": _packed_rows(estimate.pruned),
-        "cloud": None
-        if estimate.cloud is None
-        else {"particles": estimate.cloud.shape[1], "pose": _packed(estimate.cloud)},
-        "revisedAt": _packed(estimate.revised_at),
-        "revised": _packed_rows(estimate.revised),
-    }
-
-
-def _packed_rows(rows: Rows) -> dict[str, Any]:
-    """Pack rows."""
-    columns = rows.numbers.shape[1]
-    packed = {"first": rows.first, "landmark": rows.landmark, "numbers": rows.numbers}
-    return {"columns": columns} | {name: _packed(part) for name, part in packed.items()}
 
 
 @np.errstate(over="ignore", invalid="ignore")
-def _packed(numbers: np.ndarray) -> dict[str, str]:
-    """Return numbers in base64, as little-endian int32 or float32."""
-    whole = np.issubdtype(numbers.dtype, np.integer)
+def _packed(value: Any) -> Any:
+    """Convert a value to JSON: records without None, arrays as little-endian int32 or float32."""
+    if is_dataclass(value):
+        parts = {to_camel(field.name): getattr(value, field.name) for field in fields(value)}
+        return {name: _packed(part) for name, part in parts.items() if part is not None}
+    if isinstance(value, tuple):
+        return [_packed(part) for part in value]
+    if isinstance(value, str):
+        return upright(value)
+    if not isinstance(value, np.ndarray):
+        return value
+    whole = np.issubdtype(value.dtype, np.integer)
     name, kind = ("int32", "<i4") if whole else ("float32", "<f4")
-    return {name: base64.b64encode(numbers.astype(kind).tobytes()).decode("ascii")}
+    return {name: base64.b64encode(value.astype(kind).tobytes()).decode("ascii")}
 
 
 def _scale(probability: float) -> float:
     """Return the size, in standard deviations, of an ellipse that contains a probability."""
     return float(np.sqrt(-2.0 * np.log1p(-probability)))
-
-
-def _json(value: Any) -> str:
-    """Return JSON without characters that could end its element of the page."""
-    text = json.dumps(value, allow_nan=False, separators=(",", ":"))
-    return text.replace("<", "\\u003c").replace("&", "\\u0026")
