@@ -20,7 +20,7 @@ from pipistrelle.config import (
 from pipistrelle.estimation.catalogue import COPIES
 from pipistrelle.experiments import machine
 from pipistrelle.experiments.machine import check_length, check_memory
-from pipistrelle.experiments.runs import validate as validate_mission
+from pipistrelle.experiments.runs import validate
 from pipistrelle.experiments.runs.trial import run_mission
 from pipistrelle.experiments.studies.plan import Plan
 from pipistrelle.experiments.studies.study import run_study
@@ -67,7 +67,7 @@ def test_a_refusal_of_dense_rays_names_their_members(monkeypatch):
 
 def test_too_many_steps_are_refused_before_a_path_is_drawn(monkeypatch):
     monkeypatch.setattr(machine, "installed", lambda: 4.0 * GB)
-    monkeypatch.setattr(validate_mission, "world_of", lambda _: pytest.fail("drawn"))
+    monkeypatch.setattr(validate, "world_of", lambda _: pytest.fail("drawn"))
     config = Config(scenario=ScenarioConfig(steps=200_000_000))
     with pytest.raises(InputError, match=r"200,000,000 steps may need .* GB .* has 4.0 GB"):
         run_mission(config, ["fused"])
@@ -136,7 +136,7 @@ def test_a_run_that_hears_passively_among_others_needs_room_for_rays(monkeypatch
     config = Config(scenario=ScenarioConfig(steps=8))
     # EKF-SLAM of 51 landmarks: 24 bytes times the square of 105 numbers, or of 411 with rays.
     monkeypatch.setattr(machine, "installed", lambda: 1e6)
-    monkeypatch.setattr(validate_mission, "check_recording", lambda *_, **__: None)
+    monkeypatch.setattr(validate, "check_recording", lambda *_, **__: None)
     for ways in (("active", "passive"), ("fused", "active")):
         with pytest.raises(InputError, match=r"ekf: 51 landmarks of 4 members each \(rays"):
             run_mission(config, ways)

@@ -13,8 +13,7 @@ from numba.core.event import install_timer
 from pipistrelle import kernel_clock
 from pipistrelle.config import Config, InputError, ScenarioConfig
 from pipistrelle.estimation.catalogue import CATALOGUE
-from pipistrelle.experiments.runs import compiling, trial
-from pipistrelle.experiments.runs import validate as validate_mission
+from pipistrelle.experiments.runs import compiling, trial, validate
 
 TINY = Config(scenario=ScenarioConfig(steps=8, landmarks=4, radius=10.0))
 COLD = """
@@ -84,7 +83,7 @@ def test_nothing_is_announced_while_input_is_judged(said, monkeypatch):
         numba.njit(lambda x: x + 4)(1.0)
         raise InputError("scenario.landmarks: too many")
 
-    monkeypatch.setattr(validate_mission, "world_of", drawn)
+    monkeypatch.setattr(validate, "world_of", drawn)
     with pytest.raises(InputError, match="too many"):
         trial.run_mission(TINY, ("fused",))
     assert said == []

@@ -99,14 +99,6 @@ def scans_of(
     return tuple(noise(scan) for frame, scan in scans if scan.landmark.size or not frame.between)
 
 
-def frame_causes(heard: Sequence[FrameMeasurements], scans: Sequence[Scan]) -> Causes:
-    """Return the true label of each measurement in scans without labels, from `scans_of`."""
-    frames = {frame.rows.time: frame for frame in heard}
-    return tuple(
-        causes_of(scan, _unlabelled(frames[scan.time]), frames[scan.time].causes) for scan in scans
-    )
-
-
 def _unlabelled(frame: FrameMeasurements) -> Scan:
     """Return a frame's measurements without labels; raise if it was simulated with labels only."""
     if frame.unlabelled is None:
@@ -176,7 +168,9 @@ class HeardWorld:
         """Return the true label of each measurement of a strategy; None for known labels."""
         if config.association.method == KNOWN:
             return None
-        return frame_causes(self.beams[config.emitter.radius], self.scans(config, strategy))
+        frames = {frame.rows.time: frame for frame in self.beams[config.emitter.radius]}
+        pairs = ((scan, frames[scan.time]) for scan in self.scans(config, strategy))
+        return tuple(causes_of(scan, _unlabelled(frame), frame.causes) for scan, frame in pairs)
 
     def bound(self, config: Config, strategy: Strategy) -> Float[np.ndarray, "t 3 3"]:
         """Return the bound on the covariance of the pose at every step, for the measured noise."""

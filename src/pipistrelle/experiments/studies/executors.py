@@ -28,13 +28,13 @@ _NO_PAGES = {f"distributed.{who}.http.routes": [] for who in ("scheduler", "work
 
 Task = Callable[[int], list[Outcome]]
 """Computes a world, writes its results, and returns the outcome of its trials."""
-Ended = tuple[int, "Future[list[Outcome]]"]
-"""Number of a finished world, and the future of its trials."""
 Results = Generator[list[Outcome], None, None]
 """The trials of each world, in the order in which the worlds end."""
 
 
-def ended(executor: Executor, task: Task, waiting: deque[int], ahead: int) -> Iterator[Ended]:
+def ended(
+    executor: Executor, task: Task, waiting: deque[int], ahead: int
+) -> Iterator[tuple[int, Future[list[Outcome]]]]:
     """Keep an executor busy; yield each finished world with the future of its trials.
 
     At most `ahead` worlds are pending. Once the executor is broken, no more are submitted, and the
@@ -62,37 +62,24 @@ def in_processes(task: Task, give_up: Task, waiting: deque[int], workers: int) -
     The worlds of processes that died are tried again, in a single process; `give_up` is called for
     a world that has lost its process twice.
     """
-    alive = False
-    while waiting:
-        suspects, lost = deque[int](), deque[int]()
-        alive |= yield from _in_pool(task, waiting, workers, suspects)
-        while suspects:
-            alive |= yield from _in_pool(task, suspects, 1, lost)
-        if lost and not alive:
+    alive, suspects, lost = False, deque[int](), deque[int]()
+    while waiting or suspects:
+        queue, size, broken = (suspects, 1, lost) if suspects else (waiting, workers, suspects)
+        with _pool(min(size, len(queue))) as pool:
+            for iteration, future in ended(pool, task, queue, size):
+                try:
+                    yield future.result()
+                    alive = True
+                except BrokenExecutor:
+                    broken.append(iteration)
+        if lost and not suspects and not alive:
             raise InputError(
                 "workers: their processes end before a world is done: killed, out of memory, or "
                 'started by a script without if __name__ == "__main__"; one worker needs no other '
                 "process"
             )
-        yield from map(give_up, lost)
-
-
-def _in_pool(
-    task: Task, waiting: deque[int], workers: int, broken: deque[int]
-) -> Generator[list[Outcome], None, bool]:
-    """Run worlds until a process dies; put the unfinished running worlds into `broken`.
-
-    Returns whether any world has finished.
-    """
-    alive = False
-    with _pool(min(workers, len(waiting))) as pool:
-        for iteration, future in ended(pool, task, waiting, workers):
-            try:
-                yield future.result()
-                alive = True
-            except BrokenExecutor:
-                broken.append(iteration)
-    return alive
+        while lost and not suspects:
+            yield give_up(lost.popleft())
 
 
 @contextmanager

@@ -19,7 +19,7 @@ from pipistrelle.config import (
     WaterConfig,
 )
 from pipistrelle.experiments import machine
-from pipistrelle.experiments.runs import validate as validate_mission
+from pipistrelle.experiments.runs import validate
 from pipistrelle.experiments.runs.trial import run_mission
 from pipistrelle.experiments.runs.validate import checked_scenario, warnings_of
 from pipistrelle.settings import from_flags, resolve
@@ -108,7 +108,7 @@ def test_without_room_for_a_recording_the_setting_that_makes_it_long_is_named(mo
 
 
 def test_running_a_mission_checks_its_recording(monkeypatch):
-    monkeypatch.setattr(validate_mission, "check_recording", lambda *_, **__: pytest.fail("asked"))
+    monkeypatch.setattr(validate, "check_recording", lambda *_, **__: pytest.fail("asked"))
     with pytest.raises(pytest.fail.Exception, match="asked"):
         run_mission(Config(), ["fused"])
 
