@@ -34,6 +34,7 @@ extensions = [
     "sphinx.ext.autodoc",
     "sphinx.ext.napoleon",
     "sphinx_gallery.gen_gallery",
+    "docs.columns_page",
     "docs.formulae",
     "docs.glossary_page",
     "docs.settings_page",

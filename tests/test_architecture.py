@@ -103,7 +103,6 @@ AT_THE_DISK = {
     "experiments/studies/world.py": {"scan_parquet", "unlink"},  # checked; left by a kill
     "detection/sounds/sound_file.py": {"open"},  # a few bytes of an ordinary file
     "detection/logs/bag.py": {"open"},  # of a compressed file that rosbags has opened
-    "detection/logs/text_tables.py": {"loadtxt"},  # of lines that were read
     "figures/player/playback.py": {"read_text"},  # the package's own pages
     "report/page.py": {"read_text"},
     "files.py": {"read_bytes", "open", "unlink", "rmdir"},

@@ -22,11 +22,11 @@ import numpy as np
 
 from pipistrelle.detection.logs.folder import write_log
 from pipistrelle.detection.logs.recording import assemble
-from pipistrelle.detection.logs.text_tables import read_table, rows_kept
 from pipistrelle.detection.scans import UNLABELLED
 from pipistrelle.estimation.beliefs import Gaussian
 from pipistrelle.evaluation.accuracy import alignment, moved, rmse
 from pipistrelle.experiments.drives import carried
+from pipistrelle.text_tables import read_table, rows_kept
 
 SENSOR = (3.78, 0.50, 0.0)
 """The lidar in the car: ahead of the middle of the rear axle, to the left [m], and turned [rad]."""

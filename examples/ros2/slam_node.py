@@ -20,8 +20,7 @@ from tf2_ros import TransformBroadcaster
 
 from pipistrelle import InputError, Slam
 from pipistrelle.config import BagConfig
-from pipistrelle.detection.logs import live_messages as live
-from pipistrelle.detection.logs.bag_log import TRANSFORMS, Frames
+from pipistrelle.detection.logs import bag_log as live
 from pipistrelle.detection.logs.vehicle import read_vehicle
 from pipistrelle.experiments.results import ros
 
@@ -54,12 +53,12 @@ class SlamNode(Node):
                              association__method=said["association"])  # fmt: skip
         self.slam = self.begin()  # what is wrong with vehicle or estimator is said at once
         self.kind, self.map_frame = said["echoes_type"], said["map_frame"]
-        self.last, self.began, self.frames, self.waiting = None, math.inf, Frames(), []
+        self.last, self.began, self.frames, self.waiting = None, math.inf, live.Frames(), []
         learn = partial(live.learn_transforms, self.frames)
         for kind, topic, take, quality in (
             ("nav_msgs/msg/Odometry", said["odometry"], self.drive, FROM_ANYBODY),
             (self.kind, said["echoes"], self.listen, FROM_ANYBODY),
-            ("tf2_msgs/msg/TFMessage", TRANSFORMS, learn, LATCHED(depth=100)),
+            ("tf2_msgs/msg/TFMessage", live.TRANSFORMS, learn, LATCHED(depth=100)),
         ):
             self.create_subscription(get_message(kind), topic, partial(self.guarded, take), quality)
         self.pose = self.create_publisher(get_message(ros.POSE), "~/pose", 10)
@@ -79,8 +78,9 @@ class SlamNode(Node):
             time, _ = live.stamp_and_pose(message)
             self.slam, self.began = self.begin(time=time), math.nextafter(time, -math.inf)
         else:
-            before, step = self.slam.time, live.step_between(self.last, message, self.settings)
-            self.slam.move(step.controls, time=step.end)
+            before = self.slam.time
+            controls, end = live.step_between(self.last, message, self.settings)
+            self.slam.move(controls, time=end)
             self.began = before
         self.last = message
         self.tell(self.hear())
@@ -91,7 +91,7 @@ class SlamNode(Node):
             raise InputError("echoes without odometry before them are left out")
         base = self.last.child_frame_id
         self.waiting += live.scans_in(self.kind, message, base, self.frames, self.settings)
-        self.waiting.sort(key=lambda scan: scan.time)
+        self.waiting.sort(key=lambda scan: scan[0])
         if len(self.waiting) > MOST_WAITING:
             self.get_logger().warning("odometry is far behind; the oldest echoes are left out")
             del self.waiting[:-MOST_WAITING]
@@ -100,11 +100,11 @@ class SlamNode(Node):
 
     def hear(self):
         """Hear the scans of this step; tell whether there were any."""
-        due = [scan for scan in self.waiting if scan.time <= self.slam.time]
+        due = [scan for scan in self.waiting if scan[0] <= self.slam.time]
         self.waiting = self.waiting[len(due) :]
-        for scan in due:
-            late = scan.time if scan.time <= self.began else None  # Slam refuses it, by its time
-            self.guarded(lambda s, late=late: self.slam.hear(time=late, **s.columns), scan)
+        for time, columns in due:
+            late = time if time <= self.began else None  # Slam refuses it, by its time
+            self.guarded(lambda one, late=late: self.slam.hear(time=late, **one), columns)
         return bool(due)
 
     def tell(self, heard):

@@ -8,6 +8,7 @@ from collections.abc import Iterable
 from difflib import get_close_matches
 from typing import Any, get_args
 
+from pydantic import BaseModel, ValidationError
 from pydantic.fields import FieldInfo
 
 from pipistrelle.config import InputError
@@ -56,6 +57,52 @@ def values_expected(fault: Any, field: FieldInfo) -> int | None:
     """
     few = fault["type"] == "missing" and isinstance(fault["loc"][-1], int)
     return len(get_args(field.annotation)) if few or fault["type"] == "too_long" else None
+
+
+def table_refusal(
+    where: object, error: ValidationError, model: type[BaseModel], *first: str
+) -> InputError:
+    """Return the error of a table of keys that a model rejects, from its first fault.
+
+    Faults of the keys `first` precede those of unknown keys, and these all others. The missing keys
+    of a table are named at once. Tables in a list are numbered from 1.
+    """
+    faults, rank = error.errors(include_url=False), {name: n for n, name in enumerate(first)}
+    unknown = {"extra_forbidden": len(rank)}
+    fault = min(
+        faults, key=lambda f: rank.get(str(f["loc"][0]), unknown.get(f["type"], len(rank) + 1))
+    )
+    *within, last = fault["loc"]
+    key, known, field = "", model.model_fields, None
+    tables: list[Any] = [model]
+    for part in fault["loc"]:
+        if isinstance(part, int):
+            key += f".{part + 1}" if tables else f"[{part}]"
+            continue
+        key, known = f"{key}.{part}".removeprefix("."), tables[0].model_fields
+        field = known.get(part)
+        kinds = () if field is None else (field.annotation, *get_args(field.annotation))
+        tables = [kind for kind in kinds if isinstance(kind, type) and issubclass(kind, BaseModel)]
+    if fault["type"] == "missing" and isinstance(last, str):
+        names = [
+            f["loc"][-1] for f in faults if f["type"] == "missing" and f["loc"][:-1] == (*within,)
+        ]
+        named = ", ".join(
+            repr(key.removesuffix(last) + str(name)) for name in names if name in known
+        )
+        found, expected = f"no key{'s' * (', ' in named)} {named}", f"the keys {', '.join(known)}"
+        return refusal(where, found, expected, f"add {named}")
+    if fault["type"] == "extra_forbidden":
+        near = meant(str(last), known)
+        fix = f"did you mean {near!r}?" if near else "remove it"
+        return refusal(where, f"the unknown key {key!r}", f"one of {', '.join(known)}", fix)
+    if field is not None and (count := values_expected(fault, field)) is not None:
+        most = f"at most {fault['ctx']['max_length']}" if tables else f"{count}"
+        key = key.removesuffix(f"[{last}]")
+        found = f"{len(fault['input'])} values"
+        return refusal(f"{where}, key {key!r}", found, most, "correct the list")
+    found = shown(fault["input"])
+    return refusal(f"{where}, key {key!r}", found, expectation(fault), "correct the value")
 
 
 def meant(name: str, known: Iterable[str]) -> str | None:

@@ -15,23 +15,22 @@ microphones numbered from 1 in the order of the file.
 """
 
 import codecs
-import math
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
-from typing import NamedTuple
 from xml.parsers import expat
 
 import numpy as np
 from jaxtyping import Float, Int
 
 from pipistrelle.config import SQUARE, Config, InputError, MicrophoneRow, ReceiverConfig
-from pipistrelle.files import check_ordinary, read_named, read_text, write_whole
+from pipistrelle.files import check_ordinary, read_named, write_whole
 from pipistrelle.geometry import wrap
 from pipistrelle.refusals import refusal, shown
 from pipistrelle.settings import ARRAY_KEY, Layer
+from pipistrelle.text_tables import Schema, place_of, rows_kept, table_of, table_text
 
 MAX_MICROPHONES = 256
 """Most microphones of an array."""
@@ -41,10 +40,12 @@ MAX_EXTENT = 10.0
 """Largest width of an array [m]: a wider one is probably in millimetres."""
 SAME_PLACE = 1e-4
 """Least distance of two microphones [m]."""
-MAX_GAIN_DB = 100.0
-"""Largest gain of a microphone, and its negative the smallest [dB]."""
-REQUIRED = ("channel", "x", "y")
-OPTIONAL = ("z", "face", "gain_db")
+ARRAY = Schema(
+    file="array.csv",
+    row="a row is a microphone, in the vehicle's frame: x ahead, y to the left",
+    columns=("channel", "x", "y"),
+    optional=("z", "face", "gain_db"),
+)
 _MARKS = {
     codecs.BOM_UTF8: "utf-8-sig",
     codecs.BOM_UTF32_LE: "utf-32",
@@ -70,7 +71,6 @@ _OF_PYTHON = ("idna", "punycode", "undefined", "unicode-escape", "unicode_escape
               "raw-unicode-escape", "raw_unicode_escape")  # fmt: skip
 """Python codecs that are not encodings of files."""
 _FACE = re.compile(r"[\w-]{0,40}")
-_LIMITS = {"x": 1e6, "y": 1e6, "z": 1e6, "gain_db": MAX_GAIN_DB}
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -85,19 +85,6 @@ class Microphones:
     """Gain relative to the others, at equal noise [dB]."""
     face: tuple[str, ...]
     """Name of its face on the vehicle; empty without a face."""
-
-
-class _Row(NamedTuple):
-    """One microphone of a file or setting."""
-
-    place: str
-    """Line of the file, or row of the setting."""
-    channel: int
-    x: float
-    y: float
-    z: float = 0.0
-    face: str = ""
-    gain_db: float = 0.0
 
 
 def read_array(path: Path, *, some: bool = False) -> Microphones:
@@ -120,9 +107,26 @@ def read_array(path: Path, *, some: bool = False) -> Microphones:
         expected = f"an array of at most {MAX_MICROPHONES} microphones"
         raise refusal(path, f"{size / 1e6:.1f} MB", expected, "name the file of an array")
     text = _text_of_xml(path, read_named(path, "a readable text file"))
-    rows = list(_rows_of_csv(path, read_text(path)) if text is None else _rows_of_xml(path, text))
-    rows.sort(key=lambda row: row.channel)
-    return _checked(str(path), rows, some=some)
+    if text is None:
+        table = ARRAY.read(path, words={"face": ()})
+    else:
+        table = table_of(path, (*ARRAY.columns, "z"), _rows_of_xml(path, text), ARRAY.optional)
+    order = np.argsort(table.column["channel"], kind="stable")
+    table = rows_kept(table, order)
+    faces = tuple(name if isinstance(name, str) else "" for name in table.column["face"].tolist())
+    for row, name in enumerate(faces):
+        if not _FACE.fullmatch(name):
+            expected = "up to 40 letters, digits, _ and -, or nothing for one that hangs free"
+            raise refusal(place_of(table, row), f"face {shown(name)}", expected, "name it so")
+    column = {name: np.nan_to_num(table.column[name]) for name in ("x", "y", "z", "gain_db")}
+    gain_db = column.pop("gain_db")
+    microphones = Microphones(
+        channel=table.column["channel"],
+        position=np.column_stack([*column.values()]),
+        gain_db=gain_db,
+        face=faces,
+    )
+    return _checked(str(path), [f"line {line}" for line in table.line], microphones, some=some)
 
 
 def microphones_of(rows: Sequence[MicrophoneRow], where: str = "receiver.array") -> Microphones:
@@ -131,14 +135,13 @@ def microphones_of(rows: Sequence[MicrophoneRow], where: str = "receiver.array")
     >>> microphones_of([(0.0, 0.1, 0.0, 0.0, ""), (0.0, -0.1, 0.0, 0.0, "")]).channel
     array([1, 2])
     """
-    numbered = enumerate(rows, start=1)
-    return _checked(
-        where,
-        [
-            _Row(f"row {n}", n, x=x, y=y, z=z, gain_db=gain_db, face=face)
-            for n, (x, y, z, gain_db, face) in numbered
-        ],
+    microphones = Microphones(
+        channel=np.arange(1, len(rows) + 1),
+        position=np.array([row[:3] for row in rows]),
+        gain_db=np.array([row[3] for row in rows]),
+        face=tuple(row[4] for row in rows),
     )
+    return _checked(where, [f"row {n}" for n in microphones.channel], microphones)
 
 
 def with_array(layer: Layer) -> Layer:
@@ -155,16 +158,46 @@ def with_array(layer: Layer) -> Layer:
     return layer | {ARRAY_KEY: given._replace(value=rows)}
 
 
-def _checked(where: str, rows: list[_Row], *, some: bool = False) -> Microphones:
-    """Make microphones of rows sorted by channel; raise if they are not an array."""
-    _check_channels(where, rows, some=some)
-    _check_places(where, rows)
-    return Microphones(
-        channel=np.array([row.channel for row in rows]),
-        position=np.array([(row.x, row.y, row.z) for row in rows]),
-        gain_db=np.array([row.gain_db for row in rows]),
-        face=tuple(row.face for row in rows),
-    )
+def _checked(
+    where: str, places: Sequence[str], microphones: Microphones, *, some: bool = False
+) -> Microphones:
+    """Return microphones sorted by channel; raise if they are not an array.
+
+    `places`: their lines or rows, for errors; `some`: as in `read_array`.
+    """
+    channels = microphones.channel.tolist()
+    if not 2 <= len(channels) <= MAX_MICROPHONES:
+        found = f"{len(channels)} microphone" + "s" * (len(channels) != 1)
+        expected = f"2 to {MAX_MICROPHONES}"
+        raise refusal(where, found, expected, "one alone hears no direction; add the others")
+    for row, (earlier, channel) in enumerate(pairwise(channels), start=1):
+        place = f"{where}, {places[row]}"
+        if channel == earlier:
+            found, expected = f"channel {channel} again", f"it once, as in {places[row - 1]}"
+            raise refusal(place, found, expected, "renumber one")
+        if channel != earlier + 1 and not some:
+            fix = "add the row, or number the channels without gaps"
+            raise refusal(
+                place, f"channel {channel} after {earlier}", f"channel {earlier + 1}", fix
+            )
+    first = f"{where}, {places[0]}"
+    if some and channels[0] == 0:
+        raise refusal(first, "channel 0", "1 or more", "number the recording's channels from 1")
+    if channels[0] > 1 and not some:
+        found, fix = f"{channels[0]} as the first channel", "add the rows, or number them from 1"
+        raise refusal(first, found, "0 or 1", fix)
+    position = microphones.position
+    extent = float(np.ptp(position, axis=0).max())
+    if extent > MAX_EXTENT:
+        expected, fix = f"at most {MAX_EXTENT:g} m", "if x, y, z are millimetres, divide by 1000"
+        raise refusal(where, f"an array {extent:g} m wide", expected, fix)
+    for m, place in enumerate(places):
+        near = np.flatnonzero(np.linalg.norm(position[:m] - position[m], axis=1) < SAME_PLACE)
+        if near.size:
+            other = f"channel {channels[near[0]]} is ({places[near[0]]})"
+            found, expected = f"channel {channels[m]} where {other}", "microphones apart"
+            raise refusal(f"{where}, {place}, x, y, z", found, expected, "correct one")
+    return microphones
 
 
 def array_text(microphones: Microphones) -> str:
@@ -175,17 +208,15 @@ def array_text(microphones: Microphones) -> str:
     >>> array_text(pair)
     'channel,x,y\n0,0.0,0.0\n1,0.0,0.1\n'
     """
-    x, y, z = microphones.position.T.astype(float).tolist()
-    columns = {"channel": microphones.channel.tolist(), "x": x, "y": y}
-    if any(z):
-        columns["z"] = z
+    x, y, z = microphones.position.T.astype(float)
+    column = {"channel": microphones.channel, "x": x, "y": y}
+    if z.any():
+        column["z"] = z
     if any(microphones.face):
-        columns["face"] = list(microphones.face)
+        column["face"] = np.array(microphones.face)
     if microphones.gain_db.any():
-        columns["gain_db"] = microphones.gain_db.tolist()
-    rows = zip(*columns.values(), strict=True)
-    lines = [",".join(v if isinstance(v, str) else repr(v) for v in row) for row in rows]
-    return "\n".join([",".join(columns), *lines, ""])
+        column["gain_db"] = microphones.gain_db
+    return table_text(column)
 
 
 def write_array(path: Path, microphones: Microphones) -> None:
@@ -194,29 +225,6 @@ def write_array(path: Path, microphones: Microphones) -> None:
         write_whole(path, array_text(microphones).encode(), replace=False)
     except FileExistsError:
         raise refusal(path, "a file", "a new name", "name another, or move it away") from None
-
-
-def _rows_of_csv(path: Path, text: str) -> Iterator[_Row]:
-    """Yield the microphones of a CSV file; blank lines and lines with # are skipped."""
-    numbered = enumerate(text.splitlines(), start=1)
-    content = [(line, row) for line, row in numbered if row.strip() and row[0] != "#"]
-    expected = f"the header {','.join(REQUIRED)!r}, perhaps followed by {', '.join(OPTIONAL)}"
-    if not content:
-        raise refusal(path, "no rows", expected, "add a row for each microphone")
-    line, header = content.pop(0)
-    names = [name.strip().strip('"') for name in header.split(",")]
-    more = names[len(REQUIRED) :]
-    known = len(set(more)) == len(more) and set(more) <= set(OPTIONAL)
-    if tuple(names[: len(REQUIRED)]) != REQUIRED or not known:
-        fix = "part the columns by commas" if ";" in header or "\t" in header else "name them so"
-        raise refusal(f"{path}, line {line}", shown(header), expected, fix)
-    for line, row in content:
-        fields = [field.strip().strip('"') for field in row.split(",")]
-        where = f"{path}, line {line}"
-        if len(fields) != len(names):
-            found = f"{len(fields)} fields in {shown(row)}"
-            raise refusal(where, found, f"{len(names)}: {', '.join(names)}", "correct the row")
-        yield _row(path, line, dict(zip(names, fields, strict=True)))
 
 
 def _text_of_xml(path: Path, data: bytes) -> str | None:
@@ -244,9 +252,9 @@ def _text_of_xml(path: Path, data: bytes) -> str | None:
     raise refusal(path, found, expected, "save it as UTF-8, and declare that")
 
 
-def _rows_of_xml(path: Path, text: str) -> Iterator[_Row]:
-    """Return the microphones of Acoular's XML; raise at a document type (entities)."""
-    rows: list[_Row] = []
+def _rows_of_xml(path: Path, text: str) -> list[tuple[int, list[str]]]:
+    """Return line and fields of each microphone in Acoular's XML; raise at a document type."""
+    rows: list[tuple[int, list[str]]] = []
     parser = expat.ParserCreate("utf-8")  # overrides the declared encoding, as the text is decoded
     expected = "Acoular's <MicArray><pos x=... y=... z=.../></MicArray>"
 
@@ -261,8 +269,7 @@ def _rows_of_xml(path: Path, text: str) -> Iterator[_Row]:
             found = f"pos with {', '.join(fields) or 'nothing'}"
             raise refusal(where, found, "pos with x, y and z", "add the coordinates")
         if tag == "pos":
-            number = {"channel": str(len(rows) + 1)}
-            rows.append(_row(path, line, number | {axis: fields[axis] for axis in "xyz"}))
+            rows.append((line, [str(len(rows) + 1), *(fields[axis].strip() for axis in "xyz")]))
 
     parser.StartDoctypeDeclHandler, parser.StartElementHandler = refuse_type, begin
     try:
@@ -272,71 +279,7 @@ def _rows_of_xml(path: Path, text: str) -> Iterator[_Row]:
         raise refusal(where, expat.ErrorString(error.code), expected, "correct the file") from None
     if not rows:
         raise refusal(path, "XML without microphones", expected, "name the file of an array")
-    return iter(rows)
-
-
-def _row(path: Path, line: int, fields: dict[str, str]) -> _Row:
-    """Return the microphone of a line's fields; raise at the first invalid field."""
-    where, channel = f"{path}, line {line}", fields["channel"]
-    if not (channel.isdecimal() and channel.isascii() and len(channel) < 10):
-        found, expected = f"channel {shown(channel)}", "a whole number, from 0 or 1 on"
-        raise refusal(where, found, expected, "number the channels of the recording")
-    if not _FACE.fullmatch(face := fields.get("face", "")):
-        expected = "up to 40 letters, digits, _ and -, or nothing for one that hangs free"
-        raise refusal(where, f"face {shown(face)}", expected, "name it so")
-    numbers = {}
-    for name, limit in _LIMITS.items():
-        field = fields.get(name, "") or ("0" if name in OPTIONAL else "")
-        try:
-            numbers[name] = float(field.replace("_", "?"))
-        except ValueError:
-            numbers[name] = math.nan
-        if not abs(numbers[name]) <= limit:
-            unit = "dB" if name == "gain_db" else "m"
-            expected = f"a number between -{limit:g} and {limit:g} {unit}"
-            raise refusal(where, f"{name} {shown(field)}", expected, "correct the field")
-    return _Row(f"line {line}", channel=int(channel), face=face, **numbers)
-
-
-def _check_channels(path: str, rows: list[_Row], *, some: bool) -> None:
-    """Raise if sorted rows have wrong channel numbers, or gaps unless `some`."""
-    if not 2 <= len(rows) <= MAX_MICROPHONES:
-        found = f"{len(rows)} microphone" + "s" * (len(rows) != 1)
-        expected = f"2 to {MAX_MICROPHONES}"
-        raise refusal(path, found, expected, "one alone hears no direction; add the others")
-    for before, row in pairwise(rows):
-        where = f"{path}, {row.place}"
-        if row.channel == before.channel:
-            expected = f"it once, as in {before.place}"
-            raise refusal(where, f"channel {row.channel} again", expected, "renumber one")
-        if row.channel != before.channel + 1 and not some:
-            found = f"channel {row.channel} after {before.channel}"
-            fix = "add the row, or number the channels without gaps"
-            raise refusal(where, found, f"channel {before.channel + 1}", fix)
-    if some and rows[0].channel == 0:
-        where = f"{path}, {rows[0].place}"
-        fix = "number the recording's channels from 1"
-        raise refusal(where, "channel 0", "1 or more", fix)
-    if rows[0].channel > 1 and not some:
-        where = f"{path}, {rows[0].place}"
-        found = f"{rows[0].channel} as the first channel"
-        raise refusal(where, found, "0 or 1", "add the rows, or number the channels from 1")
-
-
-def _check_places(path: str, rows: list[_Row]) -> None:
-    """Raise if microphones coincide, or are implausibly far from each other."""
-    place = np.array([(row.x, row.y, row.z) for row in rows])
-    extent = float(np.ptp(place, axis=0).max())
-    if extent > MAX_EXTENT:
-        expected, fix = f"at most {MAX_EXTENT:g} m", "if x, y, z are millimetres, divide by 1000"
-        raise refusal(path, f"an array {extent:g} m wide", expected, fix)
-    for m, row in enumerate(rows):
-        near = np.flatnonzero(np.linalg.norm(place[:m] - place[m], axis=1) < SAME_PLACE)
-        if near.size:
-            other = rows[near[0]]
-            found = f"channel {row.channel} where channel {other.channel} is ({other.place})"
-            expected = "each microphone in a place of its own"
-            raise refusal(f"{path}, {row.place}, x, y, z", found, expected, "correct one")
+    return rows
 
 
 LINE_TOLERANCE = 1e-5

@@ -20,8 +20,7 @@ from pipistrelle.detection.logs.recording import (
     LogCaller,
     scan_at,
 )
-from pipistrelle.detection.logs.text_tables import Table
-from pipistrelle.detection.logs.vehicle import ODOMETRY, read_vehicle, vehicle_of
+from pipistrelle.detection.logs.vehicle import NOISY, read_vehicle, vehicle_of
 from pipistrelle.detection.logs.vehicle import Vehicle as VehicleKeys
 from pipistrelle.detection.noise import noise_of
 from pipistrelle.detection.scans import OWN
@@ -62,6 +61,7 @@ from pipistrelle.scripting.saved_state import (
     write_state,
 )
 from pipistrelle.settings import Given, from_keywords
+from pipistrelle.text_tables import Table
 
 if TYPE_CHECKING:
     import polars as pl
@@ -494,7 +494,7 @@ def _log_of(vehicle: Vehicle, time: float) -> tuple[Log, Path, VehicleKeys]:
         fix = "see docs/log_format.md"
         raise refusal("vehicle", shown(vehicle), "the path of a log.toml, or its keys", fix)
     none = {"scans": (), "ignored_rows": {}, "dt": np.empty(0), "former_names": former}
-    controls, start = np.empty((0, len(ODOMETRY[told.motion]))), np.array([time])
+    controls, start = np.empty((0, len(NOISY[told.motion]))), np.array([time])
     log = Log(name=str(where), time=start, controls=controls, **none, **told.told())
     return log, where, told
 

@@ -83,7 +83,7 @@ def log_warnings(recorded: "Log", truth: "Truth", log: Path) -> list[str]:
 
 def _doubts(recorded: "Log", truth: "Truth") -> Iterator[str]:
     """Yield the warnings on a log before it is solved."""
-    from pipistrelle.detection.logs.text_tables import FORMER_NAMES
+    from pipistrelle.text_tables import FORMER_NAMES
 
     yield from recorded.doubts
     if ignored := recorded.ignored_rows:

@@ -54,10 +54,15 @@ def pinged(time=0.2, frame="base_link", **told):
     return {"header": header(time, frame)} | told
 
 
+def written(path, *messages, **options):
+    """Write a bag of messages in the order of their times."""
+    return write_bag(path, sorted(messages, key=lambda one: one[2]), **options)
+
+
 def read(path, *messages, count=5, **settings):
     """Write a bag of a drive and these messages, and read it."""
-    told = sorted([*drive(count), *messages], key=lambda one: one[2])
-    return load(write_bag(path, told), bag=BagConfig(step=0.0, **settings))[0]
+    path = written(path, *drive(count), *messages)
+    return load(path, bag=BagConfig(step=0.0, **settings))[0]
 
 
 def only(log):
@@ -138,10 +143,9 @@ def test_detections_are_travel_times_by_angles_to_starboard(tmp_path, definition
         tx_delays=[0.05, 0.0, 0.0],
         rx_angles=[0.3, 0.1, 0.2],
     )
-    path = tmp_path / "walk.mcap"
-    messages = [*drive(), ("/sonar", DETECTIONS, 0.2, told)]
-    messages.sort(key=lambda one: one[2])
-    log = load(write_bag(path, messages, definitions=definitions), bag=BagConfig(step=0.0))[0]
+    ping = ("/sonar", DETECTIONS, 0.2, told)
+    path = written(tmp_path / "walk.mcap", *drive(), ping, definitions=definitions)
+    log = load(path, bag=BagConfig(step=0.0))[0]
     row = only(log)
     assert row.bearing[0] == pytest.approx(-0.3, abs=1e-6)
     assert row.range[0] == pytest.approx(7.5, rel=1e-6)
@@ -270,11 +274,8 @@ def test_transforms_are_followed_from_frame_to_frame_either_way(tmp_path):
 
 @pytest.mark.parametrize("profiling", [True, False])
 def test_angles_are_about_the_axis_of_either_convention(tmp_path, profiling):
-    # x up, y to starboard, z ahead, or x ahead, y left, z up
-    half = math.sqrt(0.5)
-    q = {"x": 0.0, "y": -half, "z": 0.0, "w": half} if profiling else {"w": 1.0}
-    if profiling:  # turn about y by -90 degrees takes x up and z to -x; half a turn about z, ahead
-        q = {"x": half, "y": 0.0, "z": half, "w": 0.0}
+    half = math.sqrt(0.5)  # x up, y to starboard, z ahead, or x ahead, y left, z up
+    q = {"x": half, "y": 0.0, "z": half, "w": 0.0} if profiling else {"w": 1.0}
     tie = ("/tf_static", TRANSFORMS, 0.0, static("base_link", "sonar", 0.0, 0.0, q=q))
     told = pinged(
         0.2, "sonar", ping_info={"sound_speed": 1500.0},
@@ -310,8 +311,7 @@ def test_steps_merge_more_frequent_odometry(tmp_path):
 
 
 def test_messages_are_timed_by_their_headers_unless_reception_is_asked_for(tmp_path):
-    told = [*drive(), seen(0.2)]
-    path = write_bag(tmp_path / "one.mcap", sorted(told, key=lambda one: one[2]), late=0.25)
+    path = written(tmp_path / "one.mcap", *drive(), seen(0.2), late=0.25)
     log = load(path, bag=BagConfig(step=0.0))[0]
     assert log.time[0] == 0.0
     assert any("/odom" in note and "received 0.25 s after" in note for note in log.notes)
@@ -336,8 +336,8 @@ def test_the_truth_is_a_topic_that_is_named_and_the_log_begins_there(tmp_path, n
         package = "nav_msgs" if name == "Odometry" else "geometry_msgs"
         return ("/true", f"{package}/msg/{name}", time, {"header": header(time)} | told)
 
-    told = [*drive(), *(truth(0.15 + 0.1 * i) for i in range(4)), seen(0.3)]
-    path = write_bag(tmp_path / "one.mcap", sorted(told, key=lambda one: one[2]))
+    truths = (truth(0.15 + 0.1 * i) for i in range(4))
+    path = written(tmp_path / "one.mcap", *drive(), *truths, seen(0.3))
     log, true = load(path, bag=BagConfig(step=0.0, truth="/true"))
     assert log.time[0] == pytest.approx(0.15)
     np.testing.assert_allclose(log.initial_pose, [5.15, -1.0, 0.25])
@@ -347,9 +347,7 @@ def test_the_truth_is_a_topic_that_is_named_and_the_log_begins_there(tmp_path, n
 
 def test_one_of_two_odometry_topics_is_chosen_by_name(tmp_path):
     other = [("/visual", *row[1:]) for row in drive()]
-    path = write_bag(
-        tmp_path / "one.mcap", sorted([*drive(), *other, seen(0.2)], key=lambda one: one[2])
-    )
+    path = written(tmp_path / "one.mcap", *drive(), *other, seen(0.2))
     refused(path, "several topics of odometry: /odom, /visual", "--bag.odometry")
     log, truth = load(path, bag=BagConfig(truth="/visual"))
     assert truth.path is not None
@@ -395,7 +393,7 @@ def test_invalid_orientations_are_refused_or_left_out(tmp_path, kind, topic):
             for one in ("/odom", "/true"):
                 q = wrong(kind, heading) if one == topic and i in odd else None
                 rows.append(turned(one, time, heading, q))
-        return write_bag(tmp_path / name, sorted([*rows, seen(1.0)], key=lambda one: one[2]))
+        return written(tmp_path / name, *rows, seen(1.0))
 
     settings = BagConfig(odometry="/odom", truth="/true", step=0.0)
     for odd in (range(12), range(7)):
@@ -422,8 +420,7 @@ def test_quaternions_of_fixed_point_are_turns(tmp_path, steps):
     for i in range(12):
         q = {name: round(v * steps) / steps for name, v in quaternion(0.3 * i).items()}
         rows.append(turned("/odom", 0.1 * i, 0.0, q))
-    path = write_bag(tmp_path / "one.mcap", sorted([*rows, seen(1.0)], key=lambda one: one[2]))
-    log, _ = load(path, bag=BagConfig(step=0.0))
+    log, _ = load(written(tmp_path / "one.mcap", *rows, seen(1.0)), bag=BagConfig(step=0.0))
     assert not log.ignored_rows
     np.testing.assert_allclose(log.controls[:, 2], 0.3, atol=4.0 / steps)
 
@@ -519,9 +516,8 @@ def test_too_many_steps_are_refused_by_the_gap_that_makes_them(tmp_path):
 
 
 def test_a_damaged_or_missing_bag_is_refused_by_name(tmp_path):
-    told = sorted([*drive(), seen(0.2)], key=lambda one: one[2])
     for name in KINDS[:3]:
-        whole = write_bag(tmp_path / name, told).read_bytes()
+        whole = written(tmp_path / name, *drive(), seen(0.2)).read_bytes()
         for i, data in enumerate((b"", whole[: len(whole) // 2], b"\0" * 200, whole[1:])):
             path = tmp_path / f"{i}{name}"
             path.write_bytes(data)
@@ -569,12 +565,11 @@ def test_a_damaged_or_missing_bag_is_refused_by_name(tmp_path):
     ],
 )
 def test_unusable_messages_are_refused_by_topic_and_number(tmp_path, told, parts):
-    path = write_bag(tmp_path / "one.mcap", sorted(told, key=lambda one: one[2]))
-    refused(path, *parts)
+    refused(written(tmp_path / "one.mcap", *told), *parts)
 
 
 def test_messages_missing_from_a_bags_file_are_reported(tmp_path):
-    path = write_bag(tmp_path / "walk", sorted([*drive(), seen(0.2)], key=lambda one: one[2]))
+    path = written(tmp_path / "walk", *drive(), seen(0.2))
     told = (path / "metadata.yaml").read_text()
     assert told.count("message_count: 5") == 1
     (path / "metadata.yaml").write_text(told.replace("message_count: 5", "message_count: 9"))
@@ -636,8 +631,8 @@ def test_an_mcap_is_read_whatever_its_index_lacks(tmp_path, how, index, statisti
     big = [
         ("/big", "std_msgs/msg/String", 0.05 + 0.1 * i, {"data": "x" * 600_000}) for i in range(4)
     ]
-    told = sorted([*drive(), *big, seen(0.2), seen(0.3)], key=lambda one: one[2])
-    path = write_bag(tmp_path / "one.mcap", told, compression=how)
+    messages = (*drive(), *big, seen(0.2), seen(0.3))
+    path = written(tmp_path / "one.mcap", *messages, compression=how)
     whole, _ = load(path, bag=BagConfig(step=0.0))
     indexed(path, statistics=statistics, **index)
     if index.get("chunks") and not statistics:
@@ -650,7 +645,7 @@ def test_an_mcap_is_read_whatever_its_index_lacks(tmp_path, how, index, statisti
 
 
 def test_an_mcap_with_missing_messages_is_refused_with_its_remedy(tmp_path):
-    path = write_bag(tmp_path / "one.mcap", sorted([*drive(), seen(0.2)], key=lambda one: one[2]))
+    path = written(tmp_path / "one.mcap", *drive(), seen(0.2))
     data = path.read_bytes()
     count = (1).to_bytes(2, "little") + (5).to_bytes(8, "little")
     assert data.count(count) == 1
@@ -662,7 +657,7 @@ def test_an_mcap_with_missing_messages_is_refused_with_its_remedy(tmp_path):
 
 
 def test_metadata_that_would_take_minutes_to_read_are_refused(tmp_path):
-    path = write_bag(tmp_path / "walk", sorted([*drive(), seen(0.2)], key=lambda one: one[2]))
+    path = written(tmp_path / "walk", *drive(), seen(0.2))
     told = (path / "metadata.yaml").read_text()
     (path / "metadata.yaml").write_text(told + "\n#" * 600_000)
     refused(path, "metadata.yaml", "expected at most 1000000")
@@ -696,8 +691,7 @@ def test_a_truncated_message_is_refused_by_its_topic(tmp_path):
     [("walk", "FILE"), ("walk", "MESSAGE"), ("walk.mcap", "STORAGE"), ("walk.bag", "LZ4")],
 )
 def test_compressed_bags_are_read(tmp_path, name, how):
-    told = sorted([*drive(), seen(0.2)], key=lambda one: one[2])
-    path = write_bag(tmp_path / name, told, compression=how)
+    path = written(tmp_path / name, *drive(), seen(0.2), compression=how)
     assert only(load(path)[0]).landmark[0] == 7
 
 
@@ -712,8 +706,7 @@ def test_compressed_bags_are_read(tmp_path, name, how):
     ],
 )
 def test_compressed_parts_that_unpack_to_too_much_are_refused(tmp_path, monkeypatch, name, how):
-    told = sorted([*drive(), seen(0.2)], key=lambda one: one[2])
-    path = write_bag(tmp_path / name, told, compression=how)
+    path = written(tmp_path / name, *drive(), seen(0.2), compression=how)
     with monkeypatch.context() as patch:
         patch.setattr("pipistrelle.detection.logs.bag.MOST_UNPACKED", 90)
         patch.setattr("pipistrelle.detection.logs.bag.ROOM", 0.0)
@@ -754,9 +747,7 @@ def ending(path):
 @pytest.mark.parametrize("times", [15, pytest.param(100, marks=pytest.mark.slow)])
 @pytest.mark.parametrize("name", KINDS[:3])
 def test_bytes_that_are_changed_at_random_end_in_a_log_or_a_refusal(tmp_path, name, times):
-    whole = write_bag(
-        tmp_path / name, sorted([*drive(), seen(0.2)], key=lambda one: one[2])
-    ).read_bytes()
+    whole = written(tmp_path / name, *drive(), seen(0.2)).read_bytes()
     rng, ends = np.random.default_rng(5), set()
     path = tmp_path / f"odd{Path(name).suffix}"
     for _ in range(times):
@@ -769,7 +760,7 @@ def test_bytes_that_are_changed_at_random_end_in_a_log_or_a_refusal(tmp_path, na
 
 
 def test_a_bag_without_rosbags_is_refused_with_the_install_command(tmp_path, monkeypatch):
-    path = write_bag(tmp_path / "one.mcap", sorted([*drive(), seen(0.2)], key=lambda one: one[2]))
+    path = written(tmp_path / "one.mcap", *drive(), seen(0.2))
     for name in [name for name in sys.modules if name.split(".")[0] == "rosbags"]:
         monkeypatch.delitem(sys.modules, name)
     monkeypatch.setitem(sys.modules, "rosbags", None)

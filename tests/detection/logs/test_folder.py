@@ -104,14 +104,14 @@ def test_a_bicycle_log_has_a_wheelbase_speed_and_steering(tmp_path):
     assert log.controls[0].tolist() == [1.0, 0.1]
 
 
-def test_optional_settings_are_read(tmp_path):
-    log = read_log(recorded(tmp_path, UNICYCLE + "gate = 0.99\nnoise_at_rest = false\n"))
-    assert (log.gate, log.noise_at_rest) == (0.99, False)
-
-
-def test_settings_accept_whole_numbers(tmp_path):
-    log = read_log(recorded(tmp_path, UNICYCLE.replace("range_std = 0.2", "range_std = 2")))
-    assert log.range_std == 2.0
+def test_optional_settings_are_read_and_may_be_whole_numbers(tmp_path):
+    more = "gate = 0.99\nnoise_at_rest = false\nsensor_pose = [3.8, 0.5, 0.1]\n"
+    more += "[association]\nmax_range = 50\nclutter = 0.01\n"
+    settings = UNICYCLE.replace("range_std = 0.2", "range_std = 2") + more
+    log = read_log(recorded(tmp_path, settings))
+    assert (log.gate, log.noise_at_rest, log.range_std) == (0.99, False, 2.0)
+    assert log.sensor_pose == (3.8, 0.5, 0.1)
+    assert log.association == {"max_range": 50.0, "clutter": 0.01}
 
 
 def test_rows_of_one_time_are_one_scan_and_an_empty_range_is_passive(folder):
@@ -145,16 +145,6 @@ def test_bearings_are_wrapped_below_pi(tmp_path):
     np.testing.assert_allclose(bearing[2:], [4.0 - 2 * np.pi, -9.0 + 2 * np.pi], rtol=1e-15)
 
 
-def test_blank_lines_comments_spaces_and_foreign_line_ends_do_no_harm(folder):
-    plain = read_log(folder)
-    for name in ("odometry.csv", "measurements.csv"):
-        lines = (folder / name).read_text().splitlines()
-        lines[0] = ", ".join(f'"{column}"' for column in lines[0].split(","))
-        text = "\r\n".join(["# by hand", lines[0], "", *(f" {line}" for line in lines[1:]), " "])
-        (folder / name).write_bytes(b"\xef\xbb\xbf" + text.encode())
-    assert same(read_log(folder), plain)
-
-
 # How sure a measurement is
 
 
@@ -175,24 +165,19 @@ def test_rows_may_state_their_standard_deviations(tmp_path, stated, rows, bearin
     assert scan.landmark.tolist() == [7, 3]
 
 
-def test_a_range_std_without_a_range_is_accepted(tmp_path):
-    rows = measured("0.1,7,0.5,,0.01,0.3", stated=STATED)
-    (scan,) = read_log(recorded(tmp_path, measurements=rows)).scans
-    assert np.isnan(scan.range).all()
-    assert scan.bearing_std.tolist() == [0.01]
-
-
 def test_stated_deviations_stay_with_their_rows_when_others_are_dropped(tmp_path):
     rows = [
         "0.1,-1,0,1,0.1,",
-        "0.1,7,0,1,0.2,",
+        "0.1,7,0,,0.2,0.3",
+        "0.1,-1,0,1,0.1,",
         "0.3,8,0,1,0.3,",
         "0.3,-1,0,1,0.4,",
         "9,8,0,1,0.5,",
     ]
     log = read_log(recorded(tmp_path, measurements=measured(*rows, stated=STATED)))
     assert [scan.bearing_std.tolist() for scan in log.scans] == [[0.2], [0.3]]
-    assert log.ignored_rows == {"clutter": 2, "outside_odometry": 1}
+    assert np.isnan(log.scans[0].range).all()
+    assert log.ignored_rows == {"clutter": 3, "outside_odometry": 1}
 
 
 # Merged steps
@@ -296,14 +281,6 @@ def test_a_missing_file_is_named(folder, name):
     refused(folder, name, "no such file")
 
 
-@pytest.mark.parametrize("name", ["odometry.csv", "measurements.csv"])
-@pytest.mark.parametrize("header_only", [True, False])
-def test_an_empty_file_is_named(folder, name, header_only):
-    header = (folder / name).read_text().splitlines()[0]
-    (folder / name).write_text(header if header_only else "")
-    refused(folder, name, "no rows", header.split(",")[1])
-
-
 def test_an_empty_settings_file_lacks_its_format(folder):
     (folder / "log.toml").write_text("")
     refused(folder, "log.toml", "no keys 'format', 'motion', ")
@@ -341,46 +318,18 @@ def test_measurements_without_a_usable_row_are_refused(tmp_path):
     refused(folder, "measurements.csv", left_out, "0.0 s and 0.4 s", "use the odometry's clock")
 
 
-def test_clutter_rows_may_have_the_same_time(tmp_path):
-    rows = ["0.1,-1,0.5,4.0", "0.1,7,0.5,4.0", "0.1,-1,0.2,"]
-    log = read_log(recorded(tmp_path, measurements=measured(*rows)))
-    assert [scan.landmark.tolist() for scan in log.scans] == [[7]]
-    assert log.ignored_rows == {"clutter": 2}
-
-
 ROWS = {
-    "unsquarable": ("0.1,7,1e155,1", "line 3", "bearing 1e+155", "between -1e+09 and 1e+09"),
-    "far": ("0.1,7,0.5,1e10", "line 3", "range 10000000000.0", "up to 1e+06 m"),
-    "no clutter": (
-        "0.1,-2,0.5,1",
-        "line 3",
-        "landmark -2.0",
-        "from 0 to 9007199254740991, or -1 for",
-    ),
-    "missing field": ("0.1,7,0.5", "line 3", "3 fields", "4: time, landmark, bearing, range"),
-    "extra field": ("0.1,7,0.5,1,2", "line 3", "5 fields", "4"),
-    "text": ("0.1,7,left,1", "line 3", "bearing 'left'", "a finite number"),
-    "underscore": ("0.1,7,0.5,1_0", "line 3", "range '1_0'", "a finite number"),
-    "empty": ("0.1,7,,1", "line 3", "bearing ''", "a finite number"),
-    "nan": ("nan,7,0.5,1", "line 3", "time 'nan'", "a finite number"),
-    "nan range": ("0.1,7,0.5,NaN", "line 3", "range 'NaN'", "leave it empty"),
-    "infinite": ("0.1,7,-inf,1", "line 3", "bearing '-inf'", "a finite number"),
-    "overflow": ("0.1,7,1e999,1", "line 3", "bearing '1e999'", "a finite number"),
-    "no range": ("0.1,7,0.5,0", "line 3", "range 0.0", "above 0 m"),
-    "negative range": ("0.1,7,0.5,-2", "line 3", "range -2.0", "above 0 m"),
-    "swapped": ("0.1,7,4.0,-2", "line 3", "range -2.0", "exchange bearing and range"),
-    "label": ("0.1,7.5,0.5,1", "line 3", "landmark 7.5", "an integer"),
-    "large label": (
-        "0.1,9007199254740992,0.5,1",
-        "line 3",
-        "landmark 9007199254740992.0",
-        "to 9007",
-    ),
-    "no label": ("0.1,,0.5,1", "line 3", "landmark ''", "clutter -1; or leave the field empty"),
-    "name": ("0.1,tree,0.5,1", "line 3", "landmark 'tree'", "a finite number"),
-    "backwards": ("0.05,7,0.5,1", "line 3", "time 0.05 after 0.06", "backwards"),
-    "twice": ("0.06,1,0.5,1", "line 3", "time 0.06, landmark 1 again", "line 2"),
-    "outside but wrong": ("99,7,0.5,-2", "line 3", "range -2.0", "above 0 m"),
+    "no clutter": ("landmark -2,", "from 0 to 9007199254740991, or -1 for", "0.1,-2,0.5,1"),
+    "large label": ("landmark 9007199254740992,", "to 9007", "0.1,9007199254740992,0.5,1"),
+    "no label": ("landmark ''", "clutter -1; or leave the field empty", "0.1,,0.5,1"),
+    "no range": ("range 0.0", "above 0 m", "0.1,7,0.5,0"),
+    "swapped": ("range -2.0", "exchange bearing and range", "0.1,7,4.0,-2"),
+    "nan range": ("range 'NaN'", "leave it empty", "0.1,7,0.5,NaN"),
+    "empty": ("bearing ''", "a finite number", "0.1,7,,1"),
+    "twice": ("time 0.06, landmark 1 again", "line 2", "0.06,1,0.5,1"),
+    "outside but wrong": ("range -2.0", "above 0 m", "99,7,0.5,-2"),
+    "beside no range": ("range_std -1.0", "from 1e-06 m", "0.1,7,0.5,,0.1,-1"),
+    "small": ("bearing_std 1e-155", "from 1e-06 rad, up to 10000 rad", "0.1,7,0.5,1,1e-155,1"),
 }
 
 
@@ -398,35 +347,12 @@ def test_a_log_without_any_label_keeps_all_its_rows(tmp_path, label):
     assert log.ignored_rows == {}
 
 
-STATING_ROWS = {
-    "no bearing std": ("0.1,7,0.5,1,0,1", "line 3", "bearing_std 0.0", "from 1e-06 rad"),
-    "no range std": ("0.1,7,0.5,1,1,0", "line 3", "range_std 0.0", "a range_std from 1e-06 m"),
-    "negative": ("0.1,7,0.5,1,-0.1,1", "line 3", "bearing_std -0.1", "a bearing_std from 1e-06"),
-    "large": ("0.1,7,0.5,1,0.1,1e10", "line 3", "range_std 10000000000.0", "up to 1e+06 m"),
-    "small": ("0.1,7,0.5,1,1e-155,1", "line 3", "bearing_std 1e-155", "from 1e-06 rad"),
-    "vague": ("0.1,7,0.5,1,2e4,1", "line 3", "bearing_std 20000.0", "up to 10000 rad"),
-    "beside no range": ("0.1,7,0.5,,0.1,-1", "line 3", "range_std -1.0", "from 1e-06 m"),
-    "text": ("0.1,7,0.5,1,low,1", "line 3", "bearing_std 'low'", "or leave it empty"),
-    "nan": ("0.1,7,0.5,1,1,nan", "line 3", "range_std 'nan'", "a finite number"),
-    "infinite": ("0.1,7,0.5,1,inf,1", "line 3", "bearing_std 'inf'", "a finite number"),
-    "missing": ("0.1,7,0.5,1,1", "line 3", "5 fields", "6: time, landmark, bearing, range, bear"),
-    "extra": ("0.1,7,0.5,1,1,1,1", "line 3", "7 fields", "6"),
-}
-
-
-@pytest.mark.parametrize(
-    ("row", "parts"), [(r, p) for r, *p in STATING_ROWS.values()], ids=STATING_ROWS
-)
-def test_a_bad_standard_deviation_is_refused_by_its_line(tmp_path, row, parts):
-    rows = measured("0.06,1,0,1,0.1,", row, stated=STATED)
-    refused(recorded(tmp_path, measurements=rows), "measurements.csv", *parts)
-
-
-@pytest.mark.parametrize(("row", "parts"), [(r, p) for r, *p in ROWS.values()], ids=ROWS)
-def test_a_bad_measurement_is_refused_by_its_line(tmp_path, row, parts):
-    refused(
-        recorded(tmp_path, measurements=measured("0.06,1,0,1", row)), "measurements.csv", *parts
-    )
+@pytest.mark.parametrize("case", ROWS)
+def test_a_bad_measurement_is_refused_by_its_line(tmp_path, case):
+    *parts, row = ROWS[case]
+    stated = STATED if row.count(",") > 3 else ""
+    rows = measured("0.06,1,0,1" + stated.count(",") * ",", row, stated=stated)
+    refused(recorded(tmp_path, measurements=rows), "measurements.csv, line 3", *parts)
 
 
 def test_a_landmark_twice_at_one_time_is_found_among_others(tmp_path):
@@ -436,82 +362,14 @@ def test_a_landmark_twice_at_one_time_is_found_among_others(tmp_path):
     refused(recorded(tmp_path, measurements=measured(*rows)), "line 3", "landmark 9", "line 2")
 
 
-@pytest.mark.parametrize("row", ["0.1,7,0.5", "0.1,7,0.5,1,0"])
-def test_a_file_of_only_malformed_rows_is_refused(tmp_path, row):
-    folder = recorded(tmp_path, measurements=measured(row, row.replace("7", "8")))
-    refused(folder, "line 2", f"{row.count(',') + 1} fields")
-
-
-@pytest.mark.parametrize(
-    ("row", "parts"),
-    [
-        ("0.5,1", ("line 6", "2 fields", "3: time, velocity, angular_rate")),
-        ("0.5,1,fast", ("line 6", "angular_rate 'fast'")),
-        ("0.5,,0", ("line 6", "velocity ''")),
-        ("0.5,nan,0", ("line 6", "velocity 'nan'")),
-        ("0.35,1,0", ("line 6", "time 0.35 after 0.4", "backwards")),
-        ("0.5,2e4,0", ("line 6", "velocity 20000.0", "from -10000 m/s, up to 10000 m/s")),
-        ("0.5,1,-2e4", ("line 6", "angular_rate -20000.0", "from -10000 rad/s")),
-        ("2e5,1,0", ("line 6", "200000.0 after 0.4", "100000 s apart", "`step` in log.toml")),
-    ],
-)
-def test_a_bad_odometry_row_is_refused_by_its_line(tmp_path, row, parts):
-    refused(recorded(tmp_path, odometry=ODOMETRY + row + "\n"), "odometry.csv", *parts)
-
-
-def test_lines_are_counted_in_the_file_blank_ones_included(tmp_path):
-    odometry = ODOMETRY.replace("\n0.1", "\n\n# turn\n0.1") + "0.5,x,0\n"
-    refused(recorded(tmp_path, odometry=odometry), "line 8", "velocity 'x'")
+def test_a_row_of_odometry_that_holds_for_days_is_refused_by_its_line(tmp_path):
+    parts = ("line 6", "200000.0 after 0.4", "100000 s apart", "`step` in log.toml")
+    refused(recorded(tmp_path, odometry=ODOMETRY + "2e5,1,0\n"), "odometry.csv", *parts)
 
 
 def test_one_row_of_odometry_is_no_log(tmp_path):
     odometry = "time,velocity,angular_rate\n0,1,0\n"
     refused(recorded(tmp_path, odometry=odometry), "odometry.csv", "two times", "ends the log")
-
-
-@pytest.mark.parametrize(
-    ("name", "header"),
-    [
-        ("odometry.csv", "time,speed,steering"),
-        ("odometry.csv", "0.0,1.0,0.1"),
-        ("measurements.csv", "time;landmark;bearing;range"),
-        ("measurements.csv", "time,landmark,range,bearing"),
-    ],
-)
-def test_a_wrong_header_is_refused(folder, name, header):
-    lines = (folder / name).read_text().splitlines()
-    (folder / name).write_text("\n".join([header, *lines[1:]]))
-    refused(folder, name, "line 1", repr(header), repr(lines[0]))
-
-
-@pytest.mark.parametrize(
-    "more",
-    [
-        ",bearing_std,bearing_std",
-        ",bearing_std,range_std,level",
-        ",excess_path,range,excess_path_std",
-        ",bearing_sdt",
-        ";bearing_std",
-        ",",
-    ],
-)
-def test_an_unknown_or_misplaced_column_is_refused_with_the_allowed_ones(tmp_path, more):
-    header = f"time,landmark,bearing,range{more}"
-    folder = recorded(tmp_path, measurements=f"{header}\n0.1,7,0.5,4,0.1,0.1\n")
-    may = "'time,landmark,bearing,range', perhaps followed by bearing_std, range_std, excess_path,"
-    refused(folder, "measurements.csv, line 1", repr(header), may)
-
-
-def test_extra_odometry_columns_are_refused(tmp_path):
-    odometry = ODOMETRY.replace("rate\n", "rate,range_std\n")
-    message = refused(recorded(tmp_path, odometry=odometry), "odometry.csv, line 1")
-    assert "perhaps" not in message
-
-
-@pytest.mark.parametrize("stated", ["bearing_std,landmark,bearing,range", "landmark,bearing,range"])
-def test_a_column_before_the_first_four_is_refused(tmp_path, stated):
-    folder = recorded(tmp_path, measurements=f"{stated}\n0.1,7,0.5,4.0\n")
-    refused(folder, "measurements.csv, line 1", repr(stated))
 
 
 @pytest.mark.parametrize(
@@ -523,16 +381,11 @@ def test_a_column_before_the_first_four_is_refused(tmp_path, stated):
         ("format = 1", "format = 2", ("key 'format': found 2", "expected 1")),
         ('"unicycle"', '"tricycle"', ("'tricycle'", "'unicycle', 'bicycle', 'ackermann' or")),
         ("range_std = 0.2", "range_std = -0.2", ("'range_std': found -0.2", "equal to 0.000001")),
-        ("range_std = 0.2", "range_std = nan", ("'range_std': found nan", "finite number")),
         ("range_std = 0.2", 'range_std = "0.2"', ("'range_std': found '0.2'", "valid number")),
-        ("range_std = 0.2", "range_std = true", ("'range_std': found True", "valid number")),
-        ("velocity_std = 0.1", "velocity_std = -1", ("'velocity_std': found -1", "or equal to 0")),
         ("-2.0, 0.5]", "-2.0]", ("key 'initial_pose': found 2 values, expected 3",)),
-        ("-2.0, 0.5]", "-2.0, 0.5, 1.0]", ("key 'initial_pose': found 4 values, expected 3",)),
         ("-2.0, 0.5]", 'inf, "x"]', ("'initial_pose[1]': found inf", "finite")),
         ("[0.05, 0.06", "[-0.05, 0.06", ("'initial_pose_std[0]': found -0.05",)),
         ("[0.5, 20.0]", "[20.0, 0.5]", ("'range_bounds': found [20.0, 0.5]", "below a far one")),
-        ("[0.5, 20.0]", "[0.0, 20.0]", ("'range_bounds[0]': found 0.0", "greater than 0")),
         ("range_std = 0.2", "range_std = 0.2\nstep = 0", ("'step': found 0", "greater than 0")),
         (
             "range_std = 0.2",
@@ -540,12 +393,6 @@ def test_a_column_before_the_first_four_is_refused(tmp_path, stated):
             ("'time_offset': found 40000000.0", "3600"),
         ),
         ("range_std = 0.2", "range_std = 0.2\ngate = 1.5", ("'gate': found 1.5", "equal to 1")),
-        ("range_std = 0.2", "range_std = 0.2\nsensor_pose = [1.0, 2.0]", ("2 values, expected 3",)),
-        (
-            "range_std = 0.2",
-            "range_std = 0.2\nsensor_pose = [nan, 2.0, 0.0]",
-            ("'sensor_pose[0]': found nan", "finite"),
-        ),
         (
             "[0.5, 20.0]",
             "[0.5, 20.0]\n[association]\nfield_of_view = 180.0",
@@ -557,13 +404,11 @@ def test_a_column_before_the_first_four_is_refused(tmp_path, stated):
             ("unknown key 'association.range'", "max_range"),
         ),
         ("range_std = 0.2", "range_std = ", ("TOML", "line 7")),
-        ("range_std = 0.2", "range_std = 1e155", ("'range_std': found 1e+155", "less than")),
         (
             "range_std = 0.2",
             "range_std = 1e-155",
             ("'range_std': found 1e-155", "equal to 0.000001"),
         ),
-        ("[1.0, -2.0", "[1e300, -2.0", ("'initial_pose[0]': found 1e+300", "less than")),
         ("range_std = 0.2", "range_std = " + "[" * 5000, ("more than 8 levels", "mend the file")),
         ("range_std = 0.2", "range_std = " + "2" * 5000, ("integer of many digits", "64 bits")),
     ],
@@ -585,12 +430,6 @@ CAR = BICYCLE.replace("bicycle", "ackermann") + "speed_offset = -0.1\n"
 STEERED = "time,speed,steering\n0.0,1.0,0.1\n0.1,2.0,{}\n0.3,3.0,0.3\n0.4,9.0,0.9\n"
 
 
-def test_a_car_log_has_wheelbase_and_speed_offset(tmp_path):
-    log = read_log(recorded(tmp_path, CAR, STEERED.format(-1.0)))
-    assert (log.motion, log.wheelbase, log.speed_offset) == ("ackermann", 0.3, -0.1)
-    assert log.controls[1].tolist() == [2.0, -1.0]
-
-
 def test_a_car_that_measures_its_speed_outside_itself_is_refused(tmp_path):
     settings = CAR.replace("-0.1\n", "0.16\n")
     refused(recorded(tmp_path, settings, STEERED.format(0)), "speed_offset", "half the wheelbase")
@@ -602,13 +441,6 @@ def test_a_car_that_steers_across_is_asked_for_radians(tmp_path, steering):
     refused(folder, "odometry.csv, line 3", f"steering {steering}", "radians")
 
 
-def test_a_log_may_state_sensor_pose_and_association_settings(tmp_path):
-    more = "sensor_pose = [3.8, 0.5, 0.1]\n[association]\nmax_range = 50\nclutter = 0.01\n"
-    log = read_log(recorded(tmp_path, UNICYCLE + more))
-    assert log.sensor_pose == (3.8, 0.5, 0.1)
-    assert log.association == {"max_range": 50.0, "clutter": 0.01}
-
-
 def test_steps_without_number_are_refused_before_they_fill_the_memory(tmp_path):
     settings = UNICYCLE + "step = 0.1\n"
     odometry = ODOMETRY + "1700000000.0,1,0\n"
@@ -618,7 +450,7 @@ def test_steps_without_number_are_refused_before_they_fill_the_memory(tmp_path):
 # What is written
 
 
-def test_the_log_on_the_pages_of_the_documentation_is_sound(tmp_path):
+def test_the_logs_on_the_pages_of_the_documentation_are_sound(tmp_path):
     page = (Path(__file__).parents[3] / "docs" / "log_format.md").read_text()
     files = re.findall(r"^`([a-z]+\.[a-z]+)`\n\n```[a-z]+\n(.+?)^```", page, re.M | re.S)
     assert [name for name, _ in files] == ["log.toml", "odometry.csv", "measurements.csv"]
@@ -627,20 +459,12 @@ def test_the_log_on_the_pages_of_the_documentation_is_sound(tmp_path):
     log = read_log(tmp_path)
     assert len(log.dt) == 3
     assert [scan.landmark.tolist() for scan in log.scans] == [[7, 3], [7]]
-
-
-def test_the_columns_on_the_pages_of_the_documentation_are_sound(tmp_path):
-    page = (Path(__file__).parents[3] / "docs" / "log_format.md").read_text()
     (text,) = re.findall(r"^```text\n(time,[^\n]+range_std\n.+?)^```", page, re.M | re.S)
     first, second = read_log(recorded(tmp_path, measurements=text)).scans
     assert first.landmark.tolist() == [7, 3]
     np.testing.assert_array_equal(first.bearing_std, [0.004, 0.02])
     np.testing.assert_array_equal([*first.range_std, *second.range_std], [0.01, NAN, 0.2])
     assert np.isnan(second.bearing_std).all()
-
-
-def test_the_excess_paths_on_the_pages_of_the_documentation_are_sound(tmp_path):
-    page = (Path(__file__).parents[3] / "docs" / "log_format.md").read_text()
     (text,) = re.findall(r"^```text\n(time,[^\n]+caller\n.+?)^```", page, re.M | re.S)
     (callers,) = re.findall(r"^```toml\n(\[\[callers\]\]\n.+?)^```", page, re.M | re.S)
     (scan,) = read_log(recorded(tmp_path, UNICYCLE + callers, measurements=text)).scans
@@ -649,11 +473,41 @@ def test_the_excess_paths_on_the_pages_of_the_documentation_are_sound(tmp_path):
     assert scan.callers.tolist() == [-1, 20]
 
 
-@pytest.mark.parametrize("name", ["unicycle_log", "bicycle_log"])
-def test_a_log_survives_being_written(tmp_path, name):
-    log = read_log(DATA / name)
-    write_log(tmp_path / name, log)
-    assert same(read_log(tmp_path / name), log)
+def written_log(kind, folder):
+    """Return a log of each kind of content."""
+    if kind in ("unicycle_log", "bicycle_log"):
+        return read_log(DATA / kind)
+    if kind == "every setting":
+        log = replace(read_log(recorded(folder)), gate=0.97, noise_at_rest=False)
+        log = replace(log, initial_pose=(0.1, 1e-7, 3.0), sensor_pose=(0.1, 0.2, -3.0))
+        return replace(log, association={"detection": 0.5})
+    if kind == "a car":
+        log = read_log(recorded(folder, CAR, STEERED.format(-1.0)))
+        assert (log.motion, log.wheelbase, log.speed_offset) == ("ackermann", 0.3, -0.1)
+        assert log.controls[1].tolist() == [2.0, -1.0]
+        return log
+    if kind == "scans that share a step":
+        ranges = ((0.0, 5), (0.11, 4), (0.12, ""), (0.13, 2), (0.35, 1))
+        log = read_log(
+            recorded(folder, measurements=measured(*(f"{t},8,0.1,{r}" for t, r in ranges)))
+        )
+        assert [scan.time for scan in log.scans] == [0.0, 0.3, 0.3, 0.3, 0.4]
+        return log
+    rows = ("0.1,7,0.5,4.0,3.25,0.01,mate", "0.1,7,,,6.5,,boat", "0.25,8,0.1,2.0,,,")
+    settings = UNICYCLE + "excess_path_std = 0.05\n" + CALLERS + "\n[[callers]]\nname = 'c'\n"
+    log = read_log(timed(folder, *rows, settings=settings + "landmark = 9\nmoves = true\n"))
+    assert (log.excess_path_std, log.callers[2].moves) == (0.05, True)
+    return log
+
+
+@pytest.mark.parametrize(
+    "kind",
+    ["unicycle_log", "bicycle_log", "every setting", "a car", "scans that share a step", "callers"],
+)
+def test_a_log_survives_being_written(tmp_path, kind):
+    log = written_log(kind, tmp_path / "drive")
+    write_log(tmp_path / "again" / log.name, log)
+    assert same(read_log(tmp_path / "again" / log.name), log)
 
 
 @pytest.mark.parametrize("step", ["", "step = 0.1"])
@@ -661,10 +515,8 @@ def test_a_log_survives_being_written(tmp_path, name):
     ("start", "unit", "factor"),
     [
         (1_700_000_000_000_000_000, 100_000_000, "1e-09"),  # as ROS stamps
-        (1_700_000_000_000_000_000, 256, "1e-09"),
         (0, 100_000_000, "1e-09"),
         (1_700_000_000_000_000, 100_000, "1e-06"),
-        (1_700_000_000_000_000, 1, "1e-06"),
         (0, 20_000, "1e-06"),
         (4_500_000_000_000_000, 1, "1e-06"),
         (1_700_000_000_000, 100, "0.001"),
@@ -685,43 +537,6 @@ def test_a_clock_that_counts_no_seconds_is_refused_with_the_factor_that_fits(
         read_log(folder)
 
 
-def test_a_clock_of_this_century_in_seconds_is_welcome(tmp_path):
-    folder = recorded(tmp_path / "drive")
-    rows = "".join(f"{1_700_000_000 + 0.1 * k},1,0\n" for k in range(9))
-    (folder / "odometry.csv").write_text("time,velocity,angular_rate\n" + rows)
-    (folder / "measurements.csv").write_text("time,landmark,bearing,range\n1700000000.2,7,1,2\n")
-    assert len(read_log(folder).scans) == 1
-
-
-def test_every_setting_survives_being_written(tmp_path, folder):
-    log = replace(read_log(folder), gate=0.97, noise_at_rest=False, initial_pose=(0.1, 1e-7, 3.0))
-    log = replace(log, sensor_pose=(0.1, 0.2, -3.0), association={"detection": 0.5})
-    write_log(tmp_path / "again" / "drive", log)
-    assert same(read_log(tmp_path / "again" / "drive"), log)
-
-
-def test_a_car_survives_being_written(tmp_path):
-    log = read_log(recorded(tmp_path / "drive", CAR, STEERED.format(0.2)))
-    write_log(tmp_path / "again" / "drive", log)
-    assert same(read_log(tmp_path / "again" / "drive"), log)
-
-
-def test_scans_that_share_a_step_survive_being_written(tmp_path):
-    rows = [f"{t},8,0.1,{r}" for t, r in ((0.0, 5), (0.11, 4), (0.12, ""), (0.13, 2), (0.35, 1))]
-    log = read_log(recorded(tmp_path / "drive", measurements=measured(*rows)))
-    assert [scan.time for scan in log.scans] == [0.0, 0.3, 0.3, 0.3, 0.4]
-    write_log(tmp_path / "again" / "drive", log)
-    assert same(read_log(tmp_path / "again" / "drive"), log)
-
-
-def test_a_written_readme_lists_the_columns(tmp_path):
-    write_log(tmp_path, read_log(DATA / "bicycle_log"))
-    readme = (tmp_path / "README.md").read_text()
-    assert "time,speed,steering" in readme
-    assert "  time,landmark,bearing,range;" in readme
-    assert "no bearing_std or\nrange_std of its own, that of log.toml holds." in readme
-
-
 @pytest.mark.parametrize(
     ("stated", "header"),
     [
@@ -740,7 +555,7 @@ def test_only_columns_with_a_value_are_written(tmp_path, stated, header):
     write_log(tmp_path / log.name, log)
     lines = (tmp_path / log.name / "measurements.csv").read_text().splitlines()
     assert lines[0] == "time,landmark,bearing,range" + header
-    assert lines[0] + ";" in (tmp_path / log.name / "README.md").read_text()
+    assert f"measurements.csv: {lines[0]}\n" in (tmp_path / log.name / "README.md").read_text()
     assert same(read_log(tmp_path / log.name), log)
 
 
@@ -798,20 +613,6 @@ def test_former_names_of_excess_path_columns_are_read_and_listed(tmp_path):
     refused(timed(tmp_path / "both", row, settings=both.replace(CALLERS, "") + CALLERS), "log.toml")
 
 
-@pytest.mark.parametrize("order", [(0, 1, 2, 3, 4), (4, 3, 2, 1, 0), (2, 4, 0, 3, 1)])
-def test_columns_after_the_first_four_may_have_any_order(tmp_path, order):
-    names, row = (
-        ("bearing_std", "range_std", "excess_path", "excess_path_std", "caller"),
-        "0.1,7,0.5,4.0",
-    )
-    fields = ("0.01", "0.2", "3.5", "0.03", "mate")
-    stated = "".join(f",{names[i]}" for i in order)
-    text = row + "".join(f",{fields[i]}" for i in order)
-    (scan,) = read_log(timed(tmp_path, text, stated=stated)).scans
-    told = (scan.bearing_std, scan.range_std, scan.excess_path, scan.excess_path_std, scan.caller)
-    assert [part.item() for part in told] == [0.01, 0.2, 3.5, 0.03, 2]
-
-
 def test_a_log_without_callers_has_no_caller_columns(folder):
     log = read_log(folder)
     assert log.callers == ()
@@ -824,11 +625,6 @@ TIMED_WRONG = {
     "unknown": ("0.1,7,0.5,4.0,3.5,,bat", "line 2", "caller 'bat'", "expected boat or mate"),
     "the vehicle": ("0.1,7,0.5,4.0,3.5,,vehicle", "caller 'vehicle'"),
     "a number": ("0.1,7,0.5,4.0,3.5,,1", "caller '1'"),
-    "negative": ("0.1,7,0.5,4.0,-0.1,,boat", "excess_path -0.1", "from 0 m"),
-    "no number": ("0.1,7,0.5,4.0,far,,boat", "excess_path 'far'", "a finite number"),
-    "infinite": ("0.1,7,0.5,4.0,inf,,boat", "excess_path 'inf'", "a finite number"),
-    "too far": ("0.1,7,0.5,4.0,2e9,,boat", "excess_path 2000000000.0"),
-    "std 0": ("0.1,7,0.5,4.0,3,0,boat", "excess_path_std 0.0", "from 1e-06 m"),
     "no bearing": ("0.1,7,,4.0,3,,boat", "bearing ''", "without a range"),
     "nothing": ("0.1,7,,,,,boat", "bearing ''", "a further excess path alone"),
     "over itself": (
@@ -873,9 +669,9 @@ def test_a_caller_of_a_log_without_callers_is_refused_with_where_to_name_it(tmp_
         ("landmark = 52", "landmark = 1.5", ("'callers.2.landmark'", "found 1.5")),
         ("place = [1, 2.5]", "plaice = [1, 2.5]", ("'callers.2.plaice'", "mean 'place'")),
         ("place = [1, 2.5]", "place = [1]", ("'callers.2.place'",)),
-        ("place = [1, 2.5]", "place = [1, nan]", ("'callers.2.place'",)),
+        ("place = [1, 2.5]", "place = [1, nan]", ("'callers.2.place[1]'",)),
         ("place = [1, 2.5]", "", ("'callers.2.place_std'", "a place beside it")),
-        ("place_std = [0.1, 0.2]", "place_std = [-1, 0]", ("'callers.2.place_std'",)),
+        ("place_std = [0.1, 0.2]", "place_std = [-1, 0]", ("'callers.2.place_std[0]'",)),
         ("place_std = [0.1, 0.2]", "moves = 1", ("'callers.2.moves'",)),
         ("place = [1, 2.5]", "moves = true\nplace = [1, 2.5]", ("place of a caller that moves",)),
         (CALLERS, "callers = 3", ("'callers'", "found 3")),
@@ -889,18 +685,6 @@ def test_a_bad_caller_of_a_log_is_refused_by_its_key(tmp_path, old, new, parts):
     settings = (UNICYCLE + CALLERS).replace(old, new)
     assert settings != UNICYCLE + CALLERS
     refused(timed(tmp_path, "0.1,7,0.5,4.0,3.5,,boat", settings=settings), "log.toml", *parts)
-
-
-def test_excess_paths_and_callers_survive_being_written(tmp_path):
-    rows = ("0.1,7,0.5,4.0,3.25,0.01,mate", "0.1,7,,,6.5,,boat", "0.25,8,0.1,2.0,,,")
-    settings = UNICYCLE + "excess_path_std = 0.05\n" + CALLERS + "\n[[callers]]\nname = 'c'\n"
-    settings += "landmark = 9\nmoves = true\n"
-    log = read_log(timed(tmp_path / "drive", *rows, settings=settings))
-    assert log.excess_path_std == 0.05
-    assert log.callers[2].moves
-    write_log(tmp_path / "again" / "drive", log)
-    assert same(read_log(tmp_path / "again" / "drive"), log)
-    assert "An excess path [m] is" in (tmp_path / "again" / "drive" / "README.md").read_text()
 
 
 NUMBER = st.floats(-1e4, 1e4)

@@ -488,7 +488,7 @@ def test_the_stated_position_of_a_caller_initialises_its_echoes(estimator):
     told = FilterConfig(bearing_std=0.01, excess_path_std=0.02)
     config = Config(listening=ListeningConfig(timing=True), filter=told)
     for known in (True, False):
-        callers = (caller if known else replace(caller, place=None),)
+        callers = (caller if known else caller.model_copy(update={"place": None}),)
         log = replace(looks((0.0, 0.1, 0.1)), callers=callers, scans=(scan,))
         (trial,) = replay(log, NO_TRUTH, ["fused"], [estimator], None, config).trials
         rows = trial.track.landmarks

@@ -224,14 +224,7 @@ class Bag:
 
 @contextmanager
 def opened(path: Path) -> Iterator[Bag]:
-    """Open a bag; raise if the path is not a readable bag.
-
-    >>> with opened(Path("nowhere.mcap")):
-    ...     pass
-    Traceback (most recent call last):
-    pipistrelle.config.InputError: nowhere.mcap: found no such file, expected a ROS bag; check the
-    path
-    """
+    """Open a bag; raise if the path is not a readable bag."""
     whole = _storage(path)
     need_rosbags(str(path))
     from rosbags.rosbag1 import Reader as Reader1

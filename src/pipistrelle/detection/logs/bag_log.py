@@ -1,7 +1,8 @@
 """The log of a ROS bag: rows of odometry and of echoes, made from its messages.
 
 Messages of the chosen topics are read one at a time, so memory holds only the rows. The log's
-`notes` list the choice of topics and the conversions.
+`notes` list the choice of topics and the conversions. The functions from `motion_of` on convert
+live messages, one at a time, to the arguments of `Slam.move` and `Slam.hear`.
 
 The poses of sensors on the vehicle come from static transforms. A transform converts points of the
 child's frame to the parent's (tf2_msgs); the frames form a tree.
@@ -10,9 +11,9 @@ child's frame to the parent's (tf2_msgs); the frames form a tree.
 import math
 from collections import Counter
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from jaxtyping import Float
@@ -30,11 +31,12 @@ from pipistrelle.detection.logs.bag_messages import (
     TurnError,
     pose_of,
 )
-from pipistrelle.detection.logs.poses import MOTION_COVARIANCE, POSE
+from pipistrelle.detection.logs.poses import MOTION_COVARIANCE, POSE, motions_between
 from pipistrelle.detection.logs.recording import Log, assemble
-from pipistrelle.detection.logs.text_tables import Table, check_columns, place_of
-from pipistrelle.detection.scans import WIDEST
+from pipistrelle.detection.logs.vehicle import NOISY
+from pipistrelle.detection.scans import UNLABELLED, WIDEST
 from pipistrelle.refusals import refusal
+from pipistrelle.text_tables import Table, check_columns, place_of, rows_kept
 
 TRANSFORMS = "/tf_static"
 TRANSFORMS_TYPE = "tf2_msgs/msg/TFMessage"
@@ -96,11 +98,7 @@ def inverse(pose: Pose) -> Pose:
 
 
 def planar(x: float, y: float, heading: float) -> Pose:
-    """Return the transform of a pose in the plane.
-
-    >>> planar(1.0, 2.0, 0.0)[1]
-    array([1., 2., 0.])
-    """
+    """Return the transform of a pose in the plane."""
     c, s = np.cos(heading), np.sin(heading)
     return np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]]), np.array([x, y, 0.0])
 
@@ -148,34 +146,19 @@ def transforms_of(bag: Bag) -> list[str]:
     return [] if there is None else [TRANSFORMS]
 
 
-def truth_of(bag: Bag, settings: BagConfig) -> str | None:
-    """Return the topic of the true poses, or None if the settings name none."""
-    return None if settings.truth is None else bag.checked(settings.truth, POSES, "--truth")
-
-
 def roles(topics: Iterable[Topic], settings: BagConfig) -> dict[str, str]:
-    """Return the role that each topic would have, such as "odometry"; empty for an unused topic.
-
-    >>> odometry = Topic(name="/odom", type=ODOMETRY, count=3)
-    >>> roles([odometry], BagConfig()), roles([odometry], BagConfig(truth="/odom"))
-    ({'/odom': 'odometry'}, {'/odom': 'truth'})
-    """
+    """Return the role that each topic would have, such as "odometry"; empty for an unused topic."""
     topics = list(topics)
     odometries = [settings.odometry] if settings.odometry else _odometries(topics, settings)
     echoes = settings.echoes or [topic.name for topic in topics if topic.type in ECHOES]
 
-    def role(topic: Topic) -> str:
-        if topic.name == settings.truth:
-            return "truth"
-        if topic.name in odometries:
-            return "odometry" if len(odometries) == 1 else "odometry, if --bag.odometry names it"
-        if topic.name in echoes:
-            return "echoes"
-        if topic.name == TRANSFORMS:
-            return "transforms"
-        return "truth, if --truth names it" if topic.type in POSES else ""
-
-    return {topic.name: role(topic) for topic in topics}
+    role = {one.name: "truth, if --truth names it" * (one.type in POSES) for one in topics}
+    several = ", if --bag.odometry names it" * (len(odometries) > 1)
+    role |= {TRANSFORMS: "transforms"} | dict.fromkeys(echoes, "echoes")
+    role |= dict.fromkeys(odometries, f"odometry{several}")
+    if settings.truth:
+        role[settings.truth] = "truth"
+    return {one.name: role[one.name] for one in topics}
 
 
 def _odometries(topics: Iterable[Topic], settings: BagConfig) -> list[str]:
@@ -323,7 +306,10 @@ def read_bag(
                     heard[message.topic].add(message, settings)
                 else:
                     odd += frames.add(message.content)
-    _check_tied(path, frames, odd, remarks)
+    if odd and not frames:
+        raise InputError(f"{path}, topic {TRANSFORMS}, {odd[0]}")
+    if odd:
+        remarks.leave_out(TRANSFORMS, "odd_orientation", len(odd), odd[0])
     table = odometry_table(path, odometry, sound := driven.sound(remarks), settings, remarks)
     remarks.notes += _clock(odometry, driven.lag, settings)
     measured = []
@@ -335,6 +321,8 @@ def read_bag(
         remarks.notes += _converted(topic, rows, mounts, base)
         remarks.doubts += _alike(topic, rows)
     rows = _merged(f"{path}, topic {', '.join(heard)}", measured)
+    motion = "unicycle" if settings.motion == "twist" else "poses"
+    same = "initial_pose_std", "range_std", "bearing_std", "range_bounds"
     return assemble(
         table,
         rows,
@@ -344,30 +332,13 @@ def read_bag(
         ignored_rows=dict(remarks.ignored),
         name=path.resolve().name,
         initial_pose=tuple(sound[0][2:5]),
-        association=_surety(rows),
+        association=_widest_beam(rows.column["bearing_std"]),
         notes=tuple(remarks.notes),
         doubts=tuple(remarks.doubts),
-        **_vehicle(settings),
+        motion=motion,
+        control_std=tuple(getattr(settings, f"{name}_std") for name in NOISY[motion]),
+        **{name: getattr(settings, name) for name in same},
     )
-
-
-def _check_tied(path: Path, frames: Frames, odd: list[str], remarks: Remarks) -> None:
-    """Raise if all transforms are invalid; add a warning if some are."""
-    if odd and not frames:
-        raise InputError(f"{path}, topic {TRANSFORMS}, {odd[0]}")
-    if odd:
-        remarks.leave_out(TRANSFORMS, "odd_orientation", len(odd), odd[0])
-
-
-def _vehicle(settings: BagConfig) -> dict[str, Any]:
-    """Return the settings of the vehicle and its sensors as fields of a `Log`."""
-    twist = settings.motion == "twist"
-    noise = ("velocity", "angular_rate") if twist else ("forward", "sideways", "turn")
-    same = "initial_pose_std", "range_std", "bearing_std", "range_bounds"
-    return {name: getattr(settings, name) for name in same} | {
-        "motion": "unicycle" if twist else "poses",
-        "control_std": tuple(getattr(settings, f"{name}_std") for name in noise),
-    }
 
 
 def read_poses(
@@ -377,9 +348,10 @@ def read_poses(
 
     The later of two poses at one time is used. `remarks` receives notes and warnings.
     """
+    if settings.truth is None:
+        return None
     with opened(path) as bag:
-        if (topic := truth_of(bag, settings)) is None:
-            return None
+        topic = bag.checked(settings.truth, POSES, "--truth")
         pose, true = POSES[bag.topics[topic].type], TopicPoses(path, topic)
         for message in bag.messages([topic]):
             with faults_named(f"{path}, topic {topic}, message {message.number}"):
@@ -415,9 +387,8 @@ def _table(where: str, columns: tuple[str, ...], rows: list[Any], stated: int = 
     """Make a checked table of rows; each row begins with its message's number."""
     if not rows:
         raise refusal(where, "no messages", "some", "name another topic; --topics lists them")
-    number, *values = np.array(rows, dtype=float).T
-    column = dict(zip(columns, values, strict=True))
-    table = Table(path=where, line=number.astype(np.int64), unit="message", column=column)
+    table = _messages(where, columns, np.array(rows, dtype=float))
+    column = table.column
     for name in columns[: len(columns) - stated]:
         if (wrong := ~np.isfinite(column[name])).any():
             row = int(np.argmax(wrong))
@@ -425,6 +396,13 @@ def _table(where: str, columns: tuple[str, ...], rows: list[Any], stated: int = 
             raise refusal(place_of(table, row), found, "a finite number", "leave the message out")
     check_columns(table)
     return table
+
+
+def _messages(where: str, names: tuple[str, ...], rows: Float[np.ndarray, "n c"]) -> Table:
+    """Make an unchecked table of rows that begin with the number of their message."""
+    number, *values = rows.T
+    column = dict(zip(names, values, strict=True))
+    return Table(path=where, line=number.astype(np.int64), unit="message", column=column)
 
 
 def odometry_table(
@@ -451,8 +429,7 @@ def odometry_table(
         sure = f", {known} of {len(lasted)} as sure as its twist says" * bool(known)
         remarks.notes.append(f"{topic} is the odometry, the ways between its poses {steps}{sure}")
         used = ("time", *POSE, *MOTION_COVARIANCE)
-    kept = {name: column[name] for name in used}
-    return Table(path=where, line=table.line, unit="message", column=kept)
+    return replace(table, column={name: column[name] for name in used})
 
 
 def mounts_of(
@@ -480,14 +457,7 @@ def mounts_of(
 
 def rows_of(where: str, rows: TopicEchoes, mounts: dict[str, Pose], ignored: Counter[str]) -> Table:
     """Convert the echoes of a topic to bearings and ranges; count left-out echoes in `ignored`."""
-    check_columns(
-        Table(
-            path=where,
-            line=np.array(rows.number, dtype=np.int64),
-            unit="message",
-            column={"time": np.array(rows.time)},
-        )
-    )
+    check_columns(_messages(where, ("time",), np.column_stack((rows.number, rows.time))))
     parts = []
     for time, number, frame, echoes in zip(
         rows.time, rows.number, rows.frame, rows.echoes, strict=True
@@ -502,10 +472,8 @@ def rows_of(where: str, rows: TopicEchoes, mounts: dict[str, Pose], ignored: Cou
         at = [np.full(x.size, number), time + echoes.delay[flat], label]
         parts.append(np.column_stack([*at, np.arctan2(y, x), np.hypot(x, y), *stated]))
     names = ("time", "landmark", "bearing", "range", "bearing_std", "range_std")
-    number, *values = np.vstack([np.empty((0, 7)), *parts]).T
-    column = dict(zip(names, values, strict=True))
-    stamp = column.pop("time")
-    table = Table(path=where, line=number.astype(np.int64), unit="message", column=column)
+    table = _messages(where, names, np.vstack([np.empty((0, 7)), *parts]))
+    stamp = table.column.pop("time")
     if stamp.size:
         check_columns(table)
     table.column["time"] = stamp
@@ -516,12 +484,11 @@ def _merged(where: str, parts: list[Table]) -> Table:
     """Return the rows of all topics in order of time."""
     names = parts[0].column
     column = {name: np.concatenate([part.column[name] for part in parts]) for name in names}
-    order = np.argsort(column["time"], kind="stable")
-    line = np.concatenate([part.line for part in parts])[order]
-    column = {name: values[order] for name, values in column.items()}
+    line = np.concatenate([part.line for part in parts])
     if not line.size:
         raise refusal(where, "no echo to use", "some", "--topics lists what there is")
-    return Table(path=where, line=line, unit="message", column=column)
+    table = Table(path=where, line=line, unit="message", column=column)
+    return rows_kept(table, np.argsort(column["time"], kind="stable"))
 
 
 def _clock(topic: str, lags: list[float], settings: BagConfig) -> list[str]:
@@ -534,15 +501,13 @@ def _clock(topic: str, lags: list[float], settings: BagConfig) -> list[str]:
     return [told] if abs(late) > _LATE else []
 
 
-def _surety(rows: Table) -> dict[str, float]:
-    """Return the largest bearing standard deviation that association accepts: the widest beam's.
+def _widest_beam(std: Float[np.ndarray, " n"]) -> dict[str, float]:
+    """Return the largest bearing std that association accepts, if the widest beam's is larger.
 
-    Association discards measurements with a large standard deviation as likely noise. In a beam it
-    follows from the width, for weak and loud echoes, so no beam may be discarded for it. Empty if
-    the default is larger.
+    In a beam the std follows from its width, for weak and loud echoes, so no beam may be discarded
+    as likely noise for it.
     """
-    stds = rows.column["bearing_std"]
-    widest = float(stds[stds <= WIDEST].max(initial=0.0))
+    widest = float(std[std <= WIDEST].max(initial=0.0))
     return {"bearing_std": widest} if widest > AssociationConfig().bearing_std else {}
 
 
@@ -578,3 +543,82 @@ def _converted(topic: str, rows: TopicEchoes, mounts: dict[str, Pose], base: str
                 f"{toward:.3g} rad on {base or 'the vehicle'}"
             )
     return notes
+
+
+_LIVE = Path("ROS")
+
+
+def motion_of(model: str) -> Literal["poses", "twist"]:
+    """Return how odometry messages are used for a motion model, as in `BagConfig.motion`."""
+    if model in ("poses", "unicycle"):
+        return "poses" if model == "poses" else "twist"
+    expected = "'poses' or 'unicycle', which nav_msgs/Odometry tells"
+    fix = "say how surely it knows its poses"
+    raise refusal("the vehicle, key 'motion'", repr(model), expected, fix)
+
+
+def stamp_and_pose(message: Any) -> tuple[float, tuple[float, float, float]]:
+    """Return time [s] and pose [m, m, rad] of a ``nav_msgs/Odometry``, which may be the first."""
+    with faults_named("ROS, odometry"):
+        row = step_row(Message("odometry", 1, 0.0, message), BagConfig())
+    odometry_table(_LIVE, "odometry", [(1, *row)], BagConfig(), Remarks())
+    time, x, y, heading, *_ = row
+    return time, (x, y, heading)
+
+
+def clock_began(before: Any, now: Any) -> bool:
+    """Return whether the clock began between two messages: the first has the stamp 0."""
+    times = [one.header.stamp.sec + one.header.stamp.nanosec / 1e9 for one in (before, now)]
+    return times[0] == 0.0 and times[1] > BEGUN
+
+
+def step_between(
+    before: Any, now: Any, settings: BagConfig
+) -> tuple[Float[np.ndarray, "1 c"], float]:
+    """Return the controls between two ``nav_msgs/Odometry``, and the time of the second [s].
+
+    With `settings.motion` "poses" the motion between their poses, else the velocities of the first.
+    """
+    with faults_named("ROS, odometry"):
+        messages = [Message("odometry", n, 0.0, one) for n, one in enumerate((before, now), 1)]
+        rows = [(one.number, *step_row(one, settings)) for one in messages]
+    if not rows[1][1] > rows[0][1]:
+        found, expected = f"the time {rows[1][1]} s", f"one after {rows[0][1]} s"
+        raise refusal("ROS, odometry", found, expected, "leave out what comes late or twice")
+    table = odometry_table(_LIVE, "odometry", rows, settings, Remarks())
+    time, *columns = table.column.values()
+    if settings.motion == "twist":
+        return np.column_stack(columns)[:1], float(time[1])
+    return motions_between(table, time), float(time[1])
+
+
+def learn_transforms(frames: Frames, message: Any) -> None:
+    """Add the static transforms of a ``tf2_msgs/TFMessage`` to the known frames.
+
+    Raises if a rotation is invalid, after the other transforms have been added.
+    """
+    with faults_named(f"ROS, {TRANSFORMS}"):
+        if odd := frames.add(message):
+            raise InputError(odd[0])
+
+
+def scans_in(
+    kind: str, message: Any, base: str, frames: Frames, settings: BagConfig
+) -> list[tuple[float, dict[str, Float[np.ndarray, " m"]]]]:
+    """Return time [s] and columns (`Slam.hear`) of the scans in a message of echoes, by time.
+
+    `kind`: the name of its type, with ``/msg/``; `base`: the vehicle's frame; `frames`: static
+    transforms to the sensors. Rows have no labels if the whole message has none.
+    """
+    rows = TopicEchoes(kind)
+    with faults_named(f"ROS, {kind}"):
+        rows.add(Message(kind, 1, 0.0, message), settings)
+    mounts = mounts_of(_LIVE, kind, rows, frames, bare(base), settings)
+    column = rows_of(f"ROS, {kind}", rows, mounts, Counter()).column
+    time = column.pop("time")
+    if (column["landmark"] == UNLABELLED).all():
+        del column["landmark"]
+    return [
+        (float(at), {name: values[time == at] for name, values in column.items()})
+        for at in np.unique(time)
+    ]

@@ -438,7 +438,7 @@ def read_definition(name: str, text: str, *, idl: bool = False) -> dict[str, Fie
                 raise InputError(f"found {shown(head[:80])}, expected MSG: and the name of a type")
             language, title, rest = "IDL" if idl else "MSG", name, part
         owner = _full(title.strip())
-        made = _of_idl(rest) if language == "IDL" else {owner: _of_msg(rest, owner)}
+        made = _Idl(rest).records if language == "IDL" else {owner: _of_msg(rest, owner)}
         for one, fields in made.items():
             names = [field for field, _ in fields]
             if len({*names}) < len(names) or told.get(one, fields) != fields:
@@ -481,20 +481,12 @@ def _of_msg(text: str, owner: str) -> Fields:
     return fields
 
 
-def _of_idl(text: str) -> dict[str, Fields]:
-    """Parse the records of IDL as ROS writes it: modules, constants, typedefs, structs."""
-    tokens = [
-        found[0]
-        for found in _TOKEN.finditer(text)
-        if found["skip"] is None and not found[0].startswith("@")
-    ]
-    return _Idl(tokens).records
-
-
 class _Idl:
-    """Parser of the records in a list of IDL tokens."""
+    """Parser of the records in IDL as ROS writes it: modules, constants, typedefs, structs."""
 
-    def __init__(self, tokens: list[str]) -> None:
+    def __init__(self, text: str) -> None:
+        found = _TOKEN.finditer(text)
+        tokens = [one[0] for one in found if one["skip"] is None and not one[0].startswith("@")]
         self.records: dict[str, Fields] = {}
         self._left, self._scope, self._named = tokens[::-1], list[str](), dict[str, Any]()
         while self._left:

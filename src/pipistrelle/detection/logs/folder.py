@@ -11,29 +11,20 @@ the initial pose (Table I) and the range bounds of rays are the paper's.
 
 import math
 from collections.abc import Iterable
-from dataclasses import asdict, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Int
 
 from pipistrelle.config import STEEPEST
 from pipistrelle.detection.logs.poses import MOTION_COVARIANCE, POSE, poses_along
 from pipistrelle.detection.logs.recording import (
     CALLER,
-    MEASUREMENT,
+    MEASUREMENTS,
     STATED,
     Log,
     assemble,
-)
-from pipistrelle.detection.logs.text_tables import (
-    Table,
-    check_unique,
-    place_of,
-    read_table,
-    rows_kept,
-    table_text,
 )
 from pipistrelle.detection.logs.vehicle import (
     KINDS,
@@ -46,11 +37,26 @@ from pipistrelle.detection.logs.vehicle import (
 from pipistrelle.detection.scans import UNLABELLED, Scan
 from pipistrelle.files import LOG, OwnFiles, read_text
 from pipistrelle.refusals import refusal
+from pipistrelle.text_tables import (
+    Table,
+    check_unique,
+    place_of,
+    read_table,
+    rows_kept,
+    table_text,
+)
 
 ROBOTS = range(1, 6)
 LANDMARKS = range(6, 21)
-
 _UNKNOWN_MAX = 0.05
+_README = """A recorded log of Pipistrelle. Replay it with: pipistrelle slam FOLDER
+
+log.toml: motion model, start and noise; m, s, rad; _std are standard deviations of rows without
+SHA256SUMS: what was written here; nothing else is ever overwritten
+truth.csv: time,x,y,heading; optional, for scoring only
+landmarks.csv: landmark,x,y; optional, for scoring only
+
+"""
 
 
 def read_mrclam(folder: Path, robot: int, span: tuple[float, float] = (-math.inf, math.inf)) -> Log:
@@ -64,7 +70,26 @@ def read_mrclam(folder: Path, robot: int, span: tuple[float, float] = (-math.inf
     """
     columns = ("time", "velocity", "angular_rate")
     odometry = read_table(folder / f"Robot{robot}_Odometry.dat", columns, separator=None)
-    measurements, ignored = _seen_landmarks(folder, robot)
+    columns = ("time", "barcode", "range", "bearing")
+    seen = read_table(folder / f"Robot{robot}_Measurement.dat", columns, separator=None)
+    barcode = seen.column["barcode"]
+    known = read_table(folder / "Barcodes.dat", ("subject", "barcode"), separator=None)
+    check_unique(known, "barcode")
+    subjects = dict(zip(known.column["barcode"].tolist(), known.column["subject"], strict=True))
+    subject = np.array([subjects.get(worn, 0) for worn in barcode.tolist()])
+    landmark, robots = np.isin(subject, LANDMARKS), np.isin(subject, ROBOTS)
+    unknown = ~(landmark | robots)
+    if unknown.mean() > _UNKNOWN_MAX:
+        row, rows = (
+            int(np.argmax(unknown)),
+            f"{unknown.sum()} unknown barcodes in {unknown.size} rows",
+        )
+        expected = f"at most {_UNKNOWN_MAX:.0%} that Barcodes.dat does not know"
+        fix = "use the Barcodes.dat of this set"
+        raise refusal(place_of(seen, row), f"barcode {barcode[row]}, and {rows}", expected, fix)
+    ignored = {"unknown_barcode": int(unknown.sum()), "robot_seen": int(robots.sum())}
+    labelled = replace(seen, column=seen.column | {"landmark": subject})
+    measurements = rows_kept(labelled, landmark)
     return assemble(
         odometry,
         measurements,
@@ -81,56 +106,6 @@ def read_mrclam(folder: Path, robot: int, span: tuple[float, float] = (-math.inf
         bearing_std=0.06,
         range_bounds=(0.5, 20.0),
     )
-
-
-def _seen_landmarks(folder: Path, robot: int) -> tuple[Table, dict[str, int]]:
-    """Return the measurements of landmarks, labelled by subject, and the dropped rows by reason."""
-    columns = ("time", "barcode", "range", "bearing")
-    table = read_table(folder / f"Robot{robot}_Measurement.dat", columns, separator=None)
-    subject = _subjects(folder / "Barcodes.dat", table.column["barcode"])
-    landmark, seen = np.isin(subject, LANDMARKS), np.isin(subject, ROBOTS)
-    unknown = ~(landmark | seen)
-    if unknown.mean() > _UNKNOWN_MAX:
-        first = int(np.argmax(unknown))
-        raise refusal(
-            place_of(table, first),
-            f"barcode {table.column['barcode'][first]}, and {unknown.sum()} unknown barcodes "
-            f"in {len(unknown)} rows",
-            f"at most {_UNKNOWN_MAX:.0%} that Barcodes.dat does not know",
-            "use the Barcodes.dat of this set",
-        )
-    ignored = {"unknown_barcode": int(unknown.sum()), "robot_seen": int(seen.sum())}
-    named = replace(table, column=table.column | {"landmark": subject})
-    return rows_kept(named, landmark), ignored
-
-
-def _subjects(path: Path, barcode: Int[np.ndarray, " n"]) -> Int[np.ndarray, " n"]:
-    """Return the subject number of each barcode; 0 if the set does not list it."""
-    table = read_table(path, ("subject", "barcode"), separator=None)
-    check_unique(table, "barcode")
-    subject = dict(zip(table.column["barcode"].tolist(), table.column["subject"], strict=True))
-    return np.array([subject.get(worn, 0) for worn in barcode.tolist()])
-
-
-_README = """A recorded log of Pipistrelle. Replay it with: pipistrelle slam FOLDER
-
-log.toml          motion model, start and noise; m, s, rad; _std are standard deviations
-odometry.csv      {odometry}; {held}
-measurements.csv  {measurements}; an empty range is passive
-truth.csv         time,x,y,heading; optional, for scoring only
-landmarks.csv     landmark,x,y; optional, for scoring only
-SHA256SUMS        what was written here: nothing else is ever overwritten
-
-Bearings are relative to the heading, counter-clockwise. Where a measurement has no bearing_std or
-range_std of its own, that of log.toml holds.
-"""
-_EXCESS_PATHS = """
-An excess path [m] is how much longer the way of a caller's sound over the landmark is than the
-straight one; log.toml says which landmark each caller is. A row without a bearing is one excess
-path more.
-"""
-_HELD = "a row holds until the next one's time, the last only ends the log"
-_FOLLOWED = "what counts is the way from row to row, wherever they begin"
 
 
 def read_log(folder: Path) -> Log:
@@ -168,15 +143,12 @@ def read_log(folder: Path) -> Log:
     (0.5, array([7]), array([nan]))
     """
     vehicle, former = read_vehicle(folder / "log.toml")
-    names = tuple(caller.name for caller in vehicle.callers)
-    measured = read_table(
-        folder / "measurements.csv",
-        MEASUREMENT,
-        optional=("bearing", "range", *STATED, CALLER),
-        in_order=False,
-        words={CALLER: names or ("a name that [[callers]] of log.toml have",)},
-    )
-    measured.column[CALLER] += 1.0  # the vehicle is number 0
+    names = [caller.name for caller in vehicle.callers]
+    known = names or ["a name that [[callers]] of log.toml have"]
+    measured = MEASUREMENTS.read(folder / MEASUREMENTS.file, words={CALLER: known})
+    whose = measured.column[CALLER].tolist()
+    numbers = [1.0 + names.index(name) if name else math.nan for name in whose]
+    measured.column[CALLER] = np.array(numbers)
     odometry = read_odometry(folder, vehicle.motion)
     return assemble(
         odometry,
@@ -191,23 +163,16 @@ def read_log(folder: Path) -> Log:
 
 def read_odometry(folder: Path, motion: str) -> Table:
     """Read ``odometry.csv`` with the columns of a motion model."""
-    optional = MOTION_COVARIANCE if motion == "poses" else ()
-    columns = ("time", *ODOMETRY[motion])
-    odometry = read_table(folder / "odometry.csv", columns, optional=optional)
+    schema = ODOMETRY[motion]
+    odometry = schema.read(folder / schema.file)
     if motion == "ackermann":
-        _check_steering(odometry)
+        steering = odometry.column["steering"]
+        if (wrong := np.abs(steering) > STEEPEST).any():
+            row = int(np.argmax(wrong))
+            found = f"steering {steering[row].item()!r}"
+            expected = f"an angle from -{STEEPEST:g} to {STEEPEST:g} rad"
+            raise refusal(place_of(odometry, row), found, expected, "is it in radians?")
     return odometry
-
-
-def _check_steering(odometry: Table) -> None:
-    """Raise if a steering angle is larger than `STEEPEST`."""
-    steering = odometry.column["steering"]
-    wrong = np.abs(steering) > STEEPEST
-    if wrong.any():
-        row = int(np.argmax(wrong))
-        where = f"{odometry.path}, line {odometry.line[row]}"
-        expected = f"an angle from -{STEEPEST:g} to {STEEPEST:g} rad"
-        raise refusal(where, f"steering {steering[row].item()!r}", expected, "is it in radians?")
 
 
 def write_log(folder: Path, log: Log) -> None:
@@ -240,7 +205,7 @@ def write_log(folder: Path, log: Log) -> None:
 def log_files(log: Log) -> dict[str, str]:
     """Return the text of each file of a log folder, by file name; ``log.toml`` is last."""
     settings: dict[str, Any] = {"format": 1} | {name: getattr(log, name) for name in SHARED}
-    settings["callers"] = [asdict(caller) for caller in log.callers]
+    settings["callers"] = [caller.model_dump() for caller in log.callers]
     stds = zip(NOISY[log.motion], log.control_std, strict=True)
     settings |= {f"{name}_std": std for name, std in stds}
     if log.motion in ("bicycle", "ackermann"):
@@ -252,20 +217,17 @@ def log_files(log: Log) -> dict[str, str]:
     driven = _odometry_columns(log)
     measured = _measurement_columns(log)
     return {
-        "odometry.csv": table_text(tuple(driven), *driven.values()),
-        "measurements.csv": table_text(tuple(measured), *measured.values()),
-        "README.md": log_readme(driven, measured, log.motion),
+        "odometry.csv": table_text(driven),
+        "measurements.csv": table_text(measured),
+        "README.md": _readme(log.motion, driven, measured),
         "log.toml": model.text(),
     }
 
 
-def log_readme(driven: Iterable[str], measured: Iterable[str], motion: str) -> str:
-    """Return the text of a log folder's ``README.md``, from the columns of its tables."""
-    measured = tuple(measured)
-    columns = {"odometry": ",".join(driven), "measurements": ",".join(measured)}
-    held = _FOLLOWED if motion == "poses" else _HELD
-    more = _EXCESS_PATHS if "excess_path" in measured else ""
-    return _README.format(**columns, held=held) + more
+def _readme(motion: str, driven: Iterable[str], measured: Iterable[str]) -> str:
+    """Return the text of a log folder's ``README.md``, with the columns of its tables."""
+    tables = ODOMETRY[motion].readme([*driven]), MEASUREMENTS.readme([*measured])
+    return _README + "\n".join(tables)
 
 
 def as_logged(scan: Scan, name: str) -> np.ndarray:
@@ -281,7 +243,7 @@ def _odometry_columns(log: Log) -> dict[str, np.ndarray]:
     """Return the columns of ``odometry.csv``: controls, or poses with their covariance."""
     if log.motion != "poses":
         rows = np.vstack((log.controls, np.zeros(2)))
-        return {"time": log.time} | dict(zip(ODOMETRY[log.motion], rows.T, strict=True))
+        return {"time": log.time} | dict(zip(NOISY[log.motion], rows.T, strict=True))
     column = dict(zip(POSE, poses_along(log.controls).T, strict=True))
     stated = log.controls[:, len(POSE) :]
     rows = np.vstack((np.full(stated.shape[1], np.nan), stated))
@@ -298,11 +260,12 @@ def _measurement_columns(log: Log) -> dict[str, np.ndarray]:
     stamp = np.where(rank + 1 == count, used, start + (used - start) * (rank + 1) / count)
     sizes = [len(scan.landmark) for scan in log.scans]
     column = {"time": np.repeat(stamp, sizes)}
-    for name in (*MEASUREMENT[1:], *STATED):
+    required = MEASUREMENTS.columns[1:]
+    for name in (*required, *STATED):
         fields = [as_logged(scan, name) for scan in log.scans]
         values = np.concatenate(fields) if fields else np.empty(0)
         labelled = name == "level_db" and (column["landmark"] != UNLABELLED).any()
-        if name in MEASUREMENT or not (labelled or np.isnan(values).all()):
+        if name in required or not (labelled or np.isnan(values).all()):
             column[name] = values
     whose = np.concatenate([np.empty(0, dtype=np.int64), *(scan.caller for scan in log.scans)])
     if log.callers and whose.any():
@@ -317,7 +280,7 @@ class RowsHeard:
     latter, and `callers` have the keys of ``log.toml``. Raises InputError if a table is invalid.
     """
 
-    columns = ("time", *MEASUREMENT[1:], *STATED, CALLER)
+    columns = (*MEASUREMENTS.columns, *MEASUREMENTS.optional)
     """Columns of ``measurements.csv``."""
 
     def __init__(self, folder: Path, about: dict[str, Any], callers: list[dict[str, Any]]) -> None:
@@ -342,8 +305,8 @@ class RowsHeard:
         column = [as_logged(scan, name) for name in self.columns[1:-1]]
         self.rows += time.size
         self.inside += time.size * bool(self.time[0] <= scan.time <= self.time[-1])
-        text = table_text(self.columns, time, *column, self._names[scan.caller])
-        return text.split("\n", 1)[1]
+        values = (time, *column, self._names[scan.caller])
+        return table_text(dict(zip(self.columns, values, strict=True))).split("\n", 1)[1]
 
     def files(self) -> dict[str, str]:
         """Return odometry, README and log.toml by name; raise without echoes while it drives."""
@@ -355,6 +318,6 @@ class RowsHeard:
         motion = self._vehicle.motion
         return {
             "odometry.csv": read_text(self._odometry),
-            "README.md": log_readme(("time", *ODOMETRY[motion]), self.columns, motion),
+            "README.md": _readme(motion, ODOMETRY[motion].columns, self.columns),
             "log.toml": self._vehicle.text(),
         }

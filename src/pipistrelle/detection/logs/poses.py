@@ -17,9 +17,9 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from pipistrelle.config import FARTHEST
-from pipistrelle.detection.logs.text_tables import Table, place_of
 from pipistrelle.geometry import wrap
 from pipistrelle.refusals import refusal
+from pipistrelle.text_tables import Table, place_of
 
 POSE = ("x", "y", "heading")
 """Columns of a row of poses, besides its time."""
@@ -40,14 +40,6 @@ def motions_between(odometry: Table, time: Float[np.ndarray, " t"]) -> Float[np.
     last of rows at one time is used. `time` [s] increases, within the times of the rows. Returns
     forward, sideways [m] and turn [rad] in [-pi, pi), then the covariance, NaN if a part of the
     step does not state it. Exactly zero if the vehicle is at rest.
-
-    >>> from pathlib import Path
-    >>> rows = {"time": np.array([0.0, 1.0]), "x": np.array([5.0, 5.0]), "y": np.array([0.0, 2.0])}
-    >>> column = rows | {"heading": np.full(2, np.pi / 2)}
-    >>> table = Table(path=Path("odometry.csv"), line=np.array([2, 3]), column=column)
-    >>> motions_between(table, np.array([0.0, 0.5, 1.0])).round(9) + 0.0
-    array([[1., 0., 0.],
-           [1., 0., 0.]])
     """
     stamp = odometry.column["time"]
     poses = np.column_stack([odometry.column[name] for name in POSE])
@@ -67,9 +59,6 @@ def relative_motions(poses: Float[np.ndarray, "t 3"]) -> Float[np.ndarray, "t-1 
     """Return each pose relative to the pose before.
 
     `poses` [m, m, rad]. Returns forward, sideways [m] and the shorter turn [rad].
-
-    >>> relative_motions(np.array([[1.0, 1.0, 3.0], [1.0, 1.0, -3.0]])).round(3) + 0.0
-    array([[0.   , 0.   , 0.283]])
     """
     d, heading = np.diff(poses[:, :2], axis=0), poses[:, 2]
     ways = _turned(d, -heading[:-1])
@@ -82,11 +71,6 @@ def poses_along(motions: Float[np.ndarray, "k _"]) -> Float[np.ndarray, "k+1 3"]
 
     `motions`: forward, sideways [m] and turn [rad]; further columns are ignored. Returns [m, m,
     rad] with wrapped headings. Inverse of `relative_motions`, up to rounding.
-
-    >>> poses_along(np.array([[1.0, 0.0, np.pi / 2], [1.0, 0.0, 0.0]])).round(3)[:, :2] + 0.0
-    array([[0., 0.],
-           [1., 0.],
-           [1., 1.]])
     """
     heading = np.append(0.0, np.cumsum(motions[:, 2]))
     places = np.cumsum(_turned(motions[:, :2], heading[:-1]), axis=0)
@@ -98,11 +82,6 @@ def jumps(motions: Float[np.ndarray, "k _"], dt: Float[np.ndarray, " k"]) -> Int
 
     `motions` [m, m, rad]; `dt` [s]. Returns the steps of 0.5 m or 0.5 rad or more whose speed, or
     angular rate, exceeds ten times the 90th percentile of the moving steps.
-
-    >>> drive = np.tile([0.1, 0.0, 0.0], (20, 1))
-    >>> drive[7] = [40.0, -3.0, 0.0]
-    >>> jumps(drive, np.full(20, 0.1))
-    array([7])
     """
     found = np.zeros(len(dt), dtype=bool)
     for size, least in zip(

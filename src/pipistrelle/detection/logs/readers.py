@@ -6,6 +6,7 @@ imported only when a log is read. The truth of a log is read elsewhere, by the e
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -61,22 +62,21 @@ def reader_of(folder: Path, readers: Sequence[Reader] = ()) -> Reader:
 
 
 def recording_of(path: Path) -> str | None:
-    """Return advice for a recording that no reader takes, such as audio; None if there is none.
-
-    >>> recording_of(Path("walk.wav"))[:36], recording_of(Path("walk"))
-    ('an audio recording, which is no log;', None)
-    """
+    """Return advice for a recording that no reader takes, such as audio; None if there is none."""
     endings = {path.suffix.lower()}
     if path.is_dir():
         endings |= {file.suffix.lower() for file in path.iterdir()}
     return next((words for known, words in _OTHERS.items() if endings & known), None)
 
 
-def _read_log_folder(folder: Path) -> "Log":
-    """Read a log folder."""
-    from pipistrelle.detection.logs.folder import read_log
+def _imported(module: str, name: str) -> "Callable[..., Log]":
+    """Return a function of a module of this folder, which is imported when it is called."""
 
-    return read_log(folder)
+    def read(*path_and_robot: Any, **framed: Any) -> "Log":
+        read = getattr(import_module(f"pipistrelle.detection.logs.{module}"), name)
+        return read(*path_and_robot, **framed)
+
+    return read
 
 
 def _is_bag(path: Path) -> bool:
@@ -86,13 +86,6 @@ def _is_bag(path: Path) -> bool:
     if not path.is_dir():
         return path.suffix in BAGS
     return (path / "metadata.yaml").exists() or bool(storages(path))
-
-
-def _read_bag(path: Path, settings: Any, **framed: Any) -> "Log":
-    """Read a ROS bag."""
-    from pipistrelle.detection.logs.bag_log import read_bag
-
-    return read_bag(path, settings, **framed)
 
 
 def _is_mrclam(folder: Path) -> bool:
@@ -108,19 +101,12 @@ def _mrclam_robots(folder: Path) -> list[Robot]:
     return [numbers.get(name, name) for name in names]
 
 
-def _read_mrclam(folder: Path, robot: int, **framed: Any) -> "Log":
-    """Read one robot's log of a MRCLAM set."""
-    from pipistrelle.detection.logs.folder import read_mrclam
-
-    return read_mrclam(folder, robot, **framed)
-
-
 LOG_FOLDER = Reader(
     name="folder",
     title="a log folder",
     help="a log folder",
     recognises=lambda folder: (folder / "log.toml").exists(),
-    read=_read_log_folder,
+    read=_imported("folder", "read_log"),
     files=("log.toml", "odometry.csv", "measurements.csv"),
 )
 MRCLAM = Reader(
@@ -129,7 +115,7 @@ MRCLAM = Reader(
     help="a UTIAS MRCLAM folder",
     robot_help="a MRCLAM folder, 1 to 5",
     recognises=_is_mrclam,
-    read=_read_mrclam,
+    read=_imported("folder", "read_mrclam"),
     robots=_mrclam_robots,
     files=("*.dat",),
 )
@@ -138,7 +124,7 @@ ROS_BAG = Reader(
     title="a ROS bag",
     help="a ROS bag (.mcap, .db3, .bag, a folder of ROS 2)",
     recognises=_is_bag,
-    read=_read_bag,
+    read=_imported("bag_log", "read_bag"),
     configured=True,
     files=("metadata.yaml", "*.db3*", "*.mcap*"),
 )

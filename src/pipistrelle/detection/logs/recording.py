@@ -8,30 +8,24 @@ are converted here.
 """
 
 import math
+import re
 from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 import numpy as np
 from jaxtyping import Float
+from pydantic import AfterValidator, ConfigDict, Field, ValidationInfo, field_validator
 
-from pipistrelle.config import LONGEST_STEP
+from pipistrelle.config import LONGEST_STEP, NonNegative, Real, Section
 from pipistrelle.detection.logs.poses import motions_between
-from pipistrelle.detection.logs.text_tables import (
-    Table,
-    check_columns,
-    check_unique,
-    place_of,
-    rows_kept,
-)
 from pipistrelle.detection.scans import NO_CALLERS, OWN, UNLABELLED, Scan, make_scan, with_columns
 from pipistrelle.geometry import wrap
 from pipistrelle.refusals import refusal
+from pipistrelle.text_tables import Schema, Table, check_columns, check_unique, place_of, rows_kept
 
-MEASUREMENT = ("time", "landmark", "bearing", "range")
-"""Columns of every measurement: its time, and the columns of its scan."""
 STATED = (
     "bearing_std",
     "range_std",
@@ -44,6 +38,13 @@ STATED = (
 speed of sound, and level. Without labels, an excess path of 0 marks the direct call."""
 CALLER = "caller"
 """Column of the caller's number, from 1; absent or NaN for the vehicle's own call."""
+MEASUREMENTS = Schema(
+    file="measurements.csv",
+    row="a row is a measurement; landmark -1: clutter; no bearing: a further excess path",
+    columns=("time", "landmark", "bearing", "range"),
+    optional=(*STATED, CALLER),
+    empty=("bearing", "range"),
+)
 
 MAX_TIME = 1e11
 """Latest time [s]: beyond the year 5000, if counted from 1970."""
@@ -56,19 +57,37 @@ _LONG_GAP = 1000.0  # ratio to the median gap: a recording that drops one row in
 _UNITS = (1e-3, 1e-6, 1e-9)  # [s], of other clocks
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class LogCaller:
+def _is_name(name: str) -> str:
+    """Return a caller's name; raise if it is not a word."""
+    if not re.fullmatch(r"\w[\w-]{0,39}", name):
+        raise ValueError("letters, digits, _ and -, 40 at most")
+    return name
+
+
+class LogCaller(Section):
     """A caller, other than the vehicle, in a recorded log."""
 
-    name: str
+    model_config = ConfigDict(strict=True)
+
+    name: Annotated[str, AfterValidator(_is_name)]
     """Name in ``log.toml`` and in the column of callers."""
-    landmark: int
+    landmark: Annotated[int, Field(ge=0, lt=2**53)]
     """Its label as a landmark."""
     moves: bool = False
     """Whether it moves: it is then not a landmark of the map, but estimators may track it."""
-    place: tuple[float, float] | None = None
-    place_std: tuple[float, float] | None = None
+    place: Annotated[tuple[Real, Real], Field(strict=False)] | None = None
+    place_std: Annotated[tuple[NonNegative, NonNegative], Field(strict=False)] | None = None
     """`place` and `place_std`: its position and standard deviation [m], by default 1e-3 m."""
+
+    @field_validator("place", "place_std")
+    @classmethod
+    def _of_a_place(cls, value: Any, known: ValidationInfo) -> Any:
+        """Raise if a caller that moves has a place, or a standard deviation has none."""
+        if value is not None and known.data.get("moves"):
+            raise ValueError("no place of a caller that moves")
+        if value is not None and known.field_name == "place_std" and not known.data.get("place"):
+            raise ValueError("a place beside it")
+        return value
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -145,8 +164,8 @@ def assemble(
     """Make a log of a table of odometry and a table of measurements.
 
     `odometry` has ``time`` and two controls or, for ``motion = "poses"``, the columns of
-    `motions_between`. `measurements` has the columns `MEASUREMENT`, and any of `STATED` and
-    `CALLER` (NaN if unknown); a row without a bearing is a further excess path of a landmark.
+    `motions_between`. `measurements` has the required columns of `MEASUREMENTS`, and any of the
+    optional ones (NaN if unknown); a row without a bearing is a further excess path of a landmark.
     `step` [s]: length of the steps into which rows are merged (None: each row is a step);
     `time_offset` [s]: delay of the measurements' times relative to the odometry's clock; `span`
     [s]: times to which the log is cut; `ignored_rows`: rows dropped so far, by reason; `settings`:
@@ -160,7 +179,7 @@ def assemble(
     stamp = odometry.column["time"]
     last = np.append(np.diff(stamp) > 0, True)
     rows = _cut(odometry.path, stamp[last], span)
-    time = _single(odometry, rows) if step is None else _merged(odometry.path, rows, step)
+    time = _step_times(odometry, rows, step)
     if settings["motion"] == "poses":
         controls = motions_between(odometry, time)
     else:
@@ -168,43 +187,42 @@ def assemble(
         controls = _mean_controls(stamp[last], np.column_stack(columns)[last], rows, time)
     stamps = {"time": measurements.column["time"] - time_offset}
     measurements = replace(measurements, column=measurements.column | stamps)
-    measurements, clutter = _labelled(measurements, settings.get("callers", ()))
+    callers = settings.get("callers", ())
+    clutter = measurements.column["landmark"] == UNLABELLED
+    labelled = not clutter.all()
+    if labelled:
+        measurements = rows_kept(measurements, ~clutter)
+    measurements = _of_callers(measurements, callers)
+    if labelled:
+        check_unique(measurements, "time", "landmark", besides=CALLER)
     stamp = measurements.column["time"]
     inside = (stamp >= time[0]) & (stamp <= time[-1])
     ignored = Counter(ignored_rows or {})
     ignored["same_time_odometry"] += int(np.sum(~last))
-    ignored["clutter"] += clutter
+    ignored["clutter"] += int(np.sum(clutter)) * labelled
     ignored["outside_odometry"] += int(np.sum(~inside))
     if not inside.any():
         reasons = ", ".join(f"{n} {why.replace('_', ' ')}" for why, n in ignored.items() if n)
         found = f"no row to use (left out: {reasons})"
         expected = f"some of landmarks, between {time[0].item()!r} s and {time[-1].item()!r} s"
         raise refusal(measurements.path, found, expected, "use the odometry's clock")
-    said = (*MEASUREMENT, CALLER, *(name for name in STATED if name in measurements.column))
+    said = (
+        *MEASUREMENTS.columns,
+        CALLER,
+        *(name for name in STATED if name in measurements.column),
+    )
     measured = _in_order({name: measurements.column[name][inside] for name in said})
     doubts = (*settings.pop("doubts", ()), *_silence(rows, step))
     return Log(
         time=time,
         controls=controls,
         dt=np.diff(time),
-        scans=_scans(
-            time, measured, 0.0 if step is None else _RESOLUTION, settings.get("callers", ())
-        ),
+        scans=_scans(time, measured, 0.0 if step is None else _RESOLUTION, callers),
         ignored_rows={reason: count for reason, count in ignored.items() if count},
         doubts=doubts,
         bearings=measured["bearing"],
         **settings,
     )
-
-
-def _labelled(measurements: Table, callers: tuple[LogCaller, ...]) -> tuple[Table, int]:
-    """Return the labelled rows, or all if no row has a label, and the number of rows left out."""
-    clutter = measurements.column["landmark"] == UNLABELLED
-    if clutter.all():
-        return _of_callers(measurements, callers), 0
-    kept = _of_callers(rows_kept(measurements, ~clutter), callers)
-    check_unique(kept, "time", "landmark", besides=CALLER)
-    return kept, int(np.sum(clutter))
 
 
 def scan_at(time: float, rows: Table, callers: tuple[LogCaller, ...]) -> Scan:
@@ -250,20 +268,17 @@ def _cut(path: Path | str, time: np.ndarray, span: tuple[float, float]) -> np.nd
     return np.concatenate(([start], time[(time > start) & (time < end)], [end]))
 
 
-def _single(odometry: Table, time: np.ndarray) -> np.ndarray:
-    """Return the odometry times; raise if a gap is longer than `LONGEST_STEP`."""
-    long = np.flatnonzero(np.diff(time) > LONGEST_STEP)
-    if long.size:
-        row = int(np.searchsorted(odometry.column["time"], time[long[0] + 1]))
-        found = f"time {time[long[0] + 1].item()!r} after {time[long[0]].item()!r}"
-        expected = f"rows at most {LONGEST_STEP:g} s apart"
-        fix = "part the log there, or merge rows into steps by `step` in log.toml"
-        raise refusal(place_of(odometry, row), found, expected, fix)
-    return time
-
-
-def _merged(path: Path | str, time: np.ndarray, step: float) -> np.ndarray:
-    """Return the start, then the ends of steps of equal length."""
+def _step_times(odometry: Table, time: np.ndarray, step: float | None) -> np.ndarray:
+    """Return the start and the ends of steps: the rows' times, or of equal length `step` [s]."""
+    if step is None:
+        long = np.flatnonzero(np.diff(time) > LONGEST_STEP)
+        if long.size:
+            row = int(np.searchsorted(odometry.column["time"], time[long[0] + 1]))
+            found = f"time {time[long[0] + 1].item()!r} after {time[long[0]].item()!r}"
+            expected = f"rows at most {LONGEST_STEP:g} s apart"
+            fix = "part the log there, or merge rows into steps by `step` in log.toml"
+            raise refusal(place_of(odometry, row), found, expected, fix)
+        return time
     count = max(1.0, np.ceil((time[-1] - time[0] - _RESOLUTION) / step))
     if count > _MAX_STEPS:
         gap, start, end, _ = _widest_gap(time)
@@ -272,7 +287,7 @@ def _merged(path: Path | str, time: np.ndarray, step: float) -> np.ndarray:
             f"from {start!r} s to {end!r} s"
         )
         fix = "correct the times there, if the clock was set, or the step"
-        raise refusal(path, found, f"at most {_MAX_STEPS} steps", fix)
+        raise refusal(odometry.path, found, f"at most {_MAX_STEPS} steps", fix)
     return np.append(time[0] + step * np.arange(count), time[-1])
 
 
@@ -370,14 +385,14 @@ def _scans(
     rows = (dict(zip(said, part, strict=True)) for part in parts)
     scans = (make_scan(**row | {"time": float(row["time"][0])}) for row in rows if row["time"].size)
     if (measured["landmark"] == UNLABELLED).all():
-        return tuple(_with_direct_calls(scan, len(callers)) for scan in scans)
+        return tuple(_direct_calls_marked(scan, 1 + len(callers)) for scan in scans)
     return tuple(replace(scan, callers=labels) for scan in scans)
 
 
-def _with_direct_calls(scan: Scan, callers: int) -> Scan:
-    """Mark the direct call of each caller in a scan without labels: an excess path of 0."""
-    direct, straight = np.full(1 + callers, UNLABELLED), scan.excess_path == 0.0
-    for row in np.flatnonzero(straight)[::-1]:  # the first is used
-        direct[scan.caller[row]] = row
+def _direct_calls_marked(scan: Scan, count: int) -> Scan:
+    """Mark the direct call of each of `count` callers, which has an excess path of 0."""
+    direct, straight = np.full(count, UNLABELLED), scan.excess_path == 0.0
+    rows = np.flatnonzero(straight)[::-1]  # the first is used
+    direct[scan.caller[rows]] = rows
     excess = np.where(straight, np.nan, scan.excess_path)
     return replace(with_columns(scan, excess_path=excess), direct=direct)

@@ -25,12 +25,12 @@ from jaxtyping import Bool, Complex, Float, Int
 
 from pipistrelle.acoustics.call import LEAST_SAMPLES, Call, ToneBurst, is_whole
 from pipistrelle.config import BLOCK
-from pipistrelle.detection.logs.text_tables import place_of, read_table
 from pipistrelle.detection.matched import BandFilters
 from pipistrelle.detection.sounds.sound_file import FILE as ABOUT
 from pipistrelle.detection.sounds.sound_file import Description, Sound
 from pipistrelle.jit import kernel
 from pipistrelle.refusals import refusal
+from pipistrelle.text_tables import place_of, read_table
 
 
 class Blocks(NamedTuple):

@@ -29,7 +29,6 @@ from pipistrelle.arrays.sampling import free_tones
 from pipistrelle.config import (
     SWEEP,
     TONE,
-    BeaconConfig,
     CallConfig,
     CallerConfig,
     Config,
@@ -37,31 +36,30 @@ from pipistrelle.config import (
     ScenarioConfig,
     caller_names,
 )
-from pipistrelle.detection.logs.text_tables import check_unique, read_table
 from pipistrelle.experiments.hearing.landmark_fields import MAX_DRAWS, nearest
 from pipistrelle.experiments.hearing.trajectories import Course, course_of, driven, motion_of
 from pipistrelle.geometry import points_at, wrap
+from pipistrelle.refusals import refusal
 from pipistrelle.settings import CALLERS, Layer
+from pipistrelle.text_tables import Schema, check_unique, place_of
 
 WALK_STD, WALK_MEMORY = 0.5, 10.0
 """Defaults of a walk: standard deviation of the velocity along an axis [m/s] and its time constant
 [s]."""
 
+ROUTE = Schema(
+    file="route",
+    row="a row is a position of a caller, which rests before the first and after the last",
+    columns=("time", "x", "y"),
+    optional=("heading",),
+)
+"""Columns of the file that the key ``route`` of a caller names."""
+
 Points = Float[np.ndarray, "_ 2"]
 
 
 def with_routes(layer: Layer) -> Layer:
-    r"""Replace the file names of callers' routes by the rows of these files.
-
-    >>> from tempfile import TemporaryDirectory
-    >>> from pipistrelle.settings import from_flags
-    >>> with TemporaryDirectory() as place:
-    ...     path = Path(place) / "boat.csv"
-    ...     _ = path.write_text("time,x,y\n0,1,2\n5,3,4\n")
-    ...     layer = with_routes(from_flags({"callers": [{"route": str(path)}]}))
-    >>> layer["callers",].value
-    [{'route': [[0.0, 1.0, 2.0], [5.0, 3.0, 4.0]]}]
-    """
+    """Replace the file names of callers' routes by the rows of these files."""
     if CALLERS not in layer:
         return layer
     given = layer[CALLERS]
@@ -87,20 +85,15 @@ def routes_read(callers: Any, where: str) -> Any:
 def _rows(path: str, where: str) -> list[list[float]]:
     """Read the rows of a route file: time [s], x, y [m] and, if given, heading [rad]."""
     try:
-        table = read_table(Path(path), ("time", "x", "y"), optional=("heading",))
+        table = ROUTE.read(Path(path))
         check_unique(table, "time")
+        silent = np.isnan(table.column["heading"])
+        if silent.any() and not silent.all():
+            place, fix = place_of(table, int(np.argmax(silent))), "fill it in"
+            raise refusal(place, "no heading", "one in every row or in none", fix)
     except InputError as error:
         raise InputError(f"{where}: {error}") from None
-    *columns, heading = table.column.values()
-    silent = np.isnan(heading)
-    if not silent.all():
-        if silent.any():
-            line = table.line[int(np.argmax(silent))]
-            raise InputError(
-                f"{where}: {path}, line {line}: found no heading, expected one in every row or in "
-                "none; fill it in"
-            )
-        columns.append(heading)
+    columns = [*table.column.values()][: 3 if silent.all() else 4]
     return np.column_stack(columns).tolist()
 
 
@@ -145,15 +138,18 @@ def callers_among(
         caller = _placeless(one, name, callers, around)
         _check_speed(caller.key, one, around.config)
         is_beacon = first is not None and j == 1 and one.distance is None
-        taken = [] if is_beacon and one.way == "stand" else [around.landmarks, _standing(callers)]
+        standing = np.array([c.place for c in callers if not moves(c)]).reshape(-1, 2)
+        taken = [] if is_beacon and one.way == "stand" else [around.landmarks, standing]
         if one.way == "mission":
             found = _mission(around, taken, stream)
             place = None if found is None else found[0][:, :2]
             heading = None if found is None else found[0][:, 2]
             caller = replace(caller, mission=found, heading=heading)
+        elif one.way == "route":
+            place, heading = _route(one, around)
+            caller = replace(caller, heading=heading)
         else:
             place = _WAYS[one.way](one, around, taken, stream)
-            caller = replace(caller, heading=_heading(one, around))
         if place is None:
             raise _no_place(caller.key, one, around)
         calls = _times(caller.key, one, around, stream)
@@ -169,14 +165,19 @@ def _placeless(
 ) -> Caller:
     """Return the next caller with its name, call and level, but no position yet."""
     config, key = around.config, f"callers.{len(before) + 1}"
-    sent = _call(one, config.beacon, first=not before)
-    if sent is None:
+    fields = set(CallConfig.model_fields)
+    call = config.beacon.model_dump(include=fields)
+    if before:
+        call |= {"call": TONE, "frequency": None}
+    call |= one.model_dump(exclude_none=True, include=fields)
+    if call["call"] != SWEEP and call["frequency"] is None:
         known = (*callers_of(config, np.zeros(2))[:1], *before)
         free = free_tones(config, known, config.beacon.frequency)
         raise InputError(
             f"{key}.frequency: found none, expected a tone of its own{free}; give one, for only "
             "the first may have the beacon's"
         )
+    sent = CallConfig.model_validate({key: v for key, v in call.items() if v is not None})
     usual = config.emitter if one.way == "mission" else config.beacon
     return Caller(
         name=name,
@@ -187,30 +188,13 @@ def _placeless(
     )
 
 
-def _call(one: CallerConfig, beacon: BeaconConfig, *, first: bool) -> CallConfig | None:
-    """Return the call of a caller, completed by the beacon's settings; None without a frequency."""
-    given = one.model_dump(exclude_none=True, include=set(CallConfig.model_fields))
-    usual = beacon.model_dump(include=set(CallConfig.model_fields))
-    if not first:
-        usual |= {"call": TONE, "frequency": None}
-    sent = usual | given
-    if sent["call"] != SWEEP and sent["frequency"] is None:
-        return None
-    return CallConfig.model_validate({key: v for key, v in sent.items() if v is not None})
-
-
 def place_at(
     distance: float,
     setup: ScenarioConfig,
     rng: np.random.Generator,
     clear_of: Iterable[Points],
 ) -> Float[np.ndarray, "2"] | None:
-    """Draw a position at a distance [m] from the centre, clear of points [m]; None if that fails.
-
-    >>> place = place_at(3.0, ScenarioConfig(), np.random.default_rng(7), [np.zeros((1, 2))])
-    >>> round(float(np.hypot(*place)), 9)
-    3.0
-    """
+    """Draw a position at a distance [m] from the centre, clear of points [m], or None."""
     clear_of = [*clear_of]
     for _ in range(MAX_DRAWS):
         direction = rng.uniform(-math.pi, math.pi)
@@ -273,9 +257,7 @@ def _walk(
     return _away_from_vehicle(drawn, around)
 
 
-def _line(
-    one: CallerConfig, around: Surroundings, taken: Sequence[Points], rng: np.random.Generator
-) -> Float[np.ndarray, "t 2"]:
+def _line(one: CallerConfig, around: Surroundings, *_: Any) -> Float[np.ndarray, "t 2"]:
     """Return the path along the closed line through way-points at constant speed."""
     speed = around.config.scenario.speed if one.speed is None else one.speed
     points = np.array([*(one.waypoints or ()), *(one.waypoints or ())[:1]])
@@ -287,24 +269,15 @@ def _line(
 
 
 def _route(
-    one: CallerConfig, around: Surroundings, taken: Sequence[Points], rng: np.random.Generator
-) -> Float[np.ndarray, "t 2"]:
-    """Return the path of a route; the caller rests before its first time and after its last."""
-    time, *place = np.array(_route_rows(one)).T
-    return points_at(around.time, time, np.array(place[:2]).T)
-
-
-def _route_rows(one: CallerConfig) -> Any:
-    """Return the rows of a route, read from its file if a file is named."""
-    return _rows(one.route, "callers") if isinstance(one.route, str) else one.route
-
-
-def _heading(one: CallerConfig, around: Surroundings) -> Float[np.ndarray, " t"] | None:
-    """Return the headings that a route gives [rad], or None."""
-    rows = np.array(_route_rows(one)) if one.way == "route" else np.empty((0, 0))
-    if rows.shape[1] < 4:
-        return None
-    return wrap(np.interp(around.time, rows[:, 0], np.unwrap(rows[:, 3])))
+    one: CallerConfig, around: Surroundings
+) -> tuple[Float[np.ndarray, "t 2"], Float[np.ndarray, " t"] | None]:
+    """Return positions, and headings [rad] if given; it rests before and after its times."""
+    rows: Any = _rows(one.route, "callers") if isinstance(one.route, str) else one.route
+    time, x, y, *heading = np.array(rows).T
+    place = points_at(around.time, time, np.column_stack((x, y)))
+    if not heading:
+        return place, None
+    return place, wrap(np.interp(around.time, time, np.unwrap(heading[0])))
 
 
 def _mission(
@@ -331,7 +304,6 @@ _WAYS: dict[str, Callable[..., np.ndarray | None]] = {
     "circle": _circle,
     "walk": _walk,
     "waypoints": _line,
-    "route": _route,
 }
 
 
@@ -390,11 +362,6 @@ def _check_speed(key: str, one: CallerConfig, config: Config) -> None:
                 f"{key}.{name}: found {speed:g} m/s, expected less than {most:.3g} m/s, for sound "
                 "is to be faster; slow it down"
             )
-
-
-def _standing(callers: Sequence[Caller]) -> Points:
-    """Return the positions of the callers that do not move."""
-    return np.array([c.place for c in callers if not moves(c)]).reshape(-1, 2)
 
 
 def _away_from_vehicle(

@@ -17,12 +17,12 @@ from pipistrelle.arrays.layout import array_text, layout_of, microphones_in
 from pipistrelle.arrays.receiver import real_samples
 from pipistrelle.arrays.sampling import sampling
 from pipistrelle.config import SQUARE, Config, InputError
-from pipistrelle.detection.logs.text_tables import table_text
 from pipistrelle.detection.sounds.calls import FILE as CALLS
 from pipistrelle.detection.sounds.sound_file import ARRAY_FILE as ARRAY
 from pipistrelle.detection.sounds.sound_file import FILE as DESCRIPTION
 from pipistrelle.experiments.hearing.scenario import Scenario, caller_labels
 from pipistrelle.files import OwnFiles, PiecesFile, make_folder, remove_empty
+from pipistrelle.text_tables import table_text
 
 SOUND_FILE = "recording.wav"
 HEADROOM = 4.0
@@ -168,7 +168,7 @@ class SoundRecorder:
         return calls | {
             SOUND_FILE: self.finish(),
             ARRAY: array_text(microphones_in(self.config)),
-            CALLS: table_text(("sample", "time"), self.first[:-1], time),
+            CALLS: table_text({"sample": self.first[:-1], "time": time}),
             "README.md": _README,
             DESCRIPTION: tomli_w.dumps(self._description(scenario) | {"log": log}),
         }

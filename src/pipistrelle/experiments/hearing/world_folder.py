@@ -19,12 +19,6 @@ from pipistrelle.acoustics.call import settings_of
 from pipistrelle.acoustics.emitter import SHAPES, Bodies
 from pipistrelle.acoustics.paths import VEHICLE, moves
 from pipistrelle.config import CallerConfig, Config, InputError, Section, TargetConfig
-from pipistrelle.detection.logs.text_tables import (
-    Table,
-    check_unique,
-    read_table,
-    table_text,
-)
 from pipistrelle.estimation.catalogue import SECTIONS
 from pipistrelle.experiments.hearing.caller_paths import routes_read
 from pipistrelle.experiments.hearing.scenario import Scenario, World
@@ -36,7 +30,7 @@ from pipistrelle.experiments.hearing.trajectories import (
     steps_of,
 )
 from pipistrelle.files import read_file, read_text
-from pipistrelle.refusals import expectation, refusal, shown
+from pipistrelle.refusals import refusal, shown, table_refusal
 from pipistrelle.settings import (
     CALLERS,
     OWN,
@@ -50,31 +44,45 @@ from pipistrelle.settings import (
     parse_toml,
     resolve,
 )
+from pipistrelle.text_tables import (
+    Schema,
+    Table,
+    check_unique,
+    fields_in,
+    place_of,
+    points_of,
+    read_table,
+    table_text,
+)
 
 _COUNT: Key = ("scenario", "landmarks")
 _STEPS: Key = ("scenario", "steps")
-FILES = ("world.toml", "landmarks.csv", "path.csv")
-"""Files of a world, besides the routes of its callers."""
+LANDMARKS = Schema(
+    file="landmarks.csv",
+    row="a row is a landmark; numbered from 1 in any order",
+    columns=("landmark", "x", "y"),
+    optional=("radius", "shape"),
+)
 _CONTROLS = {"bicycle": ("speed", "steering"), "unicycle": ("velocity", "angular_rate")}
 _POSE = ("time", "x", "y", "heading")
-_HEADERS = {
+COURSES = {
     ("x", "y"): "way-points",
     _POSE: "poses",
     **{("time", *names): "controls" for names in _CONTROLS.values()},
     **{(*_POSE, *names): "poses and controls" for names in _CONTROLS.values()},
 }
 """Kind of a course by the columns of ``path.csv``."""
+FILES = ("world.toml", LANDMARKS.file, "path.csv")
+"""Files of a world, besides the routes of its callers."""
 _README = """\
 A world of Pipistrelle. Hear it with: pipistrelle run --world FOLDER
 
-world.toml      settings that belong to the world ([config]), and who calls ([[callers]])
-landmarks.csv   landmark,x,y and perhaps radius,shape [m]; numbered from 1
-path.csv        the vehicle's way: x,y (way-points), time,{controls} (controls), or
-                time,x,y,heading (poses), perhaps with the controls behind
-SHA256SUMS      what was written here: nothing else is ever overwritten
+world.toml: settings that belong to the world ([config]), and who calls ([[callers]])
+SHA256SUMS: what was written here; nothing else is ever overwritten
 
 Each file may be left out: what it would say is drawn, by --seed. Where the controls follow the
 poses nothing of the path is drawn; take the two columns away, and the noise on them is.
+
 """
 
 
@@ -147,7 +155,13 @@ def read_world(folder: Path) -> World:
         expected, fix = f"a folder with {', '.join(FILES)}", "name a world's (scenario.world)"
         raise refusal(folder, found, expected, fix)
     there = [name for name in FILES if os.path.lexists(folder / name)]
-    table = _read_head(folder / "world.toml") if "world.toml" in there else _WorldTable(format=1)
+    raw = {"format": 1}
+    if "world.toml" in there:
+        raw = parse_toml(read_text(folder / "world.toml"), folder / "world.toml")
+    try:
+        table = _WorldTable.model_validate(raw)
+    except ValidationError as error:
+        raise table_refusal(folder / "world.toml", error, _WorldTable, "format") from None
     callers, routes = _callers(folder / "world.toml", table.callers)
     _refuse_misspelt(folder, (*there, *routes))
     if not there:
@@ -192,10 +206,15 @@ def world_files(scenario: Scenario, config: Config) -> dict[str, str]:
     names = _CONTROLS[config.motion.model]
     controls = np.vstack((scenario.controls, np.zeros(2)))
     columns = (scenario.time, *scenario.path.T, *controls.T)
+    path = Schema(file="path.csv", row="the vehicle's path", columns=(*_POSE, *names))
+    numbers = np.arange(1, len(scenario.landmarks) + 1)
+    landmarks = {"landmark": numbers} | dict(zip("xy", scenario.landmarks.T, strict=True))
+    if (bodies := scenario.bodies) is not None:
+        landmarks |= {"radius": bodies.radius, "shape": bodies.shape}
     files = {
-        "README.md": _README.format(controls=",".join(names)),
-        "landmarks.csv": _landmark_text(scenario),
-        "path.csv": table_text((*_POSE, *names), *columns),
+        "README.md": _README + "\n".join((LANDMARKS.readme([*landmarks]), path.readme())),
+        LANDMARKS.file: table_text(landmarks),
+        path.file: table_text(dict(zip(path.columns, columns, strict=True))),
     }
     callers = []
     for caller in scenario.callers[VEHICLE + 1 :]:
@@ -203,11 +222,9 @@ def world_files(scenario: Scenario, config: Config) -> dict[str, str]:
         row |= settings_of(caller.sound)
         if moves(caller):
             row["route"] = f"caller_{caller.name}.csv"
-            way = (scenario.time, *np.asarray(caller.place).T)
-            if caller.heading is None:
-                files[row["route"]] = table_text(("time", "x", "y"), *way)
-            else:
-                files[row["route"]] = table_text(("time", *_POSE[1:]), *way, caller.heading)
+            heading = () if caller.heading is None else (caller.heading,)
+            route = (scenario.time, *np.asarray(caller.place).T, *heading)
+            files[row["route"]] = table_text(dict(zip(_POSE, route, strict=False)))
         else:
             row["place"] = np.asarray(caller.place).tolist()
         if caller.calls is not None:
@@ -243,88 +260,54 @@ def _own_settings(config: Config) -> dict[str, Any]:
     }
 
 
-def _landmark_text(scenario: Scenario) -> str:
-    """Format the landmarks as CSV, with radius and shape if the world gives them."""
-    numbers = np.arange(1, len(scenario.landmarks) + 1)
-    text = table_text(("landmark", "x", "y"), numbers, *scenario.landmarks.T)
-    bodies = scenario.bodies
-    if bodies is None:
-        return text
-    head, *rows = text.splitlines()
-    radii = ["" if np.isnan(radius) else repr(radius) for radius in bodies.radius.tolist()]
-    kinds = zip(rows, radii, bodies.shape.tolist(), strict=True)
-    lines = [f"{row},{radius},{shape}" for row, radius, shape in kinds]
-    return "\n".join([f"{head},radius,shape", *lines, ""])
-
-
-def _read_head(path: Path) -> _WorldTable:
-    """Read ``world.toml``; raise on its first fault."""
-    raw = parse_toml(read_text(path), path)
-    try:
-        return _WorldTable.model_validate(raw)
-    except ValidationError as error:
-        fault = min(error.errors(include_url=False), key=lambda f: f["loc"][0] != "format")
-    key = ".".join(str(part + 1) if isinstance(part, int) else part for part in fault["loc"])
-    if fault["type"] == "missing":
-        raise refusal(path, f"no key {key!r}", "it", f"add {key!r}")
-    if fault["type"] == "extra_forbidden":
-        raise refusal(path, f"the unknown key {key!r}", "format, config, callers", "remove it")
-    found = shown(fault["input"])
-    raise refusal(f"{path}, key {key!r}", found, expectation(fault), "correct the value")
-
-
 def _read_landmarks(
     path: Path, usual: TargetConfig
 ) -> tuple[Float[np.ndarray, "n 2"], Bodies | None]:
     """Read the positions of landmarks, and their bodies if the columns exist."""
-    words = {"shape": tuple(SHAPES)}
-    more = ("radius", "shape")
-    if _is_header_alone(path):
-        return np.empty((0, 2)), None
-    table = read_table(path, ("landmark", "x", "y"), optional=more, words=words)
+    header, *rows = fields_in(path) or [(0, [])]
+    if not rows and {*LANDMARKS.columns} <= {*header[1]} <= {
+        *LANDMARKS.columns,
+        *LANDMARKS.optional,
+    }:
+        return np.empty((0, 2)), None  # the header alone: a world without landmarks
+    table = LANDMARKS.read(path, words={"shape": tuple(SHAPES)})
     check_unique(table, "landmark")
+    check_unique(table, "x", "y")
     label, count = table.column["landmark"], len(table.line)
     wrong = (label < 1) | (label > count)
     if wrong.any():
         row = int(np.argmax(wrong))
-        where, found = f"{path}, line {table.line[row]}", f"landmark {label[row]}"
-        raise refusal(where, found, f"the numbers 1 to {count}", "number the landmarks from 1 on")
+        expected, fix = f"the numbers 1 to {count}", "number the landmarks from 1 on"
+        raise refusal(place_of(table, row), f"landmark {label[row]}", expected, fix)
     order = np.argsort(label)
-    places = np.column_stack((table.column["x"], table.column["y"]))[order]
-    _refuse_coincident(table, places[label - 1])
-    radius, word = (table.column[name][order] for name in more)
-    if np.isnan(radius).all() and np.isnan(word).all():
-        return places, None
-    shape = [usual.shape if np.isnan(w) else words["shape"][int(w)] for w in word.tolist()]
-    return places, Bodies(radius=radius, shape=np.array(shape))
-
-
-def _is_header_alone(path: Path) -> bool:
-    """Return whether a file has the landmarks' header and no rows: a world without landmarks."""
-    lines = [line for line in read_text(path).splitlines() if line.strip() and line[0] != "#"]
-    names = [name.strip() for name in lines[0].split(",")] if len(lines) == 1 else []
-    return names[:3] == ["landmark", "x", "y"] and not set(names[3:]) - {"radius", "shape"}
-
-
-def _refuse_coincident(table: Table, places: Float[np.ndarray, "n 2"]) -> None:
-    """Raise if two landmarks coincide."""
-    x, y = places.T
-    check_unique(Table(path=table.path, line=table.line, column={"x": x, "y": y}), "x", "y")
+    radius, shape = (table.column[name][order] for name in LANDMARKS.optional)
+    stated = not np.isnan(radius).all() or (shape != "").any()
+    bodies = Bodies(radius=radius, shape=np.where(shape == "", usual.shape, shape))
+    return points_of(table)[order], bodies if stated else None
 
 
 def _read_course(path: Path, config: Config) -> Course:
     """Read the course of the vehicle; the columns decide its kind."""
-    columns = _columns(path, config.motion.model)
+    model, controls = config.motion.model, _CONTROLS[config.motion.model]
+    others = {name for names in _CONTROLS.values() for name in names} - {*controls}
+    line, fields = next(iter(fields_in(path)), (1, [""]))
+    columns, header = tuple(fields), ",".join(fields)
+    known = {names: kind for names, kind in COURSES.items() if others.isdisjoint(names)}
+    if columns not in known:
+        fix = f"or set motion.model: it is {model!r}" if columns in COURSES else "name them so"
+        expected = " or ".join(f"{','.join(names)!r} ({kind})" for names, kind in known.items())
+        raise refusal(f"{path}, line {line}", f"{header[:80]!r}", expected, fix)
     table = read_table(path, columns)
     column = table.column
     if "time" not in columns:
         return Waypoints(points=_waypoints(table))
-    _check_rising(table)
+    if len(table.line) < 2:
+        raise refusal(path, "one row", "at least two: the last ends the drive", "add rows")
+    check_unique(table, "time")
     time = column["time"] - column["time"][0]
-    names = [name for name in columns if name not in _POSE]
     commands = None
-    if names:
-        commands = Commands(time=time, rows=np.column_stack([column[name] for name in names]))
+    if {*controls} <= {*columns}:
+        commands = Commands(time=time, rows=np.column_stack([column[name] for name in controls]))
     if "heading" not in columns:
         assert commands is not None
         return commands
@@ -332,45 +315,16 @@ def _read_course(path: Path, config: Config) -> Course:
     return Poses(time=time, path=poses, commands=commands)
 
 
-def _columns(path: Path, model: str) -> tuple[str, ...]:
-    """Return the columns in the header of a course; raise if they match no kind of course."""
-    lines = (line for line in read_text(path).splitlines() if line.strip() and line[0] != "#")
-    header = next(lines, "")
-    columns = tuple(name.strip().strip('"') for name in header.split(","))
-    known = {names: kind for names, kind in _HEADERS.items() if _fits(names, model)}
-    if columns not in known:
-        fix = "name the columns so"
-        if columns in _HEADERS:
-            fix = f"or set motion.model: it is {model!r}"
-        expected = " or ".join(f"{','.join(names)!r} ({kind})" for names, kind in known.items())
-        raise refusal(f"{path}, line 1", f"{header[:80]!r}", expected, fix)
-    return columns
-
-
-def _fits(columns: tuple[str, ...], model: str) -> bool:
-    """Return whether columns contain no controls of another motion model."""
-    others = {name for key, names in _CONTROLS.items() if key != model for name in names}
-    return not others.intersection(columns)
-
-
 def _waypoints(table: Table) -> Float[np.ndarray, "n 2"]:
     """Return the way-points; raise if there are too few or two successive ones coincide."""
-    points = np.column_stack((table.column["x"], table.column["y"]))
+    points = points_of(table)
     if len(points) < 2:
         raise refusal(table.path, "one way-point", "at least two", "add rows")
     same = ~np.diff(points, axis=0).any(axis=1)
     if same.any():
-        row = int(np.argmax(same)) + 1
-        where = f"{table.path}, line {table.line[row]}"
-        raise refusal(where, "the way-point before it again", "another", "remove the row")
+        where, found = place_of(table, int(np.argmax(same)) + 1), "the way-point before it again"
+        raise refusal(where, found, "another", "remove the row")
     return points
-
-
-def _check_rising(table: Table) -> None:
-    """Raise if a course has fewer than two rows, or rows of equal time."""
-    if len(table.line) < 2:
-        raise refusal(table.path, "one row", "at least two: the last ends the drive", "add rows")
-    check_unique(table, "time")
 
 
 def _callers(path: Path, tables: Any) -> tuple[tuple[CallerConfig, ...] | None, list[str]]:

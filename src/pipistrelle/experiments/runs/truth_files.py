@@ -18,14 +18,23 @@ from jaxtyping import Float
 from pipistrelle.config import BagConfig
 from pipistrelle.detection.logs.readers import Robot
 from pipistrelle.detection.logs.recording import Log, check_seconds
-from pipistrelle.detection.logs.text_tables import check_unique, read_table, table_text
 from pipistrelle.experiments.drives import LabelledPoints, Truth
 from pipistrelle.files import LOG, OwnFiles
 from pipistrelle.geometry import poses_at
 from pipistrelle.refusals import refusal
+from pipistrelle.text_tables import Schema, check_unique, points_of, read_table, table_text
 
-FILES = ("truth.csv", "landmarks.csv")
-_PATH = ("time", "x", "y", "heading")
+TRUTH = Schema(
+    file="truth.csv",
+    row="a row is a true pose; for scoring only",
+    columns=("time", "x", "y", "heading"),
+)
+LANDMARKS = Schema(
+    file="landmarks.csv",
+    row="a row is a true landmark; for scoring only",
+    columns=("landmark", "x", "y"),
+)
+FILES = (TRUTH.file, LANDMARKS.file)
 
 Read = Callable[..., Log]
 """Reads the log of a folder, and of a robot if there are several."""
@@ -81,7 +90,7 @@ def read_truth(folder: Path, time: Float[np.ndarray, " k"]) -> Truth:
     The path is interpolated at the times `time` [s], the heading unwrapped; NaN outside the
     recorded poses.
     """
-    path_file, landmark_file = folder / "truth.csv", folder / "landmarks.csv"
+    path_file, landmark_file = folder / TRUTH.file, folder / LANDMARKS.file
     path = landmarks = None
     if lexists(path_file):  # also a broken link, which raises
         path = poses_at(time, *read_path(path_file, ","))
@@ -89,7 +98,7 @@ def read_truth(folder: Path, time: Float[np.ndarray, " k"]) -> Truth:
             expected = f"poses between the log's times {time[0].item()!r} and {time[-1].item()!r}"
             raise refusal(path_file, "none", expected, "use the log's clock or remove the file")
     if lexists(landmark_file):
-        landmarks = read_landmarks(landmark_file, ("landmark", "x", "y"), ",")
+        landmarks = read_landmarks(landmark_file, LANDMARKS.columns, ",")
     return Truth(time=time, path=path, landmarks=landmarks)
 
 
@@ -120,35 +129,28 @@ def truth_files(truth: Truth) -> dict[str, str]:
     files = {}
     if truth.path is not None:
         rows = np.column_stack((truth.time, truth.path))[np.isfinite(truth.path).all(axis=1)]
-        files["truth.csv"] = table_text(_PATH, *rows.T)
+        files[TRUTH.file] = table_text(dict(zip(TRUTH.columns, rows.T, strict=True)))
     if truth.landmarks is not None:
         labels, positions = truth.landmarks
-        files["landmarks.csv"] = table_text(("landmark", "x", "y"), labels, *positions.T)
+        columns = (labels, *positions.T)
+        files[LANDMARKS.file] = table_text(dict(zip(LANDMARKS.columns, columns, strict=True)))
     return files
 
 
 def read_path(
     path: Path, separator: str | None
 ) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, "n 3"]]:
-    r"""Read times [s] and poses [m, m, rad], with unwrapped heading, from a table.
+    """Read times [s] and poses [m, m, rad], with unwrapped heading, from a table.
 
     The later of two rows with equal time wins. Without a separator, columns are split at spaces and
     there is no header.
-
-    >>> from tempfile import TemporaryDirectory
-    >>> with TemporaryDirectory() as place:
-    ...     file = Path(place) / "truth.csv"
-    ...     _ = file.write_text("time,x,y,heading\n0,1,2,3.0\n1,1,2,-3.0\n")
-    ...     time, poses = read_path(file, ",")
-    >>> time, poses[:, 2].round(2)
-    (array([0., 1.]), array([3.  , 3.28]))
     """
-    table = read_table(path, _PATH, separator=separator)
+    table = read_table(path, TRUTH.columns, separator=separator)
     check_seconds(table)
     column = table.column
     last = np.append(np.diff(column["time"]) > 0, True)
     heading = np.unwrap(column["heading"][last])
-    return column["time"][last], np.column_stack((column["x"][last], column["y"][last], heading))
+    return column["time"][last], np.column_stack((points_of(table)[last], heading))
 
 
 def read_landmarks(path: Path, columns: tuple[str, ...], separator: str | None) -> LabelledPoints:
@@ -169,4 +171,4 @@ def read_landmarks(path: Path, columns: tuple[str, ...], separator: str | None) 
     """
     table = read_table(path, columns, separator=separator)
     check_unique(table, columns[0])
-    return table.column[columns[0]], np.column_stack((table.column["x"], table.column["y"]))
+    return table.column[columns[0]], points_of(table)
