@@ -2,6 +2,8 @@
 
 import json
 import re
+from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import polars as pl
@@ -23,22 +25,20 @@ from pipistrelle.evaluation.scores import SCORES
 from pipistrelle.experiments.comparing import (
     compare_missions,
     compare_studies,
+    comparison_table,
     differing,
-    distinguishing,
     draw_of,
     kind_of,
     matched,
-    named,
-    notes_of,
     path_view,
-    section,
-    shared_name,
+    settings_table,
+    write_comparison,
 )
 from pipistrelle.experiments.drives import NO_TRUTH, Truth
 from pipistrelle.experiments.results.reading import StoredPath
 from pipistrelle.experiments.studies.plan import Plan
 from pipistrelle.experiments.studies.world import TABLES, world_file
-from pipistrelle.files import RESULTS, OwnFiles
+from pipistrelle.files import COMPARISON, RESULTS, SUMS, OwnFiles, spelt
 from reference.results import PLACES, STEPS, TIME, TRUTH, loop, mission_folder, study_folder, turned
 
 OFF = turned(loop(), 0.1, (0.5, -0.2))
@@ -62,33 +62,32 @@ def test_the_same_estimates_are_compared_and_others_are_named(folders):
     one = {("active", "ekf"): NOISY, ("fused", "ekf"): OFF}
     two = {("fused", "ekf"): NOISY, ("passive", "ekf"): OFF}
     compared = compare_missions(folders(one, two))
-    assert [estimate.title for estimate in compared.compared] == ["fused ekf"]
-    assert compared.alone == {("active", "ekf"): (0,), ("passive", "ekf"): (1,)}
-    assert notes_of(compared) == (
+    assert [estimate.title for estimate in compared.estimates] == ["fused ekf"]
+    assert compared.notes == (
         "active ekf: only in A, not compared",
         "passive ekf: only in B, not compared",
     )
 
 
-def test_folders_of_one_filter_each_are_compared_by_strategy(folders):
-    one = {("active", "ekf"): OFF, ("fused", "ekf"): OFF}
-    two = {("fused", "mine:Own"): NOISY, ("active", "mine:Own"): NOISY}
-    compared = compare_missions(folders(one, two))
-    assert [estimate.title for estimate in compared.compared] == ["active", "fused"]
-    assert compared.compared[0].estimates == (("active", "ekf"), ("active", "mine:Own"))
-    assert compared.alone == {}
-
-
-def test_folders_of_one_strategy_each_are_compared_by_filter(folders):
-    one = {("active", "ekf"): OFF, ("active", "fastslam"): OFF}
-    two = {("fused", "fastslam"): NOISY}
-    compared = compare_missions(folders(one, two))
-    assert [estimate.title for estimate in compared.compared] == ["fastslam"]
-
-
-def test_folders_of_one_estimate_each_are_compared_whatever_they_are(folders):
-    compared = compare_missions(folders({("active", "ekf"): OFF}, {("fused", "iekf"): NOISY}))
-    assert [estimate.title for estimate in compared.compared] == [""]
+@pytest.mark.parametrize(
+    ("one", "two", "titles"),
+    [
+        ("active ekf, fused ekf", "fused mine:Own, active mine:Own", ["active", "fused"]),
+        ("active ekf, active fastslam", "fused fastslam", ["fastslam"]),
+        ("active ekf, fused ekf", "fused ekf, passive ekf", ["fused ekf"]),
+        ("fused mine:Own, active mine:Own", "active mine:Own", ["active Own"]),
+        ("active ekf", "fused iekf", [""]),
+    ],
+)
+def test_estimates_are_matched_by_what_differs_within_a_folder(folders, one, two, titles):
+    keys = [[tuple(name.split()) for name in text.split(", ")] for text in (one, two)]
+    paths = [dict.fromkeys(some, mine) for some, mine in zip(keys, (OFF, NOISY), strict=True)]
+    compared = compare_missions(folders(*paths))
+    assert [estimate.title for estimate in compared.estimates] == titles
+    for estimate in compared.estimates:
+        first, second = estimate.estimates
+        assert first in keys[0]
+        assert second in keys[1]
 
 
 def test_folders_without_a_common_estimate_are_refused_with_their_estimates(folders):
@@ -100,11 +99,11 @@ def test_folders_without_a_common_estimate_are_refused_with_their_estimates(fold
 
 def test_errors_of_raw_and_aligned_paths_equal_the_scores(folders):
     paths = {("fused", "ekf"): OFF}, {("fused", "ekf"): NOISY}
-    (estimate,) = compare_missions(folders(*paths)).compared
-    for view, scores in zip(estimate.views, estimate.scores, strict=True):
-        assert rmse(view.error[1:]) == pytest.approx(scores["position_rmse_m"], rel=1e-9)
-        aligned = scores["position_rmse_aligned_m"]
-        assert rmse(view.error_aligned[1:]) == pytest.approx(aligned, rel=1e-6, abs=1e-9)
+    (estimate,) = compare_missions(folders(*paths)).estimates
+    raw, aligned = (estimate.scores[f"position_rmse_{kind}m"] for kind in ("", "aligned_"))
+    assert [rmse(view.error[1:]) for view in estimate.views] == pytest.approx(raw, rel=1e-9)
+    errors = [rmse(view.error_aligned[1:]) for view in estimate.views]
+    assert errors == pytest.approx(aligned, rel=1e-6, abs=1e-9)
     exact, noisy = estimate.views
     assert exact.error_aligned.max() < 1e-9 < 0.03 < rmse(noisy.error_aligned)
     np.testing.assert_allclose(exact.aligned, TRUTH.path[:, :2], atol=1e-9)
@@ -125,11 +124,11 @@ def test_without_any_truth_paths_are_held_against_the_first(folders):
     compared = compare_missions(
         folders({("fused", "ekf"): loop()}, {("fused", "ekf"): OFF}, truth=(NO_TRUTH, NO_TRUTH))
     )
-    first, other = compared.compared[0].views
+    first, other = compared.estimates[0].views
     assert first.error.max() == 0.0
     assert other.error.max() > 0.5 > 1e-9 > other.error_aligned.max()
     assert compared.one_drive
-    assert notes_of(compared) == ()
+    assert compared.notes == ()
 
 
 @pytest.mark.parametrize("truth", [(TRUTH, NO_TRUTH), (NO_TRUTH, TRUTH)])
@@ -137,27 +136,21 @@ def test_a_folder_without_truth_is_held_against_the_truth_of_another(folders, tr
     compared = compare_missions(
         folders({("fused", "ekf"): OFF}, {("fused", "ekf"): OFF}, truth=truth)
     )
-    first, other = compared.compared[0].views
+    first, other = compared.estimates[0].views
     np.testing.assert_allclose(first.error, other.error, atol=1e-9)
     lacking = "A" if truth[0] is NO_TRUTH else "B"
-    assert notes_of(compared) == (f"Without truth: {lacking}; there is nothing to score it by.",)
+    assert compared.notes == (f"Without truth: {lacking}; there is nothing to score it by.",)
 
 
 def test_different_trajectories_are_reported(folders):
     paths, other = {("fused", "ekf"): loop()}, Truth(time=TIME, path=loop(0.3))
     compared = compare_missions(folders(paths, paths, truth=(TRUTH, other)))
     assert not compared.one_drive
-    assert notes_of(compared) == (
-        "The drives are not the same: each difference is that of one draw.",
-    )
-    first, second = compared.compared[0].views
+    assert compared.notes == ("The drives are not the same: each difference is that of one draw.",)
+    first, second = compared.estimates[0].views
     assert first.error.max() < 1e-9 < 1.0 < second.error.max()
-
-
-def test_truths_with_headings_a_full_turn_different_are_the_same(folders):
-    paths, told = {("fused", "ekf"): loop()}, TRUTH.path + np.array([0.0, 0.0, 2.0 * np.pi])
-    compared = compare_missions(folders(paths, paths, truth=(TRUTH, Truth(time=TIME, path=told))))
-    assert compared.one_drive
+    turned_once = Truth(time=TIME, path=TRUTH.path + np.array([0.0, 0.0, 2.0 * np.pi]))
+    assert compare_missions(folders(paths, paths, truth=(TRUTH, turned_once))).one_drive
 
 
 def test_other_times_are_another_drive_and_nothing_is_held_against_them(folders):
@@ -167,7 +160,7 @@ def test_other_times_are_another_drive_and_nothing_is_held_against_them(folders)
                 time=(TIME, later))
     )  # fmt: skip
     assert not compared.one_drive
-    view = compared.compared[0].views[1]
+    view = compared.estimates[0].views[1]
     assert np.isnan(view.error).all()
     np.testing.assert_array_equal(view.aligned, view.raw)
 
@@ -175,7 +168,7 @@ def test_other_times_are_another_drive_and_nothing_is_held_against_them(folders)
 def test_a_path_that_is_lost_is_not_moved(folders):
     lost = np.full_like(OFF, np.nan)
     compared = compare_missions(folders({("fused", "ekf"): OFF}, {("fused", "ekf"): lost}))
-    view = compared.compared[0].views[1]
+    view = compared.estimates[0].views[1]
     assert np.isnan(view.error_aligned).all()
     np.testing.assert_allclose(view.placed_aligned, PLACES[:2])
 
@@ -192,10 +185,11 @@ def test_differing_settings_have_all_values_and_sections_of_some_folders_are_nam
         filter: FilterConfig = sharp.filter
 
     compared = compare_missions(folders(paths, paths, config=(OfALog(), sharp)))
-    assert compared.sections_alone["air"] == (1,)
-    assert not {"seed", "filter"} & set(compared.sections_alone)
     assert compared.settings == {}
-    assert any(note.startswith("Settings of ") for note in notes_of(compared))
+    (note,) = (note for note in compared.notes if note.startswith("Settings of "))
+    assert note.startswith("Settings of air, ")
+    assert note.endswith(": only in B, not compared")
+    assert not {"seed", "filter"} & set(re.findall(r"\w+", note))
 
 
 # Which folders
@@ -236,7 +230,7 @@ def test_which_logs_were_solved_and_how_is_named_where_it_differs(folders):
         own.add("summary.json", json.dumps(told).encode())
     settings = compare_missions([one, two]).settings
     assert settings["log.path"] == ("here", "there")
-    assert settings["log.beamwidth_rad"] == (0.5, None)
+    assert settings["log.beamwidth_rad"] == ("0.5", None)
     assert "log.robot" not in settings
     assert len(set(settings["log.files"])) == 2
 
@@ -277,7 +271,15 @@ def pair(tmp_path):
 
 
 def cases_of_score(compared, score="position_rmse_m"):
-    return [case for case in compared.cases if case.score == score]
+    return [row for row in compared.rows if row["score"] == score]
+
+
+def worlds(case):
+    return case["worlds_first"], case["worlds"]
+
+
+def alone(case):
+    return case["alone_low"], case["alone_high"]
 
 
 def told(folder, case, score="position_rmse_m"):
@@ -291,38 +293,37 @@ def told(folder, case, score="position_rmse_m"):
 def test_cases_are_paired_world_by_world_and_judged_as_a_family(pair):
     compared = compare_studies(pair)
     cases = cases_of_score(compared)
-    assert [case.label for case in cases] == ["active", "fused"]
+    assert [case["case"] for case in cases] == ["active", "fused"]
     samples = [
         told(pair[1], (strategy, "iekf")) - told(pair[0], (strategy, "ekf"))
         for strategy in ("active", "fused")
     ]
     by_hand = judge([Statement(label="", sample=sample) for sample in samples])
     for case, sample, finding in zip(cases, samples, by_hand, strict=True):
-        assert case.contrast.paired
-        assert case.contrast.worlds == (WORLDS, WORLDS)
-        assert case.contrast.finding.mean == pytest.approx(sample.mean(), rel=1e-12)
-        assert case.contrast.finding.alone == pytest.approx(finding.alone, rel=1e-12)
-        assert case.contrast.finding.interval == pytest.approx(finding.interval, rel=1e-12)
+        assert case["paired"]
+        assert worlds(case) == (WORLDS, WORLDS)
+        assert case["difference"] == pytest.approx(sample.mean(), rel=1e-12)
+        assert alone(case) == pytest.approx(finding.alone, rel=1e-12)
+        assert (case["low"], case["high"]) == pytest.approx(finding.family, rel=1e-12)
         known = stats.ttest_1samp(sample, 0.0).confidence_interval(0.95)
-        assert case.contrast.finding.alone == pytest.approx((known.low, known.high), rel=1e-9)
-        assert case.contrast.finding.p < 0.05
-        assert case.contrast.finding.mean == pytest.approx(
-            case.contrast.means[1] - case.contrast.means[0], abs=1e-9
-        )
-    assert compared.settings == {"filters": (["ekf"], ["iekf"])}
-    assert notes_of(compared)[0] == "Paired over the worlds that both have met."
+        assert alone(case) == pytest.approx((known.low, known.high), rel=1e-9)
+        assert case["p"] == pytest.approx(finding.p, rel=1e-12)
+        assert case["p"] < 0.05
+        assert case["difference"] == pytest.approx(case["mean"] - case["mean_first"], abs=1e-9)
+    assert compared.settings == {"filters": ('["ekf"]', '["iekf"]')}
+    assert compared.notes[0] == "Paired over the worlds that both have met."
 
 
 def test_every_score_with_numbers_is_compared(pair):
     compared = compare_studies(pair)
-    found = list(dict.fromkeys(case.score for case in compared.cases))
+    found = list(dict.fromkeys(row["score"] for row in compared.rows))
     assert found == [name for name in SCORES if name in found], "in the order of the one table"
     assert "heading_rmse_rad" not in found, "no study has a number"
     (first, _) = cases_of_score(compared, "map_rmse_aligned_m")
     (same, _) = cases_of_score(compared, "position_rmse_aligned_m")
-    assert first.contrast.finding.mean == pytest.approx(2.0 * same.contrast.finding.mean, rel=1e-9)
+    assert first["difference"] == pytest.approx(2.0 * same["difference"], rel=1e-9)
     still, _ = cases_of_score(compared, "landmarks_full")
-    assert (still.contrast.finding.mean, still.contrast.finding.p) == (0.0, 1.0)
+    assert (still["difference"], still["p"]) == (0.0, 1.0)
 
 
 @pytest.mark.parametrize(
@@ -340,16 +341,16 @@ def test_other_worlds_are_not_paired_and_a_note_explains_it(tmp_path, config, ot
     study_folder(tmp_path / "one", plan(config=base), numbers(1.0, 1))
     study_folder(tmp_path / "two", plan(config=changed, worlds=4), numbers(0.5, 2))
     compared = compare_studies([tmp_path / "one", tmp_path / "two"])
-    assert notes_of(compared)[0].startswith("Not paired: the worlds are not the same")
+    assert compared.notes[0].startswith("Not paired: the worlds are not the same")
     case, _ = cases_of_score(compared)
-    assert not case.contrast.paired
-    assert case.contrast.worlds == (WORLDS, 4)
+    assert not case["paired"]
+    assert worlds(case) == (WORLDS, 4)
     first, second = (told(tmp_path / name, ("active", "ekf")) for name in ("one", "two"))
     known = stats.ttest_ind(second, first, equal_var=False)
-    alone = known.confidence_interval(0.95)
-    assert case.contrast.finding.alone == pytest.approx((alone.low, alone.high), rel=1e-9)
-    assert case.contrast.finding.mean == pytest.approx(second.mean() - first.mean(), rel=1e-12)
-    assert case.contrast.finding.p > 0.05, "what is between worlds hides it"
+    bounds = known.confidence_interval(0.95)
+    assert alone(case) == pytest.approx((bounds.low, bounds.high), rel=1e-9)
+    assert case["difference"] == pytest.approx(second.mean() - first.mean(), rel=1e-12)
+    assert case["p"] > 0.05, "what is between worlds hides it"
 
 
 def test_sound_and_estimators_may_differ_in_the_same_worlds():
@@ -362,11 +363,11 @@ def test_worlds_of_a_single_study_do_not_count(tmp_path):
     two = study_folder(tmp_path / "two", plan(), numbers(0.5, 2), worlds=[5, 1, 3, 2])
     compared = compare_studies([one, two])
     case, _ = cases_of_score(compared)
-    assert case.contrast.worlds == (3, 3)
-    assert (compared.done, compared.planned) == ((4, 4), (WORLDS, WORLDS))
+    assert worlds(case) == (3, 3)
+    assert compared.worlds == ((4, WORLDS), (4, WORLDS))
     both = [1, 2, 3]
     by_hand = [0.5 - 1.0 + noise(*w(case, 2)) - noise(*w(case, 1)) for w in map(of_case, both)]
-    assert case.contrast.finding.mean == pytest.approx(np.mean(by_hand), rel=1e-9)
+    assert case["difference"] == pytest.approx(np.mean(by_hand), rel=1e-9)
 
 
 def of_case(world):
@@ -390,18 +391,19 @@ def test_worlds_that_diverged_or_failed_are_counted_and_left_out_where_that_is_a
     two = study_folder(tmp_path / "two", plan(), diverging(0.5, 2, {3, 4}, value))
     everything, _ = cases_of_score(compare_studies([one, two]))
     left, _ = cases_of_score(compare_studies([one, two], drop_diverged=True))
-    assert everything.diverged == left.diverged == (1, 2)
-    assert left.contrast.worlds == (3, 3)
-    assert everything.contrast.worlds == ((WORLDS, WORLDS) if value is not None else (3, 3))
-    assert "left out" in notes_of(compare_studies([one, two], drop_diverged=True))[-1]
-    assert "count, as far" in notes_of(compare_studies([one, two]))[-1]
+    for case in (everything, left):
+        assert (case["diverged_first"], case["diverged"]) == (1, 2)
+    assert worlds(left) == (3, 3)
+    assert worlds(everything) == ((WORLDS, WORLDS) if value is not None else (3, 3))
+    assert "left out" in compare_studies([one, two], drop_diverged=True).notes[-1]
+    assert "count, as far" in compare_studies([one, two]).notes[-1]
 
 
 def test_a_score_that_is_no_number_counts_in_no_world(tmp_path):
     one = study_folder(tmp_path / "one", plan(), diverging(1.0, 1, {0}, np.nan))
     two = study_folder(tmp_path / "two", plan(), numbers(0.5, 2))
     case, _ = cases_of_score(compare_studies([one, two]), "map_rmse_m")
-    assert case.contrast.worlds == (WORLDS - 1, WORLDS - 1)
+    assert worlds(case) == (WORLDS - 1, WORLDS - 1)
 
 
 # Which cases
@@ -414,13 +416,11 @@ def test_cases_of_a_grid_are_matched_by_their_values_and_passive_by_no_beam(tmp_
     two = study_folder(tmp_path / "two", plan(strategies=ways, grid=grid), numbers(0.5, 2))
     compared = compare_studies([one, two])
     cases = cases_of_score(compared)
-    assert [(case.strategies[0], case.values["emitter.radius"]) for case in cases] == [
+    assert [(case["strategy"], case["emitter.radius"]) for case in cases] == [
         ("active", 0.025),
         ("passive", None),
     ]
-    assert [label for label, _ in compared.alone] == ["active ekf, 33.0°", "active ekf, 33.0°"]
-    assert [who for _, who in compared.alone] == [(0,), (1,)]
-    assert notes_of(compared)[-2:] == (
+    assert compared.notes[-2:] == (
         "Only in A, not compared: active ekf, 33.0°",
         "Only in B, not compared: active ekf, 33.0°",
     )
@@ -431,22 +431,23 @@ def test_a_value_that_only_one_study_varies_is_matched_with_the_settings_of_the_
     one = study_folder(tmp_path / "one", plan(grid=grid), numbers(1.0, 1))
     two = study_folder(tmp_path / "two", plan(), numbers(0.5, 2))
     compared = compare_studies([one, two])
-    assert {case.values["rays.power"] for case in compared.cases} == {2.0}
-    assert [case.label for case in cases_of_score(compared)] == [
+    assert {row["rays.power"] for row in compared.rows} == {2.0}
+    assert [case["case"] for case in cases_of_score(compared)] == [
         "active ekf, rays.power 2.0",
         "fused ekf, rays.power 2.0",
     ]
-    assert compared.settings["grid.rays.power"] == ([1.5, 2.0], None)
+    assert compared.settings["grid.rays.power"] == ("[1.5, 2.0]", None)
 
 
 def test_a_filter_of_a_single_study_is_named(tmp_path):
     one = study_folder(tmp_path / "one", plan(filters=("ekf", "fastslam")), numbers(1.0, 1))
     two = study_folder(tmp_path / "two", plan(filters=("ekf", "iekf")), numbers(0.5, 2))
     compared = compare_studies([one, two])
-    assert [case.label for case in cases_of_score(compared)] == ["active ekf", "fused ekf"]
-    assert dict(compared.alone) == {
-        "active fastslam": (0,), "fused fastslam": (0,), "active iekf": (1,), "fused iekf": (1,),
-    }  # fmt: skip
+    assert [case["case"] for case in cases_of_score(compared)] == ["active ekf", "fused ekf"]
+    assert compared.notes[-2:] == (
+        "Only in A, not compared: active fastslam; fused fastslam",
+        "Only in B, not compared: active iekf; fused iekf",
+    )
 
 
 def test_studies_without_a_common_case_are_refused_with_their_cases(tmp_path):
@@ -462,15 +463,13 @@ def test_several_studies_are_held_against_the_first_in_one_family(tmp_path):
         for seed, (name, level) in enumerate({"one": 1.0, "two": 0.5, "three": 0.9}.items())
     ]
     cases = cases_of_score(compare_studies(folders))
-    assert [case.other for case in cases] == [1, 2]
+    assert [case["letter"] for case in cases] == ["B", "C"]
     samples = [
         told(folder, ("fused", "ekf")) - told(folders[0], ("fused", "ekf"))
         for folder in folders[1:]
     ]
     by_hand = judge([Statement(label="", sample=sample) for sample in samples])
-    assert [case.contrast.finding.p for case in cases] == pytest.approx(
-        [f.p for f in by_hand], rel=1e-9
-    )
+    assert [case["p"] for case in cases] == pytest.approx([f.p for f in by_hand], rel=1e-9)
 
 
 def test_unpaired_cases_are_marked_among_paired_cases(tmp_path):
@@ -482,8 +481,8 @@ def test_unpaired_cases_are_marked_among_paired_cases(tmp_path):
         }.items()
     ]  # fmt: skip
     compared = compare_studies(folders)
-    assert [case.contrast.paired for case in cases_of_score(compared)] == [True, False, True, False]
-    assert notes_of(compared)[0].startswith("Paired where the worlds are the same")
+    assert [case["paired"] for case in cases_of_score(compared)] == [True, False, True, False]
+    assert compared.notes[0].startswith("Paired where the worlds are the same")
 
 
 # What is refused
@@ -518,34 +517,14 @@ def test_a_study_without_a_finished_world_is_refused(tmp_path):
 def test_the_version_of_a_study_is_read_from_its_readme(pair):
     from pipistrelle import __version__
 
-    assert compare_studies(pair).versions == (__version__, __version__)
+    assert "version of Pipistrelle" not in compare_studies(pair).settings
     (pair[0] / "README.md").write_text("mine")
-    (pair[1] / "README.md").unlink()
-    assert compare_studies(pair).versions == ("", "")
-
-
-THREE = [("active", "ekf"), ("fused", "ekf"), ("passive", "ekf")]
-BOTH = [("fused", "ekf"), ("fused", "fastslam")]
-
-
-def test_parts_that_differ_within_no_folder_do_not_name_an_estimate():
-    assert distinguishing([THREE, THREE]) == (True, False)
-    assert distinguishing([THREE, [("fused", "smoother")]]) == (True, False)
-    assert distinguishing([BOTH, [("fused", "ekf")]]) == (False, True)
-    assert distinguishing([BOTH, THREE]) == (True, True)
-    assert distinguishing([[("active", "ekf")], [("fused", "smoother")]]) == (False, False)
-
-
-def test_a_key_omits_parts_that_distinguish_nothing():
-    assert named(("fused", "ekf")) == ("fused", "ekf")
-    assert named(("fused", "ekf"), (False, True)) == ("", "ekf")
-    assert named(("fused", "ekf"), (False, False)) == ("", "")
-
-
-def test_a_title_has_the_shared_parts_of_estimates():
-    assert shared_name([("fused", "ekf"), ("fused", "ekf")]) == "fused ekf"
-    assert shared_name([("active", "mine:Own"), ("fused", "mine:Own")]) == "Own"
-    assert shared_name([("active", "ekf"), ("fused", "iekf")]) == ""
+    for path, known in ((pair[1], __version__), (pair[1] / "README.md", None)):
+        if known is None:
+            path.unlink()
+        settings = compare_studies(pair).settings
+        expected = None if known is None else (None, known)
+        assert settings.get("version of Pipistrelle") == expected
 
 
 def test_names_of_all_come_in_the_order_of_the_first_and_others_with_their_owners():
@@ -556,10 +535,121 @@ def test_names_of_all_come_in_the_order_of_the_first_and_others_with_their_owner
 
 
 def test_settings_differ_where_a_value_does_or_is_not_there():
-    told = differing([{"a": 1, "b": [1, 2], "c": 0}, {"a": 1, "b": [2, 1], "d": False}])
-    assert told == {"b": ([1, 2], [2, 1]), "c": (0, None), "d": (None, False)}
+    found = differing([{"a": 1, "b": [1, 2], "c": 0}, {"a": 1, "b": [2, 1], "d": False}])
+    assert found == {"b": ("[1, 2]", "[2, 1]"), "c": ("0", None), "d": (None, "false")}
     assert differing([{"a": 1}, {"a": 1.0}]) == {}
 
 
-def test_a_section_is_the_part_before_the_first_dot():
-    assert [section(name) for name in ("a.b.c", "seed")] == ["a", "seed"]
+# What is kept
+
+
+@pytest.fixture
+def missions(tmp_path):
+    lost = np.full_like(OFF, np.nan)
+    one = {("active", "ekf"): loop(), ("fused", "ekf"): OFF}
+    two = {("active", "iekf"): lost, ("fused", "iekf"): loop()}
+    sharp = Config(filter=FilterConfig(noise="measured", initial_pose_std=(0.1, 0.1, 0.1)))
+    folders = [
+        mission_folder(tmp_path / "one", one),
+        mission_folder(tmp_path / "two, [2]", two, config=sharp),
+    ]
+    return compare_missions(folders)
+
+
+@pytest.fixture
+def studies(tmp_path):
+    given = Plan(
+        name="made-up", iterations=3, strategies=("active", "passive"), filters=("ekf",),
+        config=Config(), grid={"emitter.radius": (0.0025, 0.025), "filter.noise": ("constant",)},
+    )  # fmt: skip
+    folders = [
+        study_folder(tmp_path / name, given, lambda case, world, k=k: 1.0 + k * (2 + world))
+        for k, name in enumerate(("one", "two"))
+    ]
+    return compare_studies(folders)
+
+
+def test_missions_have_a_row_for_each_estimate_folder_and_score(missions):
+    table = comparison_table(missions)
+    rmse = table.filter(pl.col("score") == "position_rmse_m")
+    assert rmse["letter"].to_list() == ["A", "B", "A", "B"]
+    assert rmse["filter"].to_list() == ["ekf", "iekf"] * 2
+    assert rmse["estimate"].to_list() == ["active", "active", "fused", "fused"]
+    first, lost, off, exact = rmse["value"].to_list()
+    assert (first, lost) == (0.0, None)
+    assert off > 0.5 > exact == 0.0
+    assert rmse["difference"].to_list() == [0.0, None, 0.0, pytest.approx(-off)]
+    diverged = table.filter(pl.col("score") == "diverged")["value"].to_list()
+    assert diverged == [0.0, 1.0, 0.0, 0.0]
+    assert {"wall_s", "landmarks_full", "nees_max"} <= set(table["score"])
+    assert not {"strategy", "filter", "ignored_rows", "online"} & set(table["score"])
+
+
+def test_studies_have_a_row_for_each_case_and_score(studies):
+    table = comparison_table(studies)
+    mine = table.filter(pl.col("score") == "map_rmse_m")
+    assert mine.select("case", "emitter.radius", "filter.noise", "worlds", "paired").rows() == [
+        ("active ekf, 33.0°, filter.noise constant", 0.0025, "constant", 3, True),
+        ("active ekf, 33.0°, filter.noise constant", 0.025, "constant", 3, True),
+        ("passive ekf, filter.noise constant", None, "constant", 3, True),
+    ]
+    assert mine["difference"].to_list() == pytest.approx([3.0] * 3)
+    assert mine["mean"].to_list() == pytest.approx([4.0] * 3)
+    low, high = mine["alone_low"][0], mine["alone_high"][0]
+    assert (low + high) / 2.0 == pytest.approx(3.0)
+
+
+def test_settings_have_a_column_for_each_folder(missions):
+    assert settings_table(missions).columns == ["setting", "A", "B"]
+    assert settings_table(missions).rows() == [
+        ("filter.noise", "constant", "measured"),
+        ("filter.initial_pose_std", "[0.05, 0.05, 0.0436]", "[0.1, 0.1, 0.1]"),
+    ]
+    assert settings_table(replace(missions, settings={})).rows() == []
+
+
+@pytest.mark.parametrize("kind", ["missions", "studies"])
+def test_a_comparison_is_written_with_sums_and_a_readme(kind, request, tmp_path):
+    compared, folder = request.getfixturevalue(kind), tmp_path / "out"
+
+    def draw(room):
+        (room / "comparison.png").write_bytes(b"picture")
+
+    given = {"command": "pipistrelle compare one", "notes": ["A note."], "draw": draw}
+    write_comparison(OwnFiles(folder, COMPARISON), compared, **given)
+    names = sorted(path.name for path in folder.iterdir())
+    assert names == [
+        "README.md", "SHA256SUMS", "comparison.csv", "comparison.parquet", "comparison.png",
+        "settings.csv",
+    ]  # fmt: skip
+    assert OwnFiles(folder, COMPARISON).there == COMPARISON.title
+    assert (folder / SUMS).read_text().startswith("# Of Pipistrelle: a comparison\n")
+    table = comparison_table(compared)
+    assert pl.read_parquet(folder / "comparison.parquet").equals(table)
+    assert pl.read_csv(folder / "comparison.csv").height == table.height
+    readme = (folder / "README.md").read_text()
+    for part in ("pipistrelle compare one", "- A note.", f"- A: `{spelt(compared.folders['A'])}`"):
+        assert part in readme
+
+
+def test_changed_files_of_an_earlier_comparison_are_not_replaced(missions, tmp_path):
+    folder = tmp_path / "out"
+    given = {"command": "", "notes": ()}
+    write_comparison(OwnFiles(folder, COMPARISON), missions, **given)
+    write_comparison(OwnFiles(folder, COMPARISON), missions, **given)
+    (folder / "comparison.csv").write_text("mine")
+    with pytest.raises(InputError, match=r"comparison\.csv: was changed since"):
+        write_comparison(OwnFiles(folder, COMPARISON), missions, **given)
+    assert (folder / "comparison.csv").read_text() == "mine"
+    assert (folder / "README.md").exists()
+
+
+@pytest.mark.parametrize("name", ["<script>", "a`b``c", "`"])
+def test_the_readme_shows_folder_names_as_code_without_markup(missions, tmp_path, name):
+    compared = replace(missions, folders={**missions.folders, "A": Path(name)})
+    folder = tmp_path / "out"
+    write_comparison(OwnFiles(folder, COMPARISON), compared, command="", notes=())
+    (line,) = [one for one in (folder / "README.md").read_text().split("\n") if "- A: " in one]
+    ticks, text = re.fullmatch(r"- A: (`+) ?(.+?) ?\1", line).groups()
+    assert text == name
+    assert ticks not in name

@@ -141,8 +141,8 @@ def test_studies_have_a_panel_for_each_score_and_a_line_for_each_case(tmp_path):
     labels = [text.get_text() for text in figure.axes[0].get_yticklabels()]
     assert labels == ["active ekf, 33.0°", "active ekf, 33.0°", "passive ekf"]
     points = [line for line in figure.axes[0].lines if line.get_marker() == "o"]
-    found = [case.contrast.finding for case in compared.cases if case.score == "position_rmse_m"]
-    assert [line.get_xdata().item() for line in points] == [f.mean for f in found]
+    found = [row["difference"] for row in compared.rows if row["score"] == "position_rmse_m"]
+    assert [line.get_xdata().item() for line in points] == found
     assert [line.get_ydata().item() for line in points] == [0.0, 1.0, 2.0]
     assert all(line.get_mfc() == RUNS[1] for line in points), "all are significant"
     assert legend(figure)[0].startswith("A  ")
@@ -150,13 +150,13 @@ def test_studies_have_a_panel_for_each_score_and_a_line_for_each_case(tmp_path):
 
 def test_titles_of_panels_do_not_overlap_however_many_scores_there_are(tmp_path):
     compared = studies_of(tmp_path, 1.0, 2.0)
-    cases = [
-        replace(case, score=name)
+    rows = [
+        row | {"score": name}
         for name in shown_in("studies")
-        for case in compared.cases
-        if case.score == "position_rmse_m"
+        for row in compared.rows
+        if row["score"] == "position_rmse_m"
     ]
-    figure = draw_comparison(replace(compared, cases=tuple(cases)))
+    figure = draw_comparison(replace(compared, rows=tuple(rows)))
     figure.draw_without_rendering()
     boxes = [axes._left_title.get_window_extent() for axes in figure.axes]
     assert len(boxes) == len(shown_in("studies"))

@@ -7,11 +7,15 @@ folder's truth, else the path of the first folder.
 Studies are compared case by case: cases match if strategy, filter and all varied values agree.
 Cases that drew the same worlds (seed, scenario, motion) are paired world by world; of others the
 means are compared. The cases of a score are one family (`evaluation.comparison.contrasts`).
+
+`write_comparison` keeps all numbers, the settings that differ, a figure and a README in a folder.
 """
 
+import io
 import json
+import math
 import re
-from collections.abc import Hashable, Mapping, Sequence
+from collections.abc import Callable, Hashable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, TypeVar
@@ -19,6 +23,7 @@ from typing import TYPE_CHECKING, Any, Literal, TypeVar
 import numpy as np
 from jaxtyping import Float
 
+from pipistrelle import __version__
 from pipistrelle.config import Config, InputError
 from pipistrelle.estimation.catalogue import short_name
 from pipistrelle.evaluation.accuracy import alignment, moved, position_error
@@ -34,7 +39,7 @@ from pipistrelle.experiments.results.reading import (
 from pipistrelle.experiments.studies.plan import RADIUS, Plan, PlannedCase, cases_of, plan_settings
 from pipistrelle.experiments.studies.study import load_study
 from pipistrelle.experiments.studies.world import check_world, done_worlds
-from pipistrelle.files import read_file, without_links
+from pipistrelle.files import OwnFiles, drawn_files, read_file, spelt, without_links
 from pipistrelle.geometry import wrap
 
 if TYPE_CHECKING:
@@ -44,8 +49,44 @@ K = TypeVar("K", bound=Hashable)
 LETTERS = "ABCDEFGHIJKLMNOPQRSTUVWXYZ"
 """Short names of folders."""
 POSITION = "position_rmse_m"
+SIGNIFICANCE = 0.05
+"""Differences with a smaller p, corrected for all cases, are marked as shown."""
 ROUNDING = 1e-6
 """Paths that differ by less are of the same drive [m, rad]."""
+SIMPLE = (int, float, str, type(None))
+"""Types of the values that a table takes as they are."""
+NOT_SCORES = ("strategy", "filter", "ignored_rows", "online")
+"""Other entries of an estimate in ``summary.json``."""
+README = """\
+# A comparison
+
+    {command}
+
+Pipistrelle {version}. SI units and radians; what ends in _deg is in degrees. A difference is that
+of a folder less the first, A.
+
+{folders}
+
+{notes}
+
+| file | what it holds |
+|---|---|
+| comparison.csv, comparison.parquet | {table} |
+| settings.csv | the settings that differ, a column for each folder; empty: it says nothing |
+| comparison.png, comparison.pdf | {figure} |
+| SHA256SUMS | what was written here: `--overwrite` touches nothing else (`sha256sum -c`) |
+"""
+MISSIONS = (
+    "a row for each estimate, folder and score",
+    "the paths, as they are and each after the rigid motion that brings it nearest to its truth "
+    "(without one, to the first folder's path); beside them the distance from there",
+)
+STUDIES = (
+    "a row for each case, study and score: means, their difference, its interval by itself "
+    "(alone_low, alone_high) and as one of all cases (low, high), and p as one of them (Holm)",
+    "the differences by case: thick by itself, thin as one of all cases; full points are "
+    "significant",
+)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -73,93 +114,48 @@ class ComparedEstimate:
     """Strategy and filter that the estimates share."""
     estimates: tuple[Estimate, ...]
     """One of each folder."""
-    scores: tuple[Mapping[str, Any], ...]
-    """Under the names of ``summary.json``."""
+    scores: Mapping[str, tuple[float | None, ...]]
+    """Each score in every folder."""
     views: tuple[PathView, ...]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class ComparedMissions:
+class Compared:
+    """Folders by letter, compared with the first."""
+
+    folders: Mapping[str, Path]
+    settings: Mapping[str, tuple[str | None, ...]]
+    """Settings and versions that differ, with their texts in all folders."""
+    notes: tuple[str, ...]
+    """Remarks that a reader needs, a line each."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ComparedMissions(Compared):
     """Folders of `run` or `slam`, compared with the first."""
 
-    folders: tuple[Path, ...]
-    versions: tuple[str, ...]
-    compared: tuple[ComparedEstimate, ...]
-    alone: Mapping[Estimate, tuple[int, ...]]
-    """Estimates that some folders lack, and the folders that have them."""
-    settings: Mapping[str, tuple[Any, ...]]
-    """Settings that differ, in the sections that all folders have."""
-    sections_alone: Mapping[str, tuple[int, ...]]
-    """Sections that some folders lack, as logs lack a world."""
+    estimates: tuple[ComparedEstimate, ...]
     truths: tuple[StoredPath | None, ...]
     one_drive: bool
     """Whether all folders hold the same drive, as far as known."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class ComparedCase:
-    """A score of a case in the first study and in another."""
-
-    label: str
-    strategies: tuple[str, str]
-    filters: tuple[str, str]
-    values: Mapping[str, Any]
-    """Values of all settings that any study varies."""
-    beamwidth_deg: float | None
-    """Of the vehicle's call, if it matters."""
-    score: str
-    other: int
-    """Index of the other study."""
-    diverged: tuple[int, int]
-    """Worlds in which the case diverged or failed, of all finished."""
-    contrast: Contrast
-    """Of the other study with the first."""
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class ComparedStudies:
+class ComparedStudies(Compared):
     """Folders of studies, compared with the first."""
 
-    folders: tuple[Path, ...]
-    versions: tuple[str, ...]
-    """Empty if a folder's README does not contain it."""
-    done: tuple[int, ...]
-    planned: tuple[int, ...]
-    """Numbers of worlds."""
-    cases: tuple[ComparedCase, ...]
-    """By score, then by case, then by study."""
+    worlds: tuple[tuple[int, int], ...]
+    """Numbers of finished and of planned worlds."""
+    rows: tuple[Mapping[str, Any], ...]
+    """Rows of `comparison_table`: by score, then by case, then by study."""
     overall: tuple[Contrast, ...]
     """Position RMSE of each other study, averaged over the cases of a world."""
-    alone: tuple[tuple[str, tuple[int, ...]], ...]
-    """Cases that some folders lack, and the folders that have them."""
-    settings: Mapping[str, tuple[Any, ...]]
-    """Settings of the plans that differ."""
-    dropped_diverged: bool
-    """Whether worlds in which either case diverged are left out."""
-
-
-Compared = ComparedMissions | ComparedStudies
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class _ReadStudy:
-    """A study's plan, its number of finished worlds, and the trials of each case."""
-
-    plan: Plan
-    worlds: int
-    trials: "Mapping[int, pl.DataFrame]"
 
 
 def kind_of(folders: Sequence[Path]) -> Literal["missions", "studies"]:
     """Return whether folders hold missions or studies.
 
     Raises InputError if they are too few or too many, repeated, or not of one kind.
-
-    Examples
-    --------
-    >>> kind_of([Path("one"), Path("two"), Path("./one")])
-    Traceback (most recent call last):
-    pipistrelle.config.InputError: one: is given twice, as A and C; name each folder once
     """
     if not 2 <= len(folders) <= len(LETTERS):
         expected = f"expected 2 to {len(LETTERS)} of `run`, `slam` or `study`"
@@ -185,90 +181,64 @@ def kind_of(folders: Sequence[Path]) -> Literal["missions", "studies"]:
     return "missions"
 
 
-def distinguishing(folders: Sequence[Sequence[Estimate]]) -> tuple[bool, bool]:
+def distinguishing(folders: Iterable[Iterable[Estimate]]) -> tuple[bool, bool]:
     """Return whether strategies, and whether filters, differ within any folder.
 
     Others do not name an estimate: folders of one filter each are compared strategy by strategy.
-
-    Examples
-    --------
-    >>> both = [("active", "ekf"), ("fused", "ekf")]
-    >>> distinguishing([both, [("fused", "smoother")]])
-    (True, False)
     """
-    strategy, name = (
-        any(len({estimate[part] for estimate in estimates}) > 1 for estimates in folders)
-        for part in (0, 1)
-    )
-    return strategy, name
+    parts = [[set(part) for part in zip(*estimates, strict=True)] for estimates in folders]
+    strategies, filters = zip(*parts, strict=True)
+    return max(map(len, strategies)) > 1, max(map(len, filters)) > 1
 
 
-def named(estimate: Estimate, parts: tuple[bool, bool] = (True, True)) -> Estimate:
-    """Return the key of an estimate, without parts that `distinguishing` excludes.
-
-    Examples
-    --------
-    >>> named(("fused", "ekf"), (True, False))
-    ('fused', '')
-    """
+def named(estimate: Estimate, parts: tuple[bool, bool]) -> Estimate:
+    """Return the key of an estimate, without parts that `distinguishing` excludes."""
     strategy, name = estimate
     return strategy * parts[0], name * parts[1]
 
 
 def shared_name(estimates: Sequence[Estimate]) -> str:
-    """Return the strategy and filter that estimates share.
-
-    Examples
-    --------
-    >>> shared_name([("fused", "ekf"), ("fused", "mine:Own")]), shared_name([("fused", "mine:Own")])
-    ('fused', 'fused Own')
-    """
-    strategies, filters = ({estimate[part] for estimate in estimates} for part in (0, 1))
-    common = [only for (only, *others) in (sorted(strategies), sorted(filters)) if not others]
-    return " ".join(map(short_name, common))
+    """Return the strategy and filter that estimates share."""
+    parts = [set(part) for part in zip(*estimates, strict=True)]
+    return " ".join(short_name(only) for (only, *others) in map(sorted, parts) if not others)
 
 
-def matched(keys: Sequence[Sequence[K]]) -> tuple[tuple[K, ...], dict[K, tuple[int, ...]]]:
-    """Return the keys of all folders, and the owners of every other key.
-
-    `keys`: of each folder, without repetition. Returns: in the order of the first folder.
-
-    Examples
-    --------
-    >>> matched([["a", "b"], ["c", "b"]])
-    (('b',), {'a': (0,), 'c': (1,)})
-    """
-    owners = {
-        key: tuple(i for i, own in enumerate(keys) if key in own) for each in keys for key in each
-    }
+def matched(keys: Sequence[Iterable[K]]) -> tuple[tuple[K, ...], dict[K, tuple[int, ...]]]:
+    """Return the keys of all folders in the order of the first, and the owners of other keys."""
+    owners: dict[K, tuple[int, ...]] = {}
+    for i, own in enumerate(keys):
+        for key in own:
+            owners[key] = (*owners.get(key, ()), i)
     everywhere = tuple(key for key, who in owners.items() if len(who) == len(keys))
     return everywhere, {key: who for key, who in owners.items() if len(who) < len(keys)}
 
 
-def differing(settings: Sequence[Mapping[str, Any]]) -> dict[str, tuple[Any, ...]]:
-    """Return the settings that differ between folders, with their values (None if missing).
+def differing(settings: Sequence[Mapping[str, Any]]) -> dict[str, tuple[str | None, ...]]:
+    """Return the settings that differ between folders, with their texts (None if missing)."""
+    unlike = {}
+    for name in dict.fromkeys(name for one in settings for name in one):
+        values = [one.get(name) for one in settings]
+        if any(value != values[0] for value in values):
+            unlike[name] = tuple(
+                v if v is None or isinstance(v, str) else json.dumps(v) for v in values
+            )
+    return unlike
 
-    Examples
-    --------
-    >>> differing([{"seed": 1, "rays.power": 2.0}, {"seed": 1, "rays.power": 3.0, "x": 0}])
-    {'rays.power': (2.0, 3.0), 'x': (None, 0)}
-    """
-    values = {
-        name: tuple(one.get(name) for one in settings)
-        for name in dict.fromkeys(name for one in settings for name in one)
+
+def _lettered(
+    folders: Sequence[Path], versions: Sequence[str], settings: Sequence[Mapping[str, Any]]
+) -> dict[str, Any]:
+    """Return folders by letter, and the settings and versions that differ."""
+    version = [{"version of Pipistrelle": version or None} for version in versions]
+    return {
+        "folders": dict(zip(LETTERS, folders, strict=False)),
+        "settings": differing(version) | differing(settings),
     }
-    return {name: some for name, some in values.items() if any(v != some[0] for v in some)}
 
 
-def section(name: str) -> str:
-    """Return the section of a dotted setting, or the setting itself without a dot.
-
-    Examples
-    --------
-    >>> section("rays.power"), section("seed")
-    ('rays', 'seed')
-    """
-    return name.partition(".")[0]
+def _letters(who: Iterable[int]) -> str:
+    """Return the letters of some folders."""
+    return " and ".join(LETTERS[i] for i in who)
 
 
 def compare_missions(folders: Sequence[Path]) -> ComparedMissions:
@@ -277,9 +247,9 @@ def compare_missions(folders: Sequence[Path]) -> ComparedMissions:
     Raises InputError if a folder cannot be read, or no estimate is in all of them.
     """
     missions = [read_mission(folder) for folder in folders]
-    parts = distinguishing([tuple(mission.scores) for mission in missions])
+    parts = distinguishing(mission.scores for mission in missions)
     own = [{named(estimate, parts): estimate for estimate in m.scores} for m in missions]
-    common, alone = matched([tuple(keys) for keys in own])
+    common, alone = matched(own)
     if not common:
         tried = "; ".join(
             f"{mission.folder} has {', '.join(f'{s} {short_name(f)}' for s, f in mission.scores)}"
@@ -289,20 +259,32 @@ def compare_missions(folders: Sequence[Path]) -> ComparedMissions:
             f"compare: found no estimate that all folders have: {tried}; expected one of the same "
             "--strategy and --filter, or folders of one strategy or one filter each"
         )
-    shared, lacking = matched([sorted(set(map(section, mission.settings))) for mission in missions])
-    settings_shared = [
-        {name: value for name, value in mission.settings.items() if section(name) in shared}
-        for mission in missions
+    sections = [{name.partition(".")[0] for name in mission.settings} for mission in missions]
+    shared, lacking = matched([sorted(some) for some in sections])
+    settings = [
+        {name: value for name, value in m.settings.items() if name.partition(".")[0] in shared}
+        for m in missions
     ]
+    truths = tuple(mission.truth for mission in missions)
+    one_drive = _one_drive(missions)
+    notes = []
+    for key, who in alone.items():
+        strategy, name = own[who[0]][key]
+        notes.append(f"{strategy} {short_name(name)}: only in {_letters(who)}, not compared")
+    if not one_drive:
+        notes.append("The drives are not the same: each difference is that of one draw.")
+    untrue = [i for i, truth in enumerate(truths) if truth is None]
+    if 0 < len(untrue) < len(truths):
+        notes.append(f"Without truth: {_letters(untrue)}; there is nothing to score it by.")
+    for who in dict.fromkeys(lacking.values()):
+        names = ", ".join(name for name, its in lacking.items() if its == who)
+        notes.append(f"Settings of {names}: only in {_letters(who)}, not compared")
     return ComparedMissions(
-        folders=tuple(folders),
-        versions=tuple(mission.version for mission in missions),
-        compared=tuple(_compared(missions, [keys[key] for keys in own]) for key in common),
-        alone={own[who[0]][key]: who for key, who in alone.items()},
-        settings=differing(settings_shared),
-        sections_alone=lacking,
-        truths=tuple(mission.truth for mission in missions),
-        one_drive=_one_drive(missions),
+        **_lettered(folders, [mission.version for mission in missions], settings),
+        notes=tuple(notes),
+        estimates=tuple(_compared(missions, [keys[key] for keys in own]) for key in common),
+        truths=truths,
+        one_drive=one_drive,
     )
 
 
@@ -311,10 +293,19 @@ def _compared(missions: Sequence[StoredMission], estimates: Sequence[Estimate]) 
     chosen = list(zip(missions, estimates, strict=True))
     truths = (mission.truth for mission in missions if mission.truth is not None)
     whole = next(truths, missions[0].paths[estimates[0]])
+    scores = []
+    for mission, estimate in chosen:
+        run = mission.scores[estimate]
+        numbers = {name: value for name, value in run.items() if name not in NOT_SCORES}
+        numbers |= {f"online_{name}": value for name, value in (run.get("online") or {}).items()}
+        scores.append({n: None if v is None else float(v) for n, v in numbers.items()})
     return ComparedEstimate(
         title=shared_name(estimates),
         estimates=tuple(estimates),
-        scores=tuple(mission.scores[estimate] for mission, estimate in chosen),
+        scores={
+            name: tuple(own.get(name) for own in scores)
+            for name in dict.fromkeys(name for own in scores for name in own)
+        },
         views=tuple(
             path_view(mission.paths[estimate], mission.maps[estimate], mission.truth or whole)
             for mission, estimate in chosen
@@ -330,14 +321,6 @@ def path_view(
 
     `placed` [m]: landmarks, moved with it. `reference`: compared at common times, except the start.
     Returns: unmoved if fewer than two poses can be compared.
-
-    Examples
-    --------
-    >>> line = StoredPath(time=np.arange(4.0), pose=np.eye(4, 3) * 0.0 + np.arange(4.0)[:, None])
-    >>> off = StoredPath(time=line.time, pose=line.pose + [0.0, 3.0, 0.0])
-    >>> view = path_view(off, np.zeros((0, 2)), line)
-    >>> view.error.tolist(), view.error_aligned.round(9).tolist()
-    ([3.0, 3.0, 3.0, 3.0], [0.0, 0.0, 0.0, 0.0])
     """
     raw = path.pose[:, :2]
     _, own_rows, other_rows = np.intersect1d(path.time, reference.time, return_indices=True)
@@ -359,18 +342,13 @@ def path_view(
 
 
 def _one_drive(missions: Sequence[StoredMission]) -> bool:
-    """Return whether all folders hold the same drive, from their truths and times."""
+    """Return whether all folders hold the same drive, up to rounding, from truths and times."""
     truths = [mission.truth for mission in missions if mission.truth is not None]
     paths = [path for mission in missions for path in mission.paths.values()]
-    same = all(np.array_equal(path.time, paths[0].time) for path in paths)
-    return same and all(_same(truth, truths[0]) for truth in truths)
-
-
-def _same(path: StoredPath, other: StoredPath) -> bool:
-    """Return whether two paths are equal up to rounding."""
-    if not np.array_equal(path.time, other.time):
-        return False
-    off = path.pose - other.pose
+    for group in (paths, truths):
+        if not all(np.array_equal(path.time, group[0].time) for path in group):
+            return False
+    off = np.array([truth.pose - truths[0].pose for truth in truths]).reshape(-1, 3)
     off[:, 2] = wrap(off[:, 2])
     return bool(np.all(np.abs(off) < ROUNDING))
 
@@ -382,32 +360,61 @@ def compare_studies(folders: Sequence[Path], *, drop_diverged: bool = False) -> 
     with a number count. Raises InputError if a folder cannot be read, has no finished world, or no
     case is in all of them.
     """
-    studies = [_read(folder) for folder in folders]
-    varied = tuple(dict.fromkeys(name for one in studies for name in one.plan.grid))
-    planned = [cases_of(one.plan) for one in studies]
-    parts = distinguishing([[(case.strategy, case.filter) for case in cases] for cases in planned])
-    keyed = [{_key(case, varied, parts): case for case in cases} for cases in planned]
-    common, alone = matched([tuple(cases) for cases in keyed])
+    plans, trials = zip(*(_read(folder) for folder in folders), strict=True)
+    varied = tuple(dict.fromkeys(name for plan in plans for name in plan.grid))
+    planned = [cases_of(plan) for plan in plans]
+    parts = distinguishing([(case.strategy, case.filter) for case in cases] for cases in planned)
+    keyed = [
+        {
+            (*named((case.strategy, case.filter), parts), json.dumps(_values(case, varied))): case
+            for case in cases
+        }
+        for cases in planned
+    ]
+    common, alone = matched(keyed)
     if not common:
-        raise _nothing_in_common(folders, studies)
-    rows = [[cases[key] for cases in keyed] for key in common]
-    left = [(keyed[who[0]][key], who) for key, who in alone.items()]
-    cases, overall = _judged(studies, rows, varied, drop_diverged)
+        raise _nothing_in_common(folders, plans)
+    widths = [
+        dict(table.drop_nulls("beamwidth_deg").select("case", "beamwidth_deg").rows()[::-1])
+        for table in trials
+    ]
+    matches = [[cases[key] for cases in keyed] for key in common]
+    frame = _frame(matches, trials, drop_diverged)
+    rows, overall = _judged(folders, matches, frame, varied, widths[0])
+    notes, paired = [], {row["paired"] for row in rows}
+    if paired == {True}:
+        notes.append("Paired over the worlds that both have met.")
+    elif paired == {False}:
+        notes.append(
+            "Not paired: the worlds are not the same (seed, scenario or motion differ), so means "
+            "over different worlds are compared."
+        )
+    else:
+        notes.append("Paired where the worlds are the same, without a mark; ~: means over others.")
+    notes.append(f"*: shown, as one of all cases of its table. {INTERVALS}")
+    left = "are left out" if drop_diverged else "count, as far as they have a number"
+    notes.append(f"Worlds in which a case diverged {left}.")
+    for who in dict.fromkeys(alone.values()):
+        i = who[0]
+        labels = [
+            _label([keyed[i][key]], varied, widths[i]) for key, its in alone.items() if its == who
+        ]
+        some = "; ".join(labels[:4]) + f"; and {len(labels) - 4} more" * (len(labels) > 4)
+        notes.append(f"Only in {_letters(who)}, not compared: {some}")
     return ComparedStudies(
-        folders=tuple(folders),
-        versions=tuple(map(_version, folders)),
-        done=tuple(one.worlds for one in studies),
-        planned=tuple(one.plan.planned for one in studies),
-        cases=cases,
+        **_lettered(folders, [*map(_version, folders)], [*map(plan_settings, plans)]),
+        notes=tuple(notes),
+        worlds=tuple(
+            (table["iteration"].n_unique(), plan.planned)
+            for plan, table in zip(plans, trials, strict=True)
+        ),
+        rows=rows,
         overall=overall,
-        alone=tuple((_label([case], varied, studies[who[0]].trials), who) for case, who in left),
-        settings=differing([plan_settings(one.plan) for one in studies]),
-        dropped_diverged=drop_diverged,
     )
 
 
-def _read(folder: Path) -> _ReadStudy:
-    """Read a study's trials; raise InputError if a file was changed."""
+def _read(folder: Path) -> tuple[Plan, "pl.DataFrame"]:
+    """Read a study's plan and trials; raise InputError if a file was changed."""
     import polars as pl
 
     worlds = sorted(done_worlds(folder))
@@ -420,23 +427,20 @@ def _read(folder: Path) -> _ReadStudy:
         check_world(folder, stored.plan, world)
     try:
         trials = stored.trials.collect()
-        parted = trials.partition_by("case", as_dict=True)
-        tables = {case: table for (case,), table in parted.items()}
-        for table in tables.values():
-            table.select("iteration", "status", "diverged", "beamwidth_deg", POSITION)
+        trials.select("case", "iteration", "status", "diverged", "beamwidth_deg", POSITION)
     except (OSError, pl.exceptions.PolarsError) as error:
         raise InputError(
             f"{folder}: its trials have not the columns of this version; run the study anew"
         ) from error
-    return _ReadStudy(plan=stored.plan, worlds=len(worlds), trials=tables)
+    return stored.plan, trials
 
 
-def _nothing_in_common(folders: Sequence[Path], studies: Sequence[_ReadStudy]) -> InputError:
+def _nothing_in_common(folders: Sequence[Path], plans: Sequence[Plan]) -> InputError:
     """Return the error of studies without a common case."""
     tried = []
-    for folder, one in zip(folders, studies, strict=True):
-        ways = f"{', '.join(one.plan.strategies)} by {', '.join(map(short_name, one.plan.filters))}"
-        varied = "; ".join(f"{name} {list(values)}" for name, values in one.plan.grid.items())
+    for folder, plan in zip(folders, plans, strict=True):
+        ways = f"{', '.join(plan.strategies)} by {', '.join(map(short_name, plan.filters))}"
+        varied = "; ".join(f"{name} {list(values)}" for name, values in plan.grid.items())
         tried.append(f"{folder} tries {ways}" + f" at {varied}" * bool(varied))
     return InputError(
         f"compare: found no case that all studies have: {'. '.join(tried)}. Expected a strategy, a "
@@ -444,34 +448,23 @@ def _nothing_in_common(folders: Sequence[Path], studies: Sequence[_ReadStudy]) -
     )
 
 
-def _key(
-    case: PlannedCase, varied: Sequence[str], parts: tuple[bool, bool]
-) -> tuple[str, str, tuple[str, ...]]:
-    """Return the key that matches a case between studies."""
-    values = tuple(json.dumps(_value(case, name)) for name in varied)
-    return *named((case.strategy, case.filter), parts), values
-
-
-def _value(case: PlannedCase, name: str) -> Any:
-    """Return a case's value of a setting; None for the beam of passive sensing."""
-    if name == RADIUS and case.strategy == "passive":
-        return None
-    value: Any = case.config.model_dump(mode="json")
-    for part in name.split("."):
-        value = value[part]
-    return value
-
-
-def _label(
-    cases: Sequence[PlannedCase], varied: Sequence[str], trials: "Mapping[int, pl.DataFrame]"
-) -> str:
-    """Name matched cases by their common properties; `trials`: of the first study."""
-    first, words = cases[0], [shared_name([(case.strategy, case.filter) for case in cases])]
+def _values(case: PlannedCase, varied: Sequence[str]) -> dict[str, Any]:
+    """Return a case's values of some settings; None for the beam of passive sensing."""
+    values, table = {}, case.config.model_dump(mode="json")
     for name in varied:
-        value = _value(first, name)
-        if name == RADIUS and first.number in trials:
-            value = trials[first.number]["beamwidth_deg"].drop_nulls()[:1].to_list()
-            words += [f"{width:.1f}°" for width in value]
+        value: Any = table
+        for part in name.split("."):
+            value = value[part]
+        values[name] = None if name == RADIUS and case.strategy == "passive" else value
+    return values
+
+
+def _label(cases: Sequence[PlannedCase], varied: Sequence[str], widths: Mapping[int, float]) -> str:
+    """Name matched cases by their common properties; `widths`: of the first study [deg]."""
+    first, words = cases[0], [shared_name([(case.strategy, case.filter) for case in cases])]
+    for name, value in _values(first, varied).items():
+        if name == RADIUS and first.number in widths:
+            words.append(f"{widths[first.number]:.1f}°")
         elif value is not None:
             words.append(f"{name} {value if isinstance(value, str) else json.dumps(value)}")
     return ", ".join(filter(None, words)) or "the case"
@@ -481,80 +474,107 @@ def draw_of(config: Config) -> str:
     """Return the settings that draw the worlds, as text.
 
     Worlds of equal text are the same, even if other things are heard in them.
-
-    Examples
-    --------
-    >>> draw_of(Config()) == draw_of(Config(seed=8))
-    False
     """
     return config.model_dump_json(include={"seed", "scenario", "motion"})
 
 
-def _judged(
-    studies: Sequence[_ReadStudy],
-    rows: Sequence[Sequence[PlannedCase]],
-    varied: Sequence[str],
-    drop_diverged: bool,
-) -> tuple[tuple[ComparedCase, ...], tuple[Contrast, ...]]:
-    """Compare every score case by case, and the position RMSE averaged over the cases.
+def _frame(
+    matches: Sequence[Sequence[PlannedCase]], trials: "Sequence[pl.DataFrame]", drop_diverged: bool
+) -> "pl.DataFrame":
+    """Return the scores of matched cases that all studies keep, for `contrasts`.
 
-    `rows`: matched cases, of each study one.
+    `matches`: of each study one case. `trials`: of each study. Column `lost`: the trial diverged or
+    failed. A case without any trial has a row without a world.
     """
     import polars as pl
 
-    tables, blank = [], next(iter(studies[0].trials.values())).clear()
     draws: dict[str, int] = {}
-    scores = dict.fromkeys(_scored(studies), pl.Float64)
-    heads: dict[tuple[int, int], dict[str, Any]] = {}
-    for number, row in enumerate(rows):
-        trials = [
-            one.trials.get(case.number, blank) for one, case in zip(studies, row, strict=True)
-        ]
-        lost = [(one["status"] != "done") | one["diverged"].fill_null(False) for one in trials]
-        label = _label(row, varied, studies[0].trials)
-        values = {name: _value(row[0], name) for name in varied}
-        for folder, (case, table) in enumerate(zip(row, trials, strict=True)):
-            draw = draws.setdefault(draw_of(case.config), len(draws))
-            drops = table["diverged"].fill_null(False) & drop_diverged
-            # The first row never counts: it stands for cases without any trial.
-            columns = {"world": [-1, *table["iteration"]], "drops": [True, *drops]}
-            columns |= {score: [None, *table[score].cast(float)] for score in scores}
-            head = {"case": number, "folder": folder, "draw": draw}
-            head = {name: pl.lit(value) for name, value in head.items()}
-            tables.append(pl.DataFrame(columns, schema_overrides=scores).with_columns(**head))
-            heads[number, folder] = {
-                "label": label,
-                "strategies": (row[0].strategy, case.strategy),
-                "filters": (row[0].filter, case.filter),
-                "values": values,
-                "beamwidth_deg": next(iter(trials[0]["beamwidth_deg"].drop_nulls()), None),
-                "diverged": (int(lost[0].sum()), int(lost[folder].sum())),
-            }
-    index = ["case", "folder", "draw", "world", "drops"]
-    frame = pl.concat(tables).unpivot(index=index, variable_name="score")
-    frame = frame.with_columns(value=pl.when(~pl.col("drops")).then("value"))
-    judged = contrasts(frame, "folder", ["score", "case"], family=["score"], draw="draw")
-    cases = tuple(
-        ComparedCase(
-            **heads[one.by["case"], one.b], score=one.by["score"], other=one.b, contrast=one
-        )
-        for one in judged
-    )
-    paired = set(range(len(studies))) - {one.b for one in judged if not one.paired}
-    draw = pl.col("folder").replace(dict.fromkeys(paired, 0))
-    position = frame.filter(pl.col("score") == POSITION).with_columns(draw=draw)
-    return cases, contrasts(position, "folder", over=["case"], draw="draw")
-
-
-def _scored(studies: Sequence[_ReadStudy]) -> list[str]:
-    """Return the scores that all studies keep and that have any number."""
-    tables = [table for one in studies for table in one.trials.values()]
-    return [
+    index = [
+        (number, folder, case.number, draws.setdefault(draw_of(case.config), len(draws)))
+        for number, match in enumerate(matches)
+        for folder, case in enumerate(match)
+    ]
+    scores = [
         name
         for name in SCORES
-        if name not in NOT_MEANS and all(name in table.columns for table in tables)
-        if name == POSITION or any(table[name].cast(float).is_finite().any() for table in tables)
+        if name not in NOT_MEANS and all(name in table.columns for table in trials)
+        if name == POSITION or any(table[name].cast(float).is_finite().any() for table in trials)
     ]
+    diverged = pl.col("diverged").fill_null(value=False)
+    tables = [
+        table.select(
+            pl.lit(folder).cast(int).alias("folder"),
+            pl.col("case").cast(int),
+            pl.col("iteration").cast(int).alias("world"),
+            (diverged & drop_diverged).alias("drops"),
+            ((pl.col("status") != "done") | diverged).alias("lost"),
+            pl.col(*scores).cast(float),
+        )
+        for folder, table in enumerate(trials)
+    ]
+    columns = dict.fromkeys(("match", "folder", "case", "draw"), pl.Int64)
+    frame = pl.DataFrame(index, schema=columns, orient="row").join(
+        pl.concat(tables), on=["folder", "case"], how="left", maintain_order="left_right"
+    )
+    heads = ["match", "folder", "draw", "world", "drops", "lost"]
+    frame = frame.with_columns(pl.col("world").fill_null(-1))
+    frame = frame.unpivot(scores, index=heads, variable_name="score")
+    return frame.with_columns(value=pl.when(~pl.col("drops")).then("value"))
+
+
+def _judged(
+    folders: Sequence[Path],
+    matches: Sequence[Sequence[PlannedCase]],
+    frame: "pl.DataFrame",
+    varied: Sequence[str],
+    widths: Mapping[int, float],
+) -> tuple[tuple[dict[str, Any], ...], tuple[Contrast, ...]]:
+    """Compare every score case by case, and the position RMSE averaged over the cases.
+
+    `frame`: of the matched cases. `widths`: beamwidths of the cases of the first study [deg].
+    """
+    import polars as pl
+
+    judged = contrasts(frame, "folder", ["score", "match"], family=["score"], draw="draw")
+    position = frame.filter(pl.col("score") == POSITION)
+    counts = position.group_by("match", "folder").agg(pl.col("lost").sum()).rows()
+    lost = {(number, folder): count for number, folder, count in counts}
+    labels = [_label(match, varied, widths) for match in matches]
+    values = [_values(match[0], varied) for match in matches]
+    rows = []
+    for one in judged:
+        finding, number = one.finding, one.by["match"]
+        case = matches[number][one.b]
+        bounds = [x if math.isfinite(x) else None for x in (*finding.family, *finding.alone)]
+        rows.append(
+            {
+                "case": labels[number],
+                "strategy": case.strategy,
+                "filter": short_name(case.filter),
+                **{
+                    name: value if isinstance(value, SIMPLE) else json.dumps(value)
+                    for name, value in values[number].items()
+                },
+                "beamwidth_deg": widths.get(matches[number][0].number),
+                "score": one.by["score"],
+                "letter": LETTERS[one.b],
+                "folder": spelt(folders[one.b]),
+                "paired": one.paired,
+                "worlds_first": one.worlds[0],
+                "worlds": one.worlds[1],
+                "mean_first": one.means[0],
+                "mean": one.means[1],
+                "difference": finding.mean,
+                **dict(zip(("low", "high", "alone_low", "alone_high"), bounds, strict=True)),
+                "p": finding.p,
+                "diverged_first": lost[number, 0],
+                "diverged": lost[number, one.b],
+            }
+        )
+    paired = set(range(len(folders))) - {one.b for one in judged if not one.paired}
+    draw = pl.col("folder").replace(dict.fromkeys(paired, 0))
+    position = position.with_columns(draw=draw)
+    return tuple(rows), contrasts(position, "folder", over=["match"], draw="draw")
 
 
 def _version(folder: Path) -> str:
@@ -567,46 +587,87 @@ def _version(folder: Path) -> str:
     return match[1] if match else ""
 
 
-def notes_of(compared: Compared) -> tuple[str, ...]:
-    """Return the remarks on a comparison that a reader needs, a line each."""
-    if isinstance(compared, ComparedMissions):
-        return _mission_notes(compared)
-    notes, paired = [], {case.contrast.paired for case in compared.cases}
-    if paired == {True}:
-        notes.append("Paired over the worlds that both have met.")
-    elif paired == {False}:
-        notes.append(
-            "Not paired: the worlds are not the same (seed, scenario or motion differ), so means "
-            "over different worlds are compared."
-        )
+def less(value: float | None, first: float | None) -> float | None:
+    """Return the difference of two values; None if any is missing."""
+    return None if value is None or first is None else value - first
+
+
+def comparison_table(compared: ComparedMissions | ComparedStudies) -> "pl.DataFrame":
+    """Return all numbers of a comparison as a table; null for missing numbers."""
+    import polars as pl
+
+    if isinstance(compared, ComparedStudies):
+        rows = compared.rows
     else:
-        notes.append("Paired where the worlds are the same, without a mark; ~: means over others.")
-    notes.append(f"*: shown, as one of all cases of its table. {INTERVALS}")
-    left = "are left out" if compared.dropped_diverged else "count, as far as they have a number"
-    notes.append(f"Worlds in which a case diverged {left}.")
-    for who in dict.fromkeys(its for _, its in compared.alone):
-        labels = [label for label, its in compared.alone if its == who]
-        some = "; ".join(labels[:4]) + f"; and {len(labels) - 4} more" * (len(labels) > 4)
-        notes.append(f"Only in {_letters(who)}, not compared: {some}")
-    return tuple(notes)
+        rows = tuple(
+            {
+                "estimate": estimate.title,
+                "score": score,
+                "letter": letter,
+                "folder": spelt(folder),
+                "strategy": strategy,
+                "filter": short_name(name),
+                "value": value,
+                "difference": less(value, values[0]),
+            }
+            for estimate in compared.estimates
+            for score, values in estimate.scores.items()
+            for (letter, folder), (strategy, name), value in zip(
+                compared.folders.items(), estimate.estimates, values, strict=True
+            )
+        )
+    return pl.DataFrame(rows, infer_schema_length=None).with_columns(
+        pl.selectors.float().fill_nan(None)
+    )
 
 
-def _mission_notes(compared: ComparedMissions) -> tuple[str, ...]:
-    """Return the remarks on a comparison of missions."""
-    notes = []
-    for (strategy, name), who in compared.alone.items():
-        notes.append(f"{strategy} {short_name(name)}: only in {_letters(who)}, not compared")
-    if not compared.one_drive:
-        notes.append("The drives are not the same: each difference is that of one draw.")
-    lacking = [i for i, truth in enumerate(compared.truths) if truth is None]
-    if 0 < len(lacking) < len(compared.truths):
-        notes.append(f"Without truth: {_letters(lacking)}; there is nothing to score it by.")
-    for who in dict.fromkeys(compared.sections_alone.values()):
-        names = [name for name, its in compared.sections_alone.items() if its == who]
-        notes.append(f"Settings of {', '.join(names)}: only in {_letters(who)}, not compared")
-    return tuple(notes)
+def settings_table(compared: Compared) -> "pl.DataFrame":
+    """Return the settings that differ, a row each, with a column for each folder."""
+    import polars as pl
+
+    rows = [(name, *values) for name, values in compared.settings.items()]
+    columns = dict.fromkeys(("setting", *compared.folders), pl.String)
+    return pl.DataFrame(rows, schema=columns, orient="row")
 
 
-def _letters(who: Sequence[int]) -> str:
-    """Return the letters of some folders."""
-    return " and ".join(LETTERS[i] for i in who)
+def write_comparison(
+    own: OwnFiles,
+    compared: ComparedMissions | ComparedStudies,
+    *,
+    command: str,
+    notes: Sequence[str],
+    draw: Callable[[Path], None] = lambda _: None,
+) -> None:
+    """Write a comparison into a folder, in place of an earlier one.
+
+    `own`: the folder, as `pipistrelle.files.claim` gives it. `command`: the command line.
+    `notes`: remarks for the README. `draw`: writes the figure into a folder. Raises InputError if a
+    file cannot be written, or one to be replaced was changed.
+    """
+    buffer, table = io.BytesIO(), comparison_table(compared)
+    table.write_parquet(buffer)
+    content, figure = MISSIONS if isinstance(compared, ComparedMissions) else STUDIES
+    text = README.format(
+        command=command,
+        version=__version__,
+        folders="\n".join(f"- {x}: {_quoted(spelt(f))}" for x, f in compared.folders.items()),
+        notes="\n".join(f"- {note}" for note in notes),
+        table=content,
+        figure=figure,
+    )
+    own.replace(
+        {
+            "comparison.parquet": buffer.getvalue(),
+            "comparison.csv": table.write_csv(),
+            "settings.csv": settings_table(compared).write_csv(),
+            **drawn_files(draw),
+            "README.md": text,
+        }
+    )
+
+
+def _quoted(text: str) -> str:
+    """Return text as Markdown code, whatever backticks it contains."""
+    ticks = "`" * (1 + max(map(len, re.findall("`+", text)), default=0))
+    pad = " " if "`" in text else ""
+    return f"{ticks}{pad}{text}{pad}{ticks}"

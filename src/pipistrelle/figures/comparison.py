@@ -1,6 +1,7 @@
 """Figures of comparisons: paths of several runs in a map, differences of studies by case."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from pathlib import Path
 from textwrap import fill
 from typing import TYPE_CHECKING, Any
 
@@ -9,17 +10,16 @@ import numpy as np
 from pipistrelle.estimation.catalogue import title_of
 from pipistrelle.evaluation.scores import heading, shown_in
 from pipistrelle.experiments.comparing import (
-    ComparedCase,
+    LETTERS,
+    SIGNIFICANCE,
     ComparedEstimate,
     ComparedMissions,
     ComparedStudies,
 )
-from pipistrelle.experiments.comparison_files import lettered
 from pipistrelle.figures.style import INK, STYLE, TRUTH
 from pipistrelle.files import spelt
 
 if TYPE_CHECKING:
-    from matplotlib.artist import Artist
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
@@ -28,10 +28,9 @@ RUNS = ("#0b6e69", "#c8501e", "#6a3fa0", "#7d8a12", "#b03a7a", "#2f6db3")
 DASHES: tuple[Any, ...] = ("-", (0, (5, 2)), (0, (1.2, 1.4)), (0, (6, 2, 1.2, 2)))
 WIDTH, ROW, REST = 12.0, 3.7, 0.75
 """Width of a figure of paths, height of an estimate's row, and of the legend [inch]."""
-ACROSS, TITLE = 4, 22
-"""Most panels side by side in a figure of studies, and most letters in a line of a title."""
-SIGNIFICANCE = 0.05
-"""Points with a smaller p, corrected for all cases, are filled."""
+ACROSS, TITLE, LONGEST = 4, 22, 40
+"""Most panels side by side in a figure of studies; most letters in a line of a title, and of a
+folder's name."""
 
 
 def draw_comparison(compared: ComparedMissions | ComparedStudies) -> "Figure":
@@ -56,11 +55,11 @@ def _draw_missions(compared: ComparedMissions) -> "Figure":
     """Draw a row of maps and errors for each estimate."""
     from matplotlib.figure import Figure
 
-    rows = len(compared.compared)
+    rows = len(compared.estimates)
     figure = Figure(figsize=(WIDTH, rows * ROW + REST), layout="constrained")
     grid = figure.add_gridspec(2 * rows, 3)
     known = any(truth is not None for truth in compared.truths)
-    for row, estimate in enumerate(compared.compared):
+    for row, estimate in enumerate(compared.estimates):
         raw = figure.add_subplot(grid[2 * row : 2 * row + 2, 0])
         aligned = figure.add_subplot(grid[2 * row : 2 * row + 2, 1])
         limits = _limits(compared, estimate)
@@ -73,7 +72,16 @@ def _draw_missions(compared: ComparedMissions) -> "Figure":
         whom = "its truth" if known else "the first"
         aligned.set_title(f"each turned and shifted onto {whom}", loc="left")
         _draw_errors(figure, (grid[2 * row, 2], grid[2 * row + 1, 2]), estimate, known=known)
-    _name_folders(figure, compared)
+    truth = {"color": TRUTH, "lw": 3.2, "alpha": 0.35}
+    entries = [("true path", truth)] if known else []
+    for i, (letter, folder) in enumerate(compared.folders.items()):
+        filters = dict.fromkeys(title_of(e.estimates[i][1]) for e in compared.estimates)
+        name = f"{_named(letter, folder)} ({' and '.join(filters)})"
+        entries.append((name, {"lw": 1.3} | _look(i)))
+    entries.append(
+        ("placed landmarks", {"lw": 0, "marker": "o", "ms": 3.2, "mfc": "none", "mec": INK})
+    )
+    _draw_legend(figure, entries, 5)
     return figure
 
 
@@ -147,29 +155,23 @@ def _look(i: int) -> dict[str, Any]:
     return {"color": RUNS[i % len(RUNS)], "ls": DASHES[i % len(DASHES)]}
 
 
-def _name_folders(figure: "Figure", compared: ComparedMissions) -> None:
-    """Draw the legend of the folders and their filters."""
+def _named(letter: str, folder: Path) -> str:
+    """Return the letter of a folder and the end of its name."""
+    name = spelt(folder)
+    return f"{letter}  {name if len(name) <= LONGEST else f'…{name[1 - LONGEST :]}'}"
+
+
+def _draw_legend(
+    figure: "Figure", entries: Sequence[tuple[str, dict[str, Any]]], most: int
+) -> None:
+    """Draw a legend of names and looks below the panels, with at most so many columns."""
     from matplotlib.lines import Line2D
 
-    handles: list[Artist] = []
-    names: list[str] = []
-    if any(truth is not None for truth in compared.truths):
-        handles.append(Line2D([], [], color=TRUTH, lw=3.2, alpha=0.35))
-        names.append("true path")
-    for i, (letter, folder) in enumerate(lettered(compared.folders)):
-        handles.append(Line2D([], [], lw=1.3, **_look(i)))
-        filters = dict.fromkeys(title_of(e.estimates[i][1]) for e in compared.compared)
-        names.append(f"{letter}  {_short(spelt(folder))} ({' and '.join(filters)})")
-    handles.append(Line2D([], [], lw=0, marker="o", ms=3.2, mfc="none", mec=INK))
-    names.append("placed landmarks")
-    legend = figure.legend(handles, names, loc="outside lower left", ncols=min(len(names), 5))
+    handles = [Line2D([], [], **look) for _, look in entries]
+    names, columns = [name for name, _ in entries], min(len(entries), most)
+    legend = figure.legend(handles, names, loc="outside lower left", ncols=columns)
     for text in legend.get_texts():
         text.set_parse_math(False)
-
-
-def _short(name: str, most: int = 40) -> str:
-    """Return the end of a long name."""
-    return name if len(name) <= most else f"…{name[1 - most :]}"
 
 
 def _draw_studies(compared: ComparedStudies) -> "Figure":
@@ -177,10 +179,13 @@ def _draw_studies(compared: ComparedStudies) -> "Figure":
     from matplotlib.figure import Figure
     from matplotlib.ticker import MaxNLocator
 
-    first = compared.cases[0]
-    labels = [c.label for c in compared.cases if (c.score, c.other) == (first.score, first.other)]
-    others = len(compared.folders) - 1
-    there = {case.score for case in compared.cases}
+    first, others = compared.rows[0], len(compared.folders) - 1
+    labels = [
+        row["case"]
+        for row in compared.rows
+        if (row["score"], row["letter"]) == (first["score"], first["letter"])
+    ]
+    there = {row["score"] for row in compared.rows}
     shown = {name: score for name, score in shown_in("studies").items() if name in there}
     rows = -(-len(shown) // ACROSS)
     height = max(2.0, (0.1 + 0.12 * others) * len(labels)) + 0.9
@@ -190,11 +195,11 @@ def _draw_studies(compared: ComparedStudies) -> "Figure":
     for axes in empty:
         axes.remove()
     for axes, (name, score) in zip(panels, shown.items(), strict=True):
-        of_score = [case for case in compared.cases if case.score == name]
         axes.axvline(0.0, color=INK, lw=0.8, zorder=1)
-        for k, case in enumerate(of_score):
-            place = k // others + (case.other - 1 - 0.5 * (others - 1)) * 0.6 / others
-            _draw_case(axes, case, place)
+        for k, row in enumerate(row for row in compared.rows if row["score"] == name):
+            other = LETTERS.index(row["letter"])
+            place = k // others + (other - 1 - 0.5 * (others - 1)) * 0.6 / others
+            _draw_difference(axes, row, place, RUNS[other % len(RUNS)])
         title = heading(score).replace(" [", "\u00a0[")  # no line begins with the unit
         axes.set_title(fill(title, TITLE), loc="left", weight="bold")
         axes.set_xlabel("other less A" if others > 1 else "B less A")
@@ -205,36 +210,24 @@ def _draw_studies(compared: ComparedStudies) -> "Figure":
     panels[0].set_ylim(len(labels) - 0.5, -0.5)
     for text in (text for axes in grid[:, 0] for text in axes.get_yticklabels()):
         text.set_parse_math(False)
-    _name_studies(figure, compared)
+    names = [_named(*one) for one in compared.folders.items()]
+    entries: list[tuple[str, dict[str, Any]]] = [(names[0], {"lw": 0})]
+    entries += [
+        (name, {"color": RUNS[i % len(RUNS)], "lw": 2.6}) for i, name in enumerate(names) if i
+    ]
+    entries += [
+        ("95 %, by itself", {"color": INK, "lw": 2.6}),
+        ("95 %, as one of all cases", {"color": INK, "lw": 0.9}),
+        ("significant so", {"color": INK, "lw": 0, "marker": "o", "ms": 4.6}),
+    ]
+    _draw_legend(figure, entries, 6)
     return figure
 
 
-def _draw_case(axes: "Axes", case: ComparedCase, place: float) -> None:
+def _draw_difference(axes: "Axes", row: Mapping[str, Any], place: float, colour: str) -> None:
     """Draw a difference with its finite intervals."""
-    finding, colour = case.contrast.finding, RUNS[case.other % len(RUNS)]
-    for bounds, width in ((finding.family, 0.9), (finding.alone, 2.6)):
-        if np.isfinite(bounds).all():
-            axes.hlines(place, *bounds, color=colour, lw=width, zorder=2)
-    face = colour if finding.p < SIGNIFICANCE else "white"
-    axes.plot(finding.mean, place, "o", ms=4.6, mfc=face, mec=colour, zorder=3)
-
-
-def _name_studies(figure: "Figure", compared: ComparedStudies) -> None:
-    """Draw the legend of the folders, lines and points."""
-    from matplotlib.lines import Line2D
-
-    handles: list[Artist] = [Line2D([], [], lw=0)]
-    names = [f"A  {_short(spelt(compared.folders[0]))}"]
-    for i, (letter, folder) in list(enumerate(lettered(compared.folders)))[1:]:
-        colour = RUNS[i % len(RUNS)]
-        handles.append(Line2D([], [], color=colour, lw=2.6))
-        names.append(f"{letter}  {_short(spelt(folder))}")
-    handles += [
-        Line2D([], [], color=INK, lw=2.6),
-        Line2D([], [], color=INK, lw=0.9),
-        Line2D([], [], color=INK, lw=0, marker="o", ms=4.6),
-    ]
-    names += ["95 %, by itself", "95 %, as one of all cases", "significant so"]
-    legend = figure.legend(handles, names, loc="outside lower left", ncols=min(len(names), 6))
-    for text in legend.get_texts():
-        text.set_parse_math(False)
+    for low, high, width in (("low", "high", 0.9), ("alone_low", "alone_high", 2.6)):
+        if row[low] is not None and row[high] is not None:
+            axes.hlines(place, row[low], row[high], color=colour, lw=width, zorder=2)
+    face = colour if row["p"] < SIGNIFICANCE else "white"
+    axes.plot(row["difference"], place, "o", ms=4.6, mfc=face, mec=colour, zorder=3)

@@ -1,13 +1,13 @@
 """`pipistrelle compare` and `pipistrelle report`: differences of results, a study on one page."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 from cyclopts import Parameter
 
 from pipistrelle.evaluation.scores import heading, shown_in
-from pipistrelle.verbs.console import announced, text_table
+from pipistrelle.verbs.console import announced, command_line, text_table
 from pipistrelle.verbs.streams import put, say
 
 
@@ -87,16 +87,7 @@ def _effects(table: dict[str, Any]) -> str:
 
 
 if TYPE_CHECKING:
-    from pipistrelle.experiments.comparing import (
-        Compared,
-        ComparedCase,
-        ComparedEstimate,
-        ComparedMissions,
-        ComparedStudies,
-    )
-
-SIGNIFICANCE = 0.05
-"""Differences with a smaller p, corrected for all cases, are marked."""
+    from pipistrelle.experiments.comparing import ComparedMissions, ComparedStudies
 
 
 def compare(
@@ -123,174 +114,143 @@ def compare(
     """Put results side by side, the first of them held against each other one."""
     from pipistrelle.config import InputError
     from pipistrelle.experiments import comparing
+    from pipistrelle.files import COMPARISON, claim, spelt
 
     if output is None and (overwrite or quiet):
         flag = "--overwrite" if overwrite else "--quiet"
         raise InputError(f"{flag}: nothing is kept without -o DIR; add it, or leave the flag out")
-    compared: Compared
+    compared: ComparedMissions | ComparedStudies
+    names = {
+        letter: spelt(folder) for letter, folder in zip(comparing.LETTERS, folders, strict=False)
+    }
     if comparing.kind_of(folders) == "studies":
         compared = comparing.compare_studies(folders, drop_diverged=drop_diverged)
-        shown = _study_tables(compared)
+        answer, tables = _studies_answer(compared), _study_tables(compared)
+        for letter, (done, planned) in zip(names, compared.worlds, strict=True):
+            names[letter] += f": {done} worlds" + f" of {planned}" * (done < planned)
     elif drop_diverged:
         raise InputError("--drop-diverged: is for studies; a run is one world; leave it out")
     else:
         compared = comparing.compare_missions(folders)
-        shown = _mission_tables(compared)
-    answer, notes = _answer(compared), comparing.notes_of(compared)
+        answer, tables = _missions_answer(compared), _mission_tables(compared)
     if output is not None:
-        _keep(output, compared, (*answer, *notes), overwrite=overwrite, quiet=quiet)
+        own = claim(output, COMPARISON, overwrite=overwrite)
+
+        def draw(room: Path) -> None:
+            from pipistrelle.figures.comparison import draw_comparison
+            from pipistrelle.figures.style import save_figure
+
+            save_figure(draw_comparison(compared), room, "comparison")
+
+        notes = (*answer, *compared.notes)
+        with announced("Drawing the comparison ...", 1e9 if quiet else 3.0):
+            comparing.write_comparison(
+                own, compared, command=command_line(), notes=notes, draw=draw
+            )
     if not quiet:
-        blocks = [_names(compared), "\n".join(answer), *shown, _settings(compared)]
-        put("\n\n".join(block for block in [*blocks, "\n".join(notes)] if block))
+        settings = "No setting differs."
+        if compared.settings:
+            rows = [
+                [name, *("-" if text is None else text for text in texts)]
+                for name, texts in compared.settings.items()
+            ]
+            settings = text_table("", [["settings that differ", *compared.folders]], rows)
+        head = "\n".join(f"{letter}  {name}" for letter, name in names.items())
+        blocks = [head, "\n".join(answer), *tables, settings, "\n".join(compared.notes)]
+        put("\n\n".join(block for block in blocks if block))
     if output is not None:
         put(output)
 
 
-def _answer(compared: "Compared") -> list[str]:
-    """Return a sentence for each other folder: its position RMSE, averaged over the grid."""
-    from pipistrelle.experiments.comparing import LETTERS, POSITION, ComparedStudies
-    from pipistrelle.experiments.comparison_files import less
+def _studies_answer(compared: "ComparedStudies") -> list[str]:
+    """Return a sentence for each other study: its position RMSE, averaged over the grid."""
+    from pipistrelle.experiments.comparing import LETTERS, POSITION
     from pipistrelle.report.effects import headline
+
+    cases = sum(row["score"] == POSITION and row["letter"] == "B" for row in compared.rows)
+    return [
+        headline(f"{LETTERS[one.b]} instead of A", "position RMSE", "m", one, cases)
+        for one in compared.overall
+    ]
+
+
+def _missions_answer(compared: "ComparedMissions") -> list[str]:
+    """Return a sentence for each other folder: its position RMSE, averaged over the estimates."""
+    from pipistrelle.experiments.comparing import POSITION, less
     from pipistrelle.report.variables import amount
 
-    title, first = "position RMSE", LETTERS[0]
-    if isinstance(compared, ComparedStudies):
-        cases = sum(c.score == POSITION and c.other == 1 for c in compared.cases)
-        return [
-            headline(f"{LETTERS[one.b]} instead of {first}", title, "m", one, cases)
-            for one in compared.overall
-        ]
-    lines = []
-    for letter, i in zip(LETTERS[1:], range(1, len(compared.folders)), strict=False):
-        errors = [[one.scores[k].get(POSITION) for k in (0, i)] for one in compared.compared]
-        gaps = [gap for a, b in errors if (gap := less(b, a)) is not None]
-        if gaps:
-            mean, count = sum(gaps) / len(gaps), len(gaps)
+    errors, lines = [one.scores.get(POSITION) for one in compared.estimates], []
+    for i, letter in list(enumerate(compared.folders))[1:]:
+        gaps = [less(error[i], error[0]) for error in errors if error]
+        known = [gap for gap in gaps if gap is not None]
+        if known:
+            mean, count = sum(known) / len(known), len(known)
             size = "+" * (mean > 0.0) + amount(mean, "m")
             mean_of = f", averaged over {count} estimates" * (count > 1)
-            lines.append(f"{letter} instead of {first} changes the {title} by {size}{mean_of}.")
+            lines.append(f"{letter} instead of A changes the position RMSE by {size}{mean_of}.")
     return lines
-
-
-def _keep(
-    output: Path, compared: "Compared", notes: Sequence[str], *, overwrite: bool, quiet: bool
-) -> None:
-    """Write the comparison into its folder."""
-    from pipistrelle.experiments.comparison_files import write_comparison
-    from pipistrelle.figures.comparison import draw_comparison
-    from pipistrelle.figures.style import save_figure
-    from pipistrelle.files import COMPARISON, claim
-    from pipistrelle.verbs.console import command_line
-
-    own = claim(output, COMPARISON, overwrite=overwrite)
-
-    def draw(room: Path) -> None:
-        save_figure(draw_comparison(compared), room, "comparison")
-
-    with announced("Drawing the comparison ...", 1e9 if quiet else 3.0):
-        write_comparison(own, compared, command=command_line(), notes=notes, draw=draw)
-
-
-def _names(compared: "Compared") -> str:
-    """Return the letter and path of each folder, and the worlds of studies."""
-    from pipistrelle.experiments.comparing import ComparedStudies
-    from pipistrelle.experiments.comparison_files import lettered
-    from pipistrelle.files import spelt
-
-    lines = [f"{letter}  {spelt(folder)}" for letter, folder in lettered(compared.folders)]
-    if isinstance(compared, ComparedStudies):
-        counts = zip(compared.done, compared.planned, strict=True)
-        lines = [
-            f"{line}: {done} worlds" + f" of {planned}" * (done < planned)
-            for line, (done, planned) in zip(lines, counts, strict=True)
-        ]
-    return "\n".join(lines)
-
-
-def _settings(compared: "Compared") -> str:
-    """Format the settings that differ."""
-    from pipistrelle.experiments.comparison_files import lettered, settings_rows
-
-    rows = settings_rows(compared)
-    if not rows:
-        return "No setting differs."
-    heads = [["settings that differ", *(letter for letter, _ in lettered(compared.folders))]]
-    return text_table("", heads, [["-" if cell is None else cell for cell in row] for row in rows])
 
 
 def _mission_tables(compared: "ComparedMissions") -> Iterator[str]:
     """Format the scores of each estimate and their differences."""
-    from pipistrelle.experiments.comparison_files import lettered
-
-    letters = [letter for letter, _ in lettered(compared.folders)]
-    for estimate in compared.compared:
-        words = [_unlike(estimate, i) for i in range(len(letters))]
-        heads = [[estimate.title, *letters, *(f"{x} - {letters[0]}" for x in letters[1:])]]
-        if any(words):
-            heads.append(["", *words, *[""] * (len(letters) - 1)])
-        yield text_table("", heads, list(_score_rows(estimate)))
-
-
-def _unlike(estimate: "ComparedEstimate", i: int) -> str:
-    """Return the parts of an estimate's name that the title lacks."""
     from pipistrelle.estimation.catalogue import short_name
+    from pipistrelle.experiments.comparing import less
 
-    title = estimate.title.split()
-    words = map(short_name, estimate.estimates[i])
-    return " ".join(word for word in words if word not in title)
-
-
-def _score_rows(estimate: "ComparedEstimate") -> Iterator[list[str]]:
-    """Yield the rows of the scores that any folder has."""
-    from pipistrelle.experiments.comparison_files import less, scores_of
-
-    folders = [scores_of(scores) for scores in estimate.scores]
-    for name, score in shown_in("missions").items():
-        title, digits = heading(score), score.digits
-        values = [scores.get(name) for scores in folders]
-        if name == "diverged":
-            if any(values):
+    letters = list(compared.folders)
+    for estimate in compared.estimates:
+        title = estimate.title.split()
+        unlike = [
+            " ".join(word for word in map(short_name, names) if word not in title)
+            for names in estimate.estimates
+        ]
+        heads = [[estimate.title, *letters, *(f"{x} - A" for x in letters[1:])]]
+        if any(unlike):
+            heads.append(["", *unlike, *[""] * (len(letters) - 1)])
+        rows = []
+        for name, score in shown_in("missions").items():
+            values = estimate.scores.get(name, ())
+            if name in ("diverged", "gated") and not any(values):
+                continue
+            if name == "diverged":
                 words = ("-" if v is None else "yes" if v else "no" for v in values)
-                yield [title, *words, *[""] * (len(values) - 1)]
-        elif any(value is not None for value in values) and (name != "gated" or any(values)):
-            gaps = [_signed(less(value, values[0]), digits) for value in values[1:]]
-            yield [title, *(_number(value, digits) for value in values), *gaps]
+                rows.append([heading(score), *words, *[""] * (len(letters) - 1)])
+            elif any(value is not None for value in values):
+                cells = [_number(value, score.digits) for value in values]
+                gaps = [_signed(less(value, values[0]), score.digits) for value in values[1:]]
+                rows.append([heading(score), *cells, *gaps])
+        yield text_table("", heads, rows)
 
 
 def _study_tables(compared: "ComparedStudies") -> Iterator[str]:
     """Format the means of each score by case, and their differences with intervals."""
+    from pipistrelle.experiments.comparing import SIGNIFICANCE
+
     several = len(compared.folders) > 2
+    other = "other" if several else "B"
     for name, score in shown_in("studies").items():
-        cases = [case for case in compared.cases if case.score == name]
-        if not cases:
-            continue
-        title, digits = heading(score), score.mean_digits or score.digits
-        rows = [_case_row(case, digits, several) for case in cases]
-        other = "other" if several else "B"
-        heads = [[title, "A", other, f"{other} - A", "95 %, all cases", "", "worlds", "diverged"]]
-        yield text_table("", heads, rows)
+        cases = [row for row in compared.rows if row["score"] == name]
+        digits = score.mean_digits or score.digits
+        rows = []
+        for row in cases:
+            low, high = row["low"], row["high"]
+            known = low is not None and high is not None
+            lost = row["diverged_first"], row["diverged"]
+            rows.append([
+                row["case"] + f", {row['letter']}" * several,
+                _number(row["mean_first"], digits),
+                _number(row["mean"], digits),
+                _signed(row["difference"], digits),
+                f"{_signed(low, digits)} to {_signed(high, digits)}" if known else "-",
+                "*" * (row["p"] < SIGNIFICANCE) + "~" * (not row["paired"]),
+                " / ".join(map(str, dict.fromkeys((row["worlds_first"], row["worlds"])))),
+                " / ".join(map(str, lost)) if any(lost) else "",
+            ])  # fmt: skip
+        heads = [heading(score), "A", other, f"{other} - A", "95 %, all cases", "", "worlds"]
+        if cases:
+            yield text_table("", [[*heads, "diverged"]], rows)
 
 
-def _case_row(case: "ComparedCase", digits: int, several: bool) -> list[str]:
-    """Return the row of a case for a score."""
-    from pipistrelle.experiments.comparing import LETTERS
-
-    contrast, finding = case.contrast, case.contrast.finding
-    low, high = (_signed(bound, digits) for bound in finding.family)
-    known = all(abs(bound) < float("inf") for bound in finding.family)
-    worlds = dict.fromkeys(contrast.worlds)
-    return [
-        case.label + f", {LETTERS[case.other]}" * several,
-        *(_number(mean, digits) for mean in contrast.means),
-        _signed(finding.mean, digits),
-        f"{low} to {high}" if known else "-",
-        "*" * (finding.p < SIGNIFICANCE) + "~" * (not contrast.paired),
-        " / ".join(map(str, worlds)),
-        " / ".join(map(str, case.diverged)) if any(case.diverged) else "",
-    ]
-
-
-def _number(value: Any, digits: int) -> str:
+def _number(value: float | None, digits: int) -> str:
     """Format a number, a huge one in few digits; a dash without one."""
     if value is None or value != value:
         return "-"
