@@ -116,10 +116,10 @@ def test_the_order_of_a_family_does_not_matter(seed, m):
     samples = drawn(rng, rng.normal(0.0, 1.0, m), 12)
     order = rng.permutation(m)
     there = judge(statements(samples))
-    here = {finding.label: finding for finding in judge([statements(samples)[i] for i in order])}
-    for finding in there:
-        assert here[finding.label].interval == pytest.approx(finding.interval)
-        assert here[finding.label].p == pytest.approx(finding.p)
+    here = judge([statements(samples)[i] for i in order])
+    for i, finding in zip(order, here, strict=True):
+        assert finding.interval == pytest.approx(there[i].interval)
+        assert finding.p == pytest.approx(there[i].p)
 
 
 @given(SEED, st.floats(1e-3, 1e3))

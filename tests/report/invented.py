@@ -160,20 +160,13 @@ def narrowed(study, columns):
     trials = {}
     for way, mine in study.trials.items():
         b = [0] if way[1] == "passive" else columns
-        trials[way] = replace(
-            mine,
-            at=np.arange(len(columns)) % len(b),
-            failed=mine.failed[:, b],
-            diverged=mine.diverged[:, b],
-            scores={
-                score: table[:, columns if score == COMMON else b]
-                for score, table in mine.scores.items()
-            },
-            placed=mine.placed[:, b],
-            off=mine.off[:, b],
-            nees=mine.nees[:, b],
-            consistent=mine.consistent[:, b],
-        )
+        fields = ("failed", "diverged", "placed", "off", "nees", "consistent")
+        cut = {name: getattr(mine, name)[:, b] for name in fields}
+        scores = {
+            score: table[:, columns if score == COMMON else b]
+            for score, table in mine.scores.items()
+        }
+        trials[way] = replace(mine, at=np.arange(len(columns)) % len(b), scores=scores, **cut)
     return replace(
         study,
         variables=(few,),
@@ -213,7 +206,7 @@ def write_store(
     text.write_text(plan.replace("invented", name))
     plan = read_plan(text, iterations=iterations or len(study.worlds))
     open_store(folder, plan)
-    schemas, cases = world_schemas(plan), cases_of(plan)
+    cases = cases_of(plan)
     shape = (len(study.worlds), len(cases), LANDMARKS)
     full = rng.uniform(size=shape) < 0.7
     error = np.where(rng.uniform(size=shape) < 0.9, rng.rayleigh(0.4, shape), np.nan)
@@ -222,17 +215,23 @@ def write_store(
     for row, iteration in enumerate(study.worlds.tolist()):
         broken = {number for world, number in failed if world == row}
         tables = world_tables_of(study, row, cases, broken, full[row], error[row])
-        frames = {
-            name: pl.DataFrame(
-                [{"iteration": iteration} | line for line in tables[name]], schema=schemas[name]
-            )
-            for name in TABLES
-        }
-        for name, file in with_sums(frames, plan, iteration).items():
-            world_file(folder, name, iteration).write_bytes(file)
+        write_tables(folder, plan, iteration, tables)
     for row, number in failed:
         full[row, number], error[row, number] = False, np.nan
     return plan, full, error
+
+
+def write_tables(folder, plan, world, tables):
+    """Write the rows of a world's tables with their sums."""
+    schemas = world_schemas(replace(plan, filters=("ekf",)))  # those from outside are not there
+    frames = {
+        name: pl.DataFrame(
+            [{"iteration": world} | row for row in tables[name]], schema=schemas[name]
+        )
+        for name in TABLES
+    }
+    for name, file in with_sums(frames, plan, world).items():
+        world_file(folder, name, world).write_bytes(file)
 
 
 def world_tables_of(study, row, cases, broken, full, error):

@@ -1,15 +1,12 @@
 """Studies of any plan that never ran: what each setting does is planted, and so is nothing."""
 
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-import polars as pl
 
 from pipistrelle.experiments.studies.plan import cases_of, read_plan
 from pipistrelle.experiments.studies.study import open_store
-from pipistrelle.experiments.studies.world import TABLES, with_sums, world_file, world_schemas
-from report.invented import noise
+from report.invented import noise, write_tables
 
 FRAMES, LANDMARKS = 6, 5
 HEAD = "format = 1\niterations = {worlds}\n{ways}[config]\nscenario.steps = 24\n[grid]\n{grid}\n"
@@ -47,7 +44,6 @@ def write_planted(
     plan = read_plan(text)
     open_store(folder, plan)
     rng, cases = np.random.default_rng(seed), cases_of(plan)
-    schemas = world_schemas(replace(plan, filters=("ekf",)))  # those from outside are not there
     hard = noise(rng, worlds)
     own = noise(rng, worlds, len(cases), 4)
     for world in range(worlds):
@@ -70,13 +66,7 @@ def write_planted(
                 {"case": case.number, "landmark": k, "full": True, "error_m": scores["map_rmse_m"]}
                 for k in range(1, LANDMARKS + 1)
             ]
-        frames = {
-            table: pl.DataFrame([{"iteration": world} | row for row in tables[table]],
-                                schema=schemas[table])
-            for table in TABLES
-        }  # fmt: skip
-        for table, file in with_sums(frames, plan, world).items():
-            world_file(folder, table, world).write_bytes(file)
+        write_tables(folder, plan, world, tables)
     return plan
 
 

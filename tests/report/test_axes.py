@@ -69,39 +69,42 @@ def facets(tmp_path, grid, ways=PAIR):
 def test_few_combinations_of_the_rest_have_a_panel_each(tmp_path):
     grid = '"rays.power" = [1, 3]\n"beacon.level_db" = [36.8, 42.8, 48.8]'
     _, (power, level) = facets(tmp_path, grid)
-    assert [facet.title for facet in power] == [
+    assert [title for title, _ in power[0]] == [
         f"beacon.level_db = {word}" for word in ("36.8", "42.8", "48.8")
     ]
-    assert [line.name for line in level[0].lines] == ["active", "passive"]
-    assert level[1].lines[0].cells.tolist() == [3, 4, 5]
-    assert not any(facet.many for facet in (*power, *level))
+    (_, first), (_, second) = level[0]
+    assert [line.name for line in first] == ["active", "passive"]
+    assert second[0].cells.tolist() == [3, 4, 5]
+    assert (power[1], level[1]) == (False, False)
 
 
 def test_many_become_lines_of_a_panel_per_filter_and_strategy_each_case_once(tmp_path):
     levels = ", ".join(str(30.0 + k) for k in range(MOST_PANELS + 1))
     grid = f'beamwidth = [180, 11]\n"beacon.level_db" = [{levels}]'
     _, (beam, level) = facets(tmp_path, grid)
-    assert [facet.title for facet in beam] == ["EKF, active", "EKF, passive"]
-    assert [len(facet.lines) for facet in beam] == [MOST_PANELS + 1] * 2
-    assert beam[0].lines[0].name == "beacon.level_db = 30"
-    strengths = [line.strength for line in beam[0].lines]
+    assert (beam[1], level[1]) == (True, False)
+    assert [title for title, _ in beam[0]] == ["EKF, active", "EKF, passive"]
+    assert [len(lines) for _, lines in beam[0]] == [MOST_PANELS + 1] * 2
+    _, lines = beam[0][0]
+    assert lines[0].name == "beacon.level_db = 30"
+    strengths = [line.strength for line in lines]
     assert strengths[0] == 1.0
     assert (np.diff(strengths) < 0.0).all()
-    assert [facet.title for facet in level] == ["11°", "180°"]
+    assert [title for title, _ in level[0]] == ["11°", "180°"]
 
 
 def test_passive_sensing_is_one_line_where_the_rest_is_the_beam(tmp_path):
     widths = ", ".join(str(20 * k) for k in range(1, MOST_PANELS + 2))
     grid = f'beamwidth = [{widths}]\n"beacon.level_db" = [36.8, 48.8]'
     _, (_, level) = facets(tmp_path, grid)
-    assert [(f.title, len(f.lines)) for f in level] == [
+    assert [(title, len(lines)) for title, lines in level[0]] == [
         ("EKF, active", MOST_PANELS + 1), ("EKF, passive", 1),
     ]  # fmt: skip
 
 
 def test_without_variables_the_filters_are_the_axis_with_shifted_strategies():
     study = replace(invent(2), variables=(), beamwidth=BEAMWIDTH[:1])
-    (facet,) = facets_of(study, None, axis_of_words(["EKF", "FastSLAM 2.0"]))
-    assert [(line.way, line.x.tolist()) for line in facet.lines][:3] == [
+    ((_, lines),), _ = facets_of(study, None, axis_of_words(["EKF", "FastSLAM 2.0"]))
+    assert [(line.way, line.x.tolist()) for line in lines][:3] == [
         (("ekf", "active"), [0.0]), (("fastslam", "active"), [1.0]), (("ekf", "fused"), [0.0]),
     ]  # fmt: skip

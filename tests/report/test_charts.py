@@ -39,15 +39,14 @@ def charts(study):
     return {chart.name: chart for chart in study_charts(select(study, "world"))}
 
 
-def series_of(chart, panel, name):
-    (found,) = [
-        s
-        for p in chart.panels
-        if p.title == panel
-        for s in p.series
-        if s.name == name and s.style != "marks"
-    ]
+def line_of(panel, name):
+    (found,) = [s for s in panel.series if s.name == name and s.style != "marks"]
     return found
+
+
+def series_of(chart, title, name):
+    (panel,) = [panel for panel in chart.panels if panel.title == title]
+    return line_of(panel, name)
 
 
 def test_every_figure_of_the_papers_results_is_there(charts):
@@ -112,29 +111,18 @@ def test_gains_are_paired_and_full_where_significant(study, charts):
     assert (~series.filled | excludes).all(), "Holm rejects only what the interval alone excludes"
 
 
-@pytest.mark.parametrize(
-    ("chart", "score", "scale"),
-    [
-        ("position_rmse", "position_bound_m", 1.0),
-        ("heading_rmse", "heading_bound_rad", 180.0 / np.pi),
-    ],
-)
-def test_a_raw_error_of_the_path_has_its_bound_as_a_dashed_line(charts, study, chart, score, scale):
+def test_raw_errors_of_the_path_have_their_bound_as_a_dashed_line(charts, study):
     keep = np.arange(20) != 4
-    assert "dashed: the bound" in charts[chart].caption
-    for way in ("active", "fused", "passive"):
-        line = series_of(charts[chart], "EKF", f"{way}, bound")
-        least = scale * study.trials["ekf", way].scores[score][keep].mean(axis=0)
-        assert line.dashed
-        assert line.role == way
-        np.testing.assert_allclose(line.y, np.broadcast_to(least, 12), rtol=1e-12)
-
-
-def test_errors_without_a_bound_have_no_dashed_line(charts):
-    for name in ("position_rmse_aligned", "map_rmse", "map_rmse_aligned"):
-        names = [series.name for panel in charts[name].panels for series in panel.series]
-        assert not [one for one in names if one.endswith("bound")]
-        assert "bound" not in charts[name].caption
+    bounds = {"position_rmse": "position_bound_m", "heading_rmse": "heading_bound_rad"}
+    for chart in ("position_rmse", "heading_rmse", "position_rmse_aligned", "map_rmse"):
+        dashed = [s.name for panel in charts[chart].panels for s in panel.series if s.dashed]
+        assert bool(dashed) is ("dashed: the bound" in charts[chart].caption) is (chart in bounds)
+    for (chart, score), scale in zip(bounds.items(), (1.0, 180.0 / np.pi), strict=True):
+        for way in ("active", "fused", "passive"):
+            line = series_of(charts[chart], "EKF", f"{way}, bound")
+            least = scale * study.trials["ekf", way].scores[score][keep].mean(axis=0)
+            assert (line.dashed, line.role) == (True, way)
+            np.testing.assert_allclose(line.y, np.broadcast_to(least, 12), rtol=1e-12)
 
 
 def test_table_ii_is_charted_with_our_counts(charts):
@@ -152,6 +140,8 @@ def test_charts_without_data_are_not_drawn(study):
     assert "anees_fastslam" not in charts
     assert [panel.title for panel in charts["position_rmse"].panels] == ["EKF"]
     assert [panel.title for panel in charts["anees_ekf"].panels] == ["active", "fused"]
+    fused = select(only(study, [("ekf", "fused")]), "none")
+    assert "gain" not in [chart.name for chart in study_charts(fused)]
 
 
 @pytest.mark.parametrize("rule", RULES)
@@ -192,11 +182,6 @@ def charts_of(tmp_path, *args, **given):
     return study, {chart.name: chart for chart in level_charts(select(study, "none"))}
 
 
-def line_of(panel, name):
-    (found,) = [s for s in panel.series if s.name == name and s.style != "marks"]
-    return found
-
-
 def test_a_line_over_a_number_is_its_mean_within_one_deviation_and_the_bound_is_dashed(tmp_path):
     study, charts = charts_of(tmp_path, ways=BOTH, effect=by_level(0.3))
     assert list(charts) == DRAWN
@@ -224,13 +209,8 @@ def test_over_words_means_are_shifted_points_with_bars_and_the_bound_is_a_dash(t
     assert (bound.style, bound.x.tolist()) == ("levels", fused.x.tolist())
     table = study.trials["ekf", "fused"].scores["position_rmse_m"]
     np.testing.assert_allclose(fused.y, table.mean(axis=0), rtol=1e-12)
-
-
-def test_the_csv_over_words_has_the_words(tmp_path):
-    _, charts = charts_of(tmp_path, WORDS)
     header, *rows = csv_rows(charts["position_rmse"])
     assert header[3:5] == ["rays.weights", "position_rmse_m"]
-    assert {row[3] for row in rows} == {"instantaneous", "aggregated"}
     mine = [row for row in rows if row[1:3] == ["fused", "points"]]
     assert [row[3] for row in mine] == ["instantaneous", "aggregated"]
 
@@ -291,11 +271,6 @@ def test_the_first_figures_of_any_study_show_the_scores_of_the_answer(tmp_path):
         "effect_beacon_level_db_ekf", *DRAWN, "gain", "anees_ekf",
     ]  # fmt: skip
     assert [name for name in names if not answers(name)] == ["map_rmse_aligned", "anees_ekf"]
-
-
-def test_a_study_of_one_strategy_has_no_gain_to_chart():
-    fused = only(invent(3), [("ekf", "fused")])
-    assert "gain" not in [chart.name for chart in study_charts(select(fused, "none"))]
 
 
 @pytest.fixture
@@ -384,7 +359,7 @@ def test_the_gain_is_charted_along_each_variable_a_line_for_each_combination_of_
     assert "a line for each value of beacon.level_db, that of beacon.level_db = 36.8" in (
         by_power.caption
     )
-    mean = [finding.mean for finding in gains(selection, "ekf", "position_rmse_m")]
+    mean = [finding.mean for _, finding in gains(selection, "ekf", "position_rmse_m")]
     overall, *each = by_power.panels[0].series
     assert [series.y.tolist() for series in each] == [[mean[0], mean[2]], [mean[1], mean[3]]]
     assert all(series.low is None for series in each), "bars of so many would hide each other"
@@ -394,7 +369,7 @@ def test_the_gain_is_charted_along_each_variable_a_line_for_each_combination_of_
     np.testing.assert_allclose(mean, (active - fused).mean(axis=0), rtol=1e-9)
 
 
-def test_charts_can_be_had_of_a_single_world_and_of_none(tmp_path):
+def test_effects_of_a_single_world_and_of_none_have_no_intervals(tmp_path):
     write_planted(tmp_path / "s", worlds=1)
     study = read_study(tmp_path / "s")
     for failed in (False, True):

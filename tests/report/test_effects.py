@@ -20,7 +20,6 @@ from pipistrelle.report.effects import (
     pairings_of,
     question,
     record,
-    resolvable,
 )
 from pipistrelle.report.study import READ, RULES, read_study, select, selections
 from report.invented import changed, invent, narrowed, only, with_third
@@ -181,6 +180,11 @@ def test_worlds_count_by_the_rule_and_if_they_have_a_number(tmp_path, rule, left
     assert end.finding.n == left - 1
 
 
+def half_width(finding):
+    low, high = finding.family
+    return (high - low) / 2.0
+
+
 def test_the_smallest_significant_effect_is_half_the_familys_interval(tmp_path):
     study = study_of(tmp_path, ways=BOTH, spread=0.2)
     first, second = position(effects_of(select(study, "none")), factor="beacon.level_db", end=True)
@@ -188,7 +192,7 @@ def test_the_smallest_significant_effect_is_half_the_familys_interval(tmp_path):
     one, other = (table[:, 2] - table[:, 0] for table in tables)
     assert first.finding.holds is second.finding.holds is None
     for more, shown in ((1.01, True), (0.99, None)):
-        larger = one - one.mean() + more * resolvable(first.finding)
+        larger = one - one.mean() + more * half_width(first.finding)
         statements = [Statement(label="", sample=sample) for sample in (larger, other)]
         assert judge(statements)[0].holds is shown
 
@@ -197,7 +201,7 @@ def test_a_single_world_decides_nothing_and_none_still_less(tmp_path):
     study = study_of(tmp_path, worlds=1, effect=by_level(1.0))
     for effect in effects_of(select(study, "none")):
         assert effect.finding.holds is None
-        assert effect.untouched or resolvable(effect.finding) == np.inf
+        assert effect.untouched or half_width(effect.finding) == np.inf
     study.trials["ekf", "fused"].failed[:] = True
     assert {effect.finding.n for effect in effects_of(select(study, "none"))} == {0}
 
@@ -255,9 +259,7 @@ def gains_by_level(case):
 THREE = 'filters = ["ekf"]\n'
 
 
-def test_the_effect_on_a_gain_is_that_on_active_less_the_other_in_each_world(
-    tmp_path,
-):
+def test_the_effect_on_a_gain_is_that_on_active_less_the_other_in_each_world(tmp_path):
     study = study_of(tmp_path, TWO, ways=THREE, effect=gains_by_level)
     found = {
         effect.pairing.strategy: effect
@@ -265,12 +267,12 @@ def test_the_effect_on_a_gain_is_that_on_active_less_the_other_in_each_world(
         if effect.measure == gains_of(study)[0]
         and (effect.pairing.factor, effect.pairing.end) == ("beacon.level_db", True)
     }
-    table = {way: study.trials["ekf", way].scores["position_rmse_m"] for way in (
-        "active", "fused", "passive",
-    )}  # fmt: skip
     samples = []
     for way in ("fused", "passive"):
-        gain = table["active"] - table[way]
+        active, other = (
+            study.trials["ekf", one].scores["position_rmse_m"] for one in ("active", way)
+        )
+        gain = active - other
         samples.append(0.5 * (gain[:, 4] - gain[:, 0] + gain[:, 5] - gain[:, 1]))
     for effect, sample in zip(found.values(), samples, strict=True):
         assert effect.finding.mean == pytest.approx(sample.mean())
@@ -390,26 +392,24 @@ def with_maps(study, placed, off):
     )
 
 
-def test_maps_are_compared_over_the_landmarks_that_both_have_placed(study):
-    made = with_maps(study, [[1, 1, 0], [1, 1, 1]], [[3.0, 4.0, 90.0], [3.0, 8.0, 70.0]])
-    expected = np.sqrt((9 + 64) / 2) - np.sqrt((9 + 16) / 2)
-    assert change(made, measure_of(study, "map_rmse_m"), BEFORE, AFTER) == pytest.approx(
-        np.full(6, expected)
-    )
-
-
-def test_maps_without_a_landmark_in_common_have_no_difference(study):
-    made = with_maps(study, [[1, 0], [0, 1]], [[1.0, 1.0], [1.0, 1.0]])
-    assert np.isnan(change(made, measure_of(study, "map_rmse_m"), BEFORE, AFTER)).all()
-
-
-def test_maps_of_different_landmarks_are_compared_over_all_of_them(study):
-    made = with_maps(study, [[1, 1], [1, 1]], [[1.0, 1.0], [2.0, 2.0]])
-    elsewhere = replace(made, drawing=np.arange(12))
+@pytest.mark.parametrize(
+    ("placed", "off", "expected"),
+    [
+        (
+            [[1, 1, 0], [1, 1, 1]], [[3.0, 4.0, 90.0], [3.0, 8.0, 70.0]],
+            np.sqrt((9 + 64) / 2) - np.sqrt((9 + 16) / 2),
+        ),
+        ([[1, 1], [1, 1]], [[1.0, 1.0], [2.0, 2.0]], 1.0),
+        ([[1, 0], [0, 1]], [[1.0, 1.0], [1.0, 1.0]], np.nan),
+    ],
+)  # fmt: skip
+def test_maps_are_compared_over_the_landmarks_that_both_have_placed(study, placed, off, expected):
+    made, measure = with_maps(study, placed, off), measure_of(study, "map_rmse_m")
+    found = change(made, measure, BEFORE, AFTER)
+    assert found == pytest.approx(np.full(6, expected), nan_ok=True)
     own = made.trials["ekf", "fused"].scores["map_rmse_m"]
-    found = change(elsewhere, measure_of(study, "map_rmse_m"), BEFORE, AFTER)
-    np.testing.assert_array_equal(found, own[:, 5] - own[:, 0])
-    assert change(made, measure_of(study, "map_rmse_m"), BEFORE, AFTER) == pytest.approx(np.ones(6))
+    elsewhere = change(replace(made, drawing=np.arange(12)), measure, BEFORE, AFTER)
+    np.testing.assert_array_equal(elsewhere, own[:, 5] - own[:, 0])
 
 
 def test_passive_sensing_is_compared_with_any_beam_by_its_single_case(study):
@@ -498,62 +498,15 @@ def test_the_answer_averages_over_strategies_and_names_them_if_they_disagree(tmp
     assert f"{-finding.mean:.3f}".rstrip("0") in sentence
 
 
-def test_a_change_of_exactly_zero_is_answered_as_no_change(tmp_path):
-    study = study_of(tmp_path, ways=BOTH, effect=by_level(0.3))
-    for trials in study.trials.values():
-        trials.scores["position_rmse_m"][:] = trials.scores["position_rmse_m"][:, :1]
-    (sentence,) = answer_of(study)
-    assert sentence.endswith(
-        "leaves the position RMSE the same to the last digit, averaged over 2 cases."
-    )
-
-
-def test_a_value_between_the_ends_is_answered_if_only_it_has_an_effect(planted):
-    def effect(case):
-        return {"position_rmse_m": -0.4 * (case.values["beacon.level_db"] == 42.8)}
-
-    (sentence,) = planted(effect=effect)
-    assert re.search(rf"36\.8 to 42\.8 lowers the .* by 0\.\d+ m {INTERVAL}\.", sentence)
-
-
-def test_words_are_compared_with_the_first_of_the_plan(planted):
-    def effect(case):
-        return {"position_rmse_m": 0.4 * (case.values["rays.weights"] == "aggregated")}
-
-    (sentence,) = planted('"rays.weights" = ["instantaneous", "aggregated"]', effect=effect)
-    assert sentence.startswith(
-        "rays.weights = aggregated instead of instantaneous raises the position RMSE by"
-    )
-
-
-def test_of_several_values_the_largest_effect_shown_is_answered(planted):
-    def effect(case):
-        near = case.values["rays.range_bounds"][0]
-        return {"position_rmse_m": {0.5: 0.0, 1.0: 0.4, 2.0: -0.6, 3.0: 0.4}[near]}
-
-    grid = '"rays.range_bounds" = [[0.5, 20.0], [1.0, 20.0], [2.0, 20.0], [3.0, 20.0]]'
-    (sentence,) = planted(grid, effect=effect)
-    assert sentence.startswith("rays.range_bounds = [2, 20] instead of [0.5, 20] lowers")
-
-
-def test_values_of_a_variable_are_one_family_in_the_answer(tmp_path):
-    study = study_of(tmp_path, SOUNDS, effect=off_by(0.3))
-    table = study.trials["ekf", "fused"].scores["position_rmse_m"]
-    samples = [table[:, i] - table[:, 2] for i in (0, 4)]
-    findings = judge([Statement(label="", sample=sample) for sample in samples])
-    (sentence,) = answer_of(study)
-    largest = max(findings, key=lambda finding: finding.mean)
-    assert f"{largest.mean:.3f}".rstrip("0") in sentence
-    assert f"[{largest.family[0]:.3f}"[:6] in sentence
-
-
 def test_a_change_that_is_equal_in_every_world_has_no_interval(tmp_path):
     study = study_of(tmp_path)
-    hard = 0.5 * np.arange(12)[:, None]
-    study.trials["ekf", "fused"].scores["position_rmse_m"][:] = hard + np.array([0.0, 0.125, 0.25])
-    assert answer_of(study) == [
-        "beacon.level_db from 36.8 to 48.8 changes the position RMSE by 0.25 m in every world."
-    ]
+    position = study.trials["ekf", "fused"].scores["position_rmse_m"]
+    for rises, words in (
+        ([0.0, 0.125, 0.25], "changes the position RMSE by 0.25 m in every world."),
+        ([0.0, 0.0, 0.0], "leaves the position RMSE the same to the last digit."),
+    ):
+        position[:] = 0.5 * np.arange(12)[:, None] + np.array(rises)
+        assert answer_of(study) == [f"beacon.level_db from 36.8 to 48.8 {words}"]
 
 
 def off_by(metres):
@@ -566,17 +519,56 @@ def off_by(metres):
     return effect
 
 
-def test_a_false_assumption_is_compared_with_the_truth_in_the_answer(planted):
-    (sentence,) = planted(SOUNDS, effect=off_by(0.3))
-    assert re.fullmatch(
-        rf"assumed\.speed_of_sound from 343 to 3(37|49) raises the position RMSE by "
-        rf"0\.[23]\d* m {INTERVAL}\.", sentence,
-    )  # fmt: skip
+def by_value(setting, **errors):
+    """Plant an error for each value of a setting, by its text."""
+    return lambda case: {"position_rmse_m": errors[str(case.values[setting])]}
 
 
-def test_a_true_value_at_the_end_is_the_reference_of_the_answer(planted):
-    (sentence,) = planted('"assumed.speed_of_sound" = [337.0, 343.0]', effect=off_by(0.3))
-    assert sentence.startswith("assumed.speed_of_sound from 343 to 337 raises")
+NEAR = {"[0.5, 20.0]": 0.0, "[1.0, 20.0]": 0.4, "[2.0, 20.0]": -0.6, "[3.0, 20.0]": 0.4}
+
+
+@pytest.mark.parametrize(
+    ("grid", "effect", "pattern"),
+    [
+        (
+            LEVELS, by_value("beacon.level_db", **{"36.8": 0.0, "42.8": -0.4, "48.8": 0.0}),
+            rf"beacon\.level_db from 36\.8 to 42\.8 lowers the .* by 0\.\d+ m {INTERVAL}\.",
+        ),
+        (
+            '"rays.weights" = ["instantaneous", "aggregated"]',
+            by_value("rays.weights", instantaneous=0.0, aggregated=0.4),
+            r"rays\.weights = aggregated instead of instantaneous raises the position RMSE by .*",
+        ),
+        (
+            f'"rays.range_bounds" = [{", ".join(NEAR)}]', by_value("rays.range_bounds", **NEAR),
+            r"rays\.range_bounds = \[2, 20\] instead of \[0\.5, 20\] lowers .*",
+        ),
+        (
+            SOUNDS, off_by(0.3),
+            r"assumed\.speed_of_sound from 343 to 3(37|49) raises the position RMSE by "
+            rf"0\.[23]\d* m {INTERVAL}\.",
+        ),
+        (
+            '"assumed.speed_of_sound" = [337.0, 343.0]', off_by(0.3),
+            r"assumed\.speed_of_sound from 343 to 337 raises .*",
+        ),
+    ],
+    ids=["between the ends", "words", "the largest of several", "either side", "one side"],
+)  # fmt: skip
+def test_the_answer_is_the_largest_change_shown_from_the_reference(planted, grid, effect, pattern):
+    (sentence,) = planted(grid, effect=effect)
+    assert re.fullmatch(pattern, sentence)
+
+
+def test_values_of_a_variable_are_one_family_in_the_answer(tmp_path):
+    study = study_of(tmp_path, SOUNDS, effect=off_by(0.3))
+    table = study.trials["ekf", "fused"].scores["position_rmse_m"]
+    samples = [table[:, i] - table[:, 2] for i in (0, 4)]
+    findings = judge([Statement(label="", sample=sample) for sample in samples])
+    (sentence,) = answer_of(study)
+    largest = max(findings, key=lambda finding: finding.mean)
+    assert f"{largest.mean:.3f}".rstrip("0") in sentence
+    assert f"[{largest.family[0]:.3f}"[:6] in sentence
 
 
 def test_the_beamwidth_has_an_article_and_passive_sensing_does_not_count():
@@ -605,28 +597,22 @@ def test_the_question_names_the_variables_or_strategies_or_filters():
         assert question(without_variables(only(study, ways))) == words
 
 
-def test_without_a_grid_strategies_are_compared():
+def test_without_a_grid_strategies_or_else_filters_are_compared():
     ways = [("ekf", way) for way in ("active", "fused", "passive")]
     study = changed(invent(20), ("ekf", "passive"), "position_rmse_m", lambda e: e + 0.4)
     study = changed(study, ("ekf", "fused"), "position_rmse_m", lambda e: e - 0.4)
     fused, passive = answer_of(without_variables(only(study, ways)))
     assert fused.startswith("Fused instead of active sensing lowers the position RMSE by 0.")
     assert passive.startswith("Passive instead of active sensing raises the position RMSE by 0.")
-
-
-def test_without_a_grid_and_with_one_strategy_filters_are_compared():
     study = without_variables(only(invent(20), [("ekf", "fused"), ("fastslam", "fused")]))
     (sentence,) = answer_of(study)
     assert sentence.startswith("FastSLAM 2.0 instead of EKF raises the position RMSE by 0.")
 
 
 def test_of_one_strategy_and_one_filter_the_answer_is_the_error():
-    study = without_variables(only(invent(20), [("ekf", "fused")]))
-    (sentence,) = answer_of(study)
-    pattern = rf"EKF's position RMSE is 0\.\d+ m {INTERVAL} by fused sensing\."
-    assert re.fullmatch(pattern, sentence)
-    (single,) = answer_of(without_variables(only(invent(1), [("ekf", "fused")])))
-    assert re.fullmatch(r"EKF's position RMSE is 0\.\d+ m in the one world by fused .*", single)
+    for worlds, end in ((20, rf"{INTERVAL} by fused sensing\."), (1, "in the one world by .*")):
+        (sentence,) = answer_of(without_variables(only(invent(worlds), [("ekf", "fused")])))
+        assert re.fullmatch(rf"EKF's position RMSE is 0\.\d+ m {end}", sentence)
 
 
 @pytest.mark.parametrize("worlds", [1, 3])

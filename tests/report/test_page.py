@@ -18,7 +18,7 @@ from pipistrelle.experiments.studies.world import TABLES, done_worlds, with_sums
 from pipistrelle.files import LOG, REPORT, RESULTS, OwnFiles
 from pipistrelle.report.claims import TABLE_II
 from pipistrelle.report.page import write_report
-from pipistrelle.report.study import RULES, Failure, read_study
+from pipistrelle.report.study import RULES, read_study
 from pipistrelle.report.variables import setting_variable
 from pipistrelle.settings import from_flags
 from report.drawing import draw_only
@@ -74,16 +74,6 @@ def reported(store):
     """What `pipistrelle report` writes of a partial study with a failed trial."""
     assert main(["report", str(store), "--quiet"]) == 0
     return store / "report"
-
-
-@pytest.fixture(scope="module")
-def whole(tmp_path_factory):
-    """The page of a study of two worlds, all there are, without its figures for paper."""
-    folder = tmp_path_factory.mktemp("whole")
-    with pytest.MonkeyPatch.context() as patch:
-        draw_only(patch)
-        write_report(invent(2), folder)
-    return (folder / "index.html").read_text(encoding="utf-8")
 
 
 @pytest.fixture(scope="module")
@@ -162,20 +152,16 @@ def test_the_page_asks_for_nothing_outside(reported):
     assert re.findall(r"url\(|@import|https?://", text) == []
 
 
-def test_links_lead_to_files_that_are_there_and_to_places_on_the_page(reported):
+def test_links_lead_to_files_and_places_that_are_there_once(reported):
     reader = read(reported)
-    places = {attrs.get("id") for _, attrs in reader.found}
+    places = [attrs["id"] for _, attrs in reader.found if "id" in attrs]
+    assert len(places) == len(set(places))
     for attrs in reader.of("a"):
         target = attrs["href"]
         if target.startswith("#"):
             assert target[1:] in places
         else:
             assert (reported / target).is_file()
-
-
-def test_identities_are_given_once(reported):
-    given = [attrs["id"] for _, attrs in read(reported).found if "id" in attrs]
-    assert len(given) == len(set(given))
 
 
 def test_the_eight_verdicts_are_on_the_page_and_in_the_summary(reported):
@@ -190,26 +176,18 @@ def test_the_eight_verdicts_are_on_the_page_and_in_the_summary(reported):
         assert {"statistic", "interval", "p", "n", "by_exclusion"} <= claim.keys()
 
 
-def test_only_a_partial_study_is_marked_as_partial(reported, whole):
-    text = (reported / "index.html").read_text(encoding="utf-8")
-    assert "6 of 115 worlds are done" in text
-    assert json.loads((reported / "summary.json").read_text())["partial"] is True
-    assert "worlds are done" not in whole
-
-
-def test_one_world_is_not_many(tmp_path, whole, undrawn):
-    write_report(invent(1), tmp_path)
-    one = (tmp_path / "index.html").read_text(encoding="utf-8")
-    for text, words in ((one, "1 world · 50 trials"), (whole, "2 worlds · 100 trials")):
-        assert words in text
+def test_a_page_counts_its_worlds_and_warns_if_they_are_few_or_not_all(reported, tmp_path, undrawn):
+    texts = {6: (reported / "index.html").read_text(encoding="utf-8")}
+    for worlds in (1, 2, 20):
+        write_report(narrowed(invent(worlds), [0, 11]), tmp_path)
+        texts[worlds] = (tmp_path / "index.html").read_text(encoding="utf-8")
+    for worlds, text in texts.items():
+        assert ("6 of 115 worlds are done" in text) is (worlds == 6)
+        assert ("so few worlds may show what others would not" in text) is (worlds < 20)
         assert not re.search(r"\b1 worlds", text)
-
-
-def test_few_worlds_have_a_warning(tmp_path, whole, undrawn):
-    warning = "so few worlds may show what others would not"
-    assert warning in whole
-    write_report(invent(20), tmp_path)
-    assert warning not in (tmp_path / "index.html").read_text(encoding="utf-8")
+    assert "1 world · 10 trials" in texts[1]
+    assert "2 worlds · 20 trials" in texts[2]
+    assert json.loads((reported / "summary.json").read_text())["partial"] is True
 
 
 def test_all_rules_can_be_looked_at(reported):
@@ -232,8 +210,8 @@ def strange(study):
     """The same study with texts that would be markup, as one of a variable of two words."""
     two = narrowed(study, [0, 1])
     variable = replace(setting_variable(BAD, [BAD, f"{BAD}2"]), label=BAD, column=BAD, meaning=BAD)
-    failure = Failure(iteration=0, strategy=BAD, filter=BAD, beamwidth_deg=33.0,
-                      settings={BAD: BAD}, error=BAD)  # fmt: skip
+    failure = {"iteration": 0, "strategy": BAD, "filter": BAD, "beamwidth_deg": 33.0,
+               "settings": {BAD: BAD}, "error": BAD}  # fmt: skip
     return replace(two, name=BAD, variables=(variable,), grid={BAD: (BAD,)}, errors=(failure,))
 
 
@@ -298,19 +276,17 @@ def test_a_rule_without_worlds_has_a_note_and_the_others_are_shown(tmp_path, und
     assert (tmp_path / "figures" / "anees_ekf.csv").read_text().count("none,") > 0
 
 
-def test_table_ii_as_csv_has_the_papers_rows_under_each_rule(reported):
-    with (reported / "figures" / "table_ii.csv").open(newline="") as file:
-        rows = list(csv.DictReader(file))
-    assert len(rows) == len(RULES) * len(TABLE_II)
-    assert [float(row["paper_full"]) for row in rows[:8]] == [row.full[0] for row in TABLE_II]
-    assert rows[0]["exclusion"] == "world"
-    assert float(rows[0]["full_std"]) > 0.0
-
-
-def test_figures_have_their_numbers_under_each_rule(reported):
-    for name in ("position_rmse", "anees_fastslam"):
+def test_figures_and_table_ii_have_their_numbers_under_each_rule(reported):
+    rows = {}
+    for name in ("position_rmse", "anees_fastslam", "table_ii"):
         with (reported / "figures" / f"{name}.csv").open(newline="") as file:
-            assert {row["exclusion"] for row in csv.DictReader(file)} == set(RULES)
+            rows[name] = list(csv.DictReader(file))
+        assert {row["exclusion"] for row in rows[name]} == set(RULES)
+    table = rows["table_ii"]
+    assert len(table) == len(RULES) * len(TABLE_II)
+    assert [float(row["paper_full"]) for row in table[:8]] == [row.full[0] for row in TABLE_II]
+    assert table[0]["exclusion"] == "world"
+    assert float(table[0]["full_std"]) > 0.0
 
 
 def test_the_command_prints_the_verdicts_and_the_page_last(store, tmp_path, capsys, undrawn):
@@ -322,12 +298,9 @@ def test_the_command_prints_the_verdicts_and_the_page_last(store, tmp_path, caps
     assert printed[-1] == str(tmp_path / "out" / "index.html")
 
 
-def test_a_folder_that_is_no_study_ends_in_a_line(tmp_path, capsys):
+def test_a_mistake_ends_in_a_line(small, tmp_path, capsys, undrawn):
     assert main(["report", str(tmp_path)]) == 2
     assert "plan.toml" in capsys.readouterr().err
-
-
-def test_a_place_that_cannot_be_written_is_refused(small, tmp_path, undrawn):
     (tmp_path / "file").write_text("")
     with pytest.raises(InputError, match="file"):
         write_report(small, tmp_path / "file" / "deep")
@@ -357,6 +330,8 @@ def test_a_third_filter_has_its_panels_rows_and_files(tmp_path, monkeypatch):
     summary = json.loads((tmp_path / "summary.json").read_text())
     assert summary["exclusions"][2]["diverged"]["active"] > 0
     assert [row["filter"] for row in summary["exclusions"]][2] == "toy_slam.filters:Smoother"
+    assert len(summary["claims"]) == 8, "the paper's question is asked still"
+    assert "Smoother" in {row["filter"] for row in summary["findings"]}
 
 
 def test_a_stored_study_of_a_filter_that_is_not_installed_can_be_read(store, tmp_path, undrawn):

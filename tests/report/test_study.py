@@ -1,5 +1,6 @@
 """Which worlds count, under each rule."""
 
+import shutil
 from dataclasses import replace
 
 import numpy as np
@@ -12,7 +13,6 @@ from pipistrelle.experiments.studies.world import TABLES, with_sums, world_file
 from pipistrelle.report.study import (
     COMMON,
     READ,
-    Failure,
     along,
     case_name,
     combination_name,
@@ -51,24 +51,25 @@ def study():
     return study
 
 
-def test_the_paper_drops_a_world_where_any_case_of_the_filter_diverged_or_failed(study):
-    assert lost_worlds(study, "ekf").tolist() == [True, True, False, False, False, False]
-    assert lost_worlds(study, "fastslam").tolist() == [False, False, True, False, False, False]
-    assert np.flatnonzero(~kept(select(study, "world"), [("ekf", "active", 8)])).tolist() == [0, 1]
-    pair = [("ekf", "active", 8), ("fastslam", "active", 8)]
-    assert np.flatnonzero(~kept(select(study, "world"), pair)).tolist() == [0, 1, 2]
+PAIR = [("ekf", "fused", 3), ("ekf", "passive", 3)]
 
 
-def test_by_case_only_the_cases_at_hand_count(study):
-    assert kept(select(study, "case"), [("ekf", "fused", 2)]).all()
-    assert np.flatnonzero(~kept(select(study, "case"), [("ekf", "fused", 3)])).tolist() == [0]
-    pair = [("ekf", "fused", 3), ("ekf", "passive", 3)]
-    assert np.flatnonzero(~kept(select(study, "case"), pair)).tolist() == [0, 1]
-
-
-def test_without_a_rule_only_failed_trials_are_left_out(study):
-    assert kept(select(study, "none"), [("ekf", "fused", 3)]).all()
-    assert np.flatnonzero(~kept(select(study, "none"), [("fastslam", "active", 5)])).tolist() == [2]
+@pytest.mark.parametrize(
+    ("rule", "cells", "dropped"),
+    [
+        ("world", [("ekf", "active", 8)], [0, 1]),
+        ("world", [("ekf", "active", 8), ("fastslam", "active", 8)], [0, 1, 2]),
+        ("case", [("ekf", "fused", 2)], []),
+        ("case", PAIR[:1], [0]),
+        ("case", PAIR, [0, 1]),
+        ("none", PAIR, []),
+        ("none", [("fastslam", "active", 5)], [2]),
+    ],
+)
+def test_worlds_are_dropped_by_the_rule_and_where_a_trial_failed(study, rule, cells, dropped):
+    assert np.flatnonzero(~kept(select(study, rule), cells)).tolist() == dropped
+    lost = {name: np.flatnonzero(lost_worlds(study, name)).tolist() for name in FILTERS}
+    assert lost == {"ekf": [0, 1], "fastslam": [2]}
 
 
 def test_samples_are_of_the_same_worlds_and_finite(study):
@@ -103,8 +104,10 @@ def test_filters_are_in_the_catalogues_order_then_by_name(study):
     ]
 
 
-def test_of_no_world_there_is_no_mean():
+def test_moments_of_a_sample_are_known_from_two_worlds_on():
     assert np.isnan(mean_std(np.empty(0))).all()
+    assert mean_std(np.array([7.0])) == (7.0, 0.0)
+    assert mean_std(np.array([1.0, 3.0, 5.0])) == (3.0, 2.0)
 
 
 @pytest.fixture(scope="module")
@@ -160,8 +163,8 @@ def test_failed_trials_are_known_and_have_no_numbers(written):
     for world, number in failed:
         name, strategy, column = cell_of(cases_of(plan)[number])
         width = float(BEAMWIDTH[column])
-        told.append(Failure(iteration=world, strategy=strategy, filter=name, beamwidth_deg=width,
-                            settings={}, error=ERROR))  # fmt: skip
+        told.append({"iteration": world, "strategy": strategy, "filter": name,
+                     "beamwidth_deg": width, "settings": {}, "error": ERROR})  # fmt: skip
         trials = read.trials[name, strategy]
         assert trials.failed[world, column]
         assert np.isnan(trials.scores["position_rmse_m"][world, column])
@@ -199,17 +202,16 @@ def test_the_common_map_error_is_over_landmarks_that_every_strategy_placed(writt
                     assert found == pytest.approx(np.sqrt(np.mean(squares)), rel=1e-12)
 
 
-def test_worlds_without_their_file_of_trials_are_left_out(written, tmp_path):
-    folder, study = tmp_path / "store", written[1]
-    write_store(folder, study)
-    (folder / "trials" / "iteration_00002.parquet").unlink()
-    read = read_study(folder)
+def test_worlds_without_their_file_of_trials_are_left_out(written, spoilt):
+    (spoilt / "trials" / "iteration_00002.parquet").unlink()
+    whole, read = read_study(written[0]), read_study(spoilt)
     assert read.worlds.tolist() == [0, 1, 3, 4]
-    expected = study.trials["ekf", "fused"].scores["position_rmse_m"][[0, 1, 3, 4]]
-    np.testing.assert_array_equal(read.trials["ekf", "fused"].scores["position_rmse_m"], expected)
+    for way, trials in read.trials.items():
+        expected = whole.trials[way].scores["position_rmse_m"][[0, 1, 3, 4]]
+        np.testing.assert_array_equal(trials.scores["position_rmse_m"], expected)
 
 
-def test_numbers_that_are_not_finite_stay_so(written, tmp_path):
+def test_numbers_that_are_not_finite_stay_so(tmp_path):
     folder, study = tmp_path / "store", invent(2)
     study.trials["ekf", "fused"].scores["position_rmse_m"][0, 3] = np.inf
     study.trials["ekf", "fused"].nees[1, 3, 7] = np.inf
@@ -306,8 +308,33 @@ def test_a_failed_trial_is_listed_with_its_values(tmp_path):
     plan, *_ = write_store(tmp_path / "store", invent(2), grid=grid, failed=((1, 30),))
     (failure,) = read_study(tmp_path / "store").errors
     humid = cases_of(plan)[30].values["air.relative_humidity"]
-    assert failure.settings == {"air.relative_humidity": f"{humid:g}"}
-    assert failure.iteration == 1
+    assert failure["settings"] == {"air.relative_humidity": f"{humid:g}"}
+    assert failure["iteration"] == 1
+
+
+def rewrite(folder, change, world=0):
+    """Write the tables of a world again, changed by a function, with their sums."""
+    plan = read_plan(folder / "plan.toml")
+    tables = {name: pl.read_parquet(world_file(folder, name, world)) for name in TABLES}
+    for name, content in with_sums(change(tables), plan, world).items():
+        world_file(folder, name, world).write_bytes(content)
+
+
+@pytest.mark.parametrize("label", [-1, -100])
+def test_entries_of_a_map_that_are_no_true_landmark_count_in_no_map_error(tmp_path, label):
+    write_planted(tmp_path / "s", worlds=1)
+    before = read_study(tmp_path / "s").trials["ekf", "fused"]
+
+    def with_false_one(tables):
+        row = tables["landmarks"][:1]
+        row = row.with_columns(landmark=pl.lit(label, pl.Int16), error_m=pl.lit(np.nan, pl.Float32))
+        return tables | {"landmarks": pl.concat([tables["landmarks"], row])}
+
+    rewrite(tmp_path / "s", with_false_one)
+    after = read_study(tmp_path / "s").trials["ekf", "fused"]
+    np.testing.assert_array_equal(after.placed, before.placed)
+    np.testing.assert_array_equal(after.off, before.off)
+    np.testing.assert_array_equal(after.scores[COMMON], before.scores[COMMON])
 
 
 def test_a_folder_that_is_no_study_is_refused(tmp_path):
@@ -315,51 +342,48 @@ def test_a_folder_that_is_no_study_is_refused(tmp_path):
         read_study(tmp_path)
 
 
-def test_a_study_without_a_world_is_refused(tmp_path):
-    folder = tmp_path / "store"
-    write_store(folder, invent(1))
-    (folder / "trials" / "iteration_00000.parquet").unlink()
+@pytest.fixture
+def spoilt(written, tmp_path):
+    """A copy of a written study."""
+    return shutil.copytree(written[0], tmp_path / "store")
+
+
+def test_a_study_without_a_world_is_refused(spoilt):
+    for path in (spoilt / "trials").iterdir():
+        path.unlink()
     with pytest.raises(InputError, match="no world is done"):
-        read_study(folder)
+        read_study(spoilt)
 
 
-@pytest.mark.parametrize("table", ["trials", "steps", "landmarks"])
-def test_a_damaged_file_is_refused_with_what_to_do(tmp_path, table):
-    folder = tmp_path / "store"
-    write_store(folder, invent(2))
-    path = folder / table / "iteration_00001.parquet"
-    path.write_bytes(path.read_bytes()[:100])
+@pytest.mark.parametrize(
+    ("table", "content", "flaw"),
+    [
+        ("trials", slice(100), "could not be read"),
+        ("steps", slice(100), "is not as it was written"),
+        ("landmarks", slice(100), "is not as it was written"),
+        ("steps", None, "is missing"),
+        ("landmarks", None, "is missing"),
+    ],
+)
+def test_a_damaged_or_missing_file_is_refused_with_a_remedy(spoilt, table, content, flaw):
+    path = spoilt / table / "iteration_00001.parquet"
+    whole = path.read_bytes()
+    path.unlink()
+    if content is not None:
+        path.write_bytes(whole[content])
     with pytest.raises(InputError) as refused:
-        read_study(folder)
+        read_study(spoilt)
     said = str(refused.value)
-    flaw = "could not be read" if table == "trials" else "is not as it was written"
     assert said.startswith(f"{path}: {flaw}")
     assert "remove trials/iteration_00001.parquet" in said
     assert "its world is done anew" in said
     assert said.isprintable()
 
 
-@pytest.mark.parametrize("table", ["steps", "landmarks"])
-def test_a_table_that_is_gone_is_named(tmp_path, table):
-    folder = tmp_path / "store"
-    write_store(folder, invent(2))
-    path = folder / table / "iteration_00000.parquet"
-    path.unlink()
-    with pytest.raises(InputError, match="is missing; remove trials/iteration_00000") as refused:
-        read_study(folder)
-    assert str(refused.value).startswith(f"{path}:")
-
-
-def test_a_table_of_another_shape_is_refused(tmp_path):
-    folder = tmp_path / "store"
-    write_store(folder, invent(1))
-    tables = {name: pl.read_parquet(world_file(folder, name, 0)) for name in TABLES}
-    lacking = tables | {"trials": tables["trials"].drop("nees_max")}
-    world_file(folder, "trials", 0).write_bytes(
-        with_sums(lacking, read_plan(folder / "plan.toml"), 0)["trials"]
-    )
+def test_a_table_of_another_shape_is_refused(spoilt):
+    rewrite(spoilt, lambda tables: tables | {"trials": tables["trials"].drop("nees_max")})
     with pytest.raises(InputError, match=r"iteration_00000\.parquet: has not the columns"):
-        read_study(folder)
+        read_study(spoilt)
 
 
 def test_multiples_of_the_bound_are_of_root_mean_squares_over_unlike_worlds():

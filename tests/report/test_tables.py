@@ -89,21 +89,15 @@ def as_the_paper(study, **flags):
     return replace(study, config=plan.config, grid=plan.grid)
 
 
-def test_the_papers_settings_do_not_differ_from_themselves():
-    study = as_the_paper(invent(2, planned=7), seed=5)
-    assert study.grid["emitter.radius"] == RADII
-    assert not_the_papers(study) == []
+def test_settings_and_cases_that_are_not_the_papers_are_named_with_both_values():
+    same = as_the_paper(invent(2, planned=7), seed=5)
+    assert same.grid["emitter.radius"] == RADII
+    assert not_the_papers(same) == []
     assert not_the_papers_line([]) == ""
-
-
-def test_settings_that_are_not_the_papers_are_named_with_both_values():
     study = as_the_paper(invent(2), scenario={"steps": 200}, beacon={"level_db": 45.0})
     assert not_the_papers_line(not_the_papers(study)) == (
         "Not the paper's study: scenario.steps 200 (paper 1500), beacon.level_db 45 (paper 43.2)"
     )
-
-
-def test_fewer_beams_or_ways_are_not_the_papers_study():
     study = replace(as_the_paper(invent(2)), grid={"emitter.radius": (0.025, 0.0025)})
     line = not_the_papers_line(not_the_papers(only(study, [("ekf", "active"), ("ekf", "fused")])))
     assert line == (
@@ -124,6 +118,11 @@ def test_exclusions_count_worlds_and_trials_and_have_the_papers():
     assert ekf["diverged"] == {"active": 1, "fused": 3, "passive": 0}
     assert ekf["trials"] == {"active": 72, "fused": 72, "passive": 6}
     assert (fastslam["excluded"], fastslam["failed"], fastslam["paper"]) == (1, 1, 15)
+    *papers, third = exclusion_rows(with_third(study, "toy_slam:Slam"))
+    assert papers == [ekf, fastslam]
+    assert (third["filter"], third["excluded"], third["worlds"]) == ("toy_slam:Slam", 2, 6)
+    assert (third["limit"], third["paper"]) == (None, None), "outside the catalogue"
+    assert third["diverged"] == {"active": 24, "fused": 24, "passive": 1}
 
 
 def test_table_ii_has_the_means_of_the_worlds_that_count():
@@ -138,6 +137,13 @@ def test_table_ii_has_the_means_of_the_worlds_that_count():
     assert table_ii_rows(select(fused, "world"))[7]["full"] is None
 
 
+def consistency_of(study):
+    """The row of passive sensing with the EKF."""
+    rows = consistency_rows(select(study, "world"))
+    (row,) = [row for row in rows if (row["filter"], row["strategy"]) == ("ekf", "passive")]
+    return row
+
+
 def test_consistency_is_given_in_shares_of_time():
     study = invent(20)
     low, high = anees_bounds(20)
@@ -145,11 +151,7 @@ def test_consistency_is_given_in_shares_of_time():
     nees[:, :, :75] = 3.0
     nees[:, :, 75:300] = high + 1.0
     nees[:, :, 300:] = low - 1.0
-    (row,) = [
-        r
-        for r in consistency_rows(select(study, "world"))
-        if (r["filter"], r["strategy"]) == ("ekf", "passive")
-    ]
+    row = consistency_of(study)
     assert (row["inside"], row["above"]) == pytest.approx((75 / 375, 225 / 375))
     assert row["bounds"] == pytest.approx([low, high])
     assert row["expected"] == 3.0
@@ -161,14 +163,9 @@ def test_consistency_is_given_in_shares_of_time():
 def test_consistency_is_relative_to_a_consistent_filter():
     study = invent(20)
     passive = study.trials["ekf", "passive"]
-    passive.consistent[0] = 2.0
-    passive.consistent[1] = 3.0
+    passive.consistent[:] = np.array([2.0, 3.0])[:, None, None]
     passive.nees[:] = 2.0
-    (row,) = [
-        r
-        for r in consistency_rows(select(study, "world"))
-        if (r["filter"], r["strategy"]) == ("ekf", "passive")
-    ]
+    row = consistency_of(study)
     assert (row["inside"], row["departure"], row["expected"]) == (1.0, 0.0, 2.0)
     assert row["bounds"][0] < 2.0 < row["bounds"][1] < anees_bounds(20)[1]
 
@@ -180,11 +177,3 @@ def test_strategies_are_averages_over_beamwidths():
     found = {(r["filter"], r["strategy"]): r for r in by_strategy(rows)}
     assert found["fastslam", "active"]["anees"] == pytest.approx(np.mean(mine))
     assert len(found) == 6
-
-
-def test_a_filter_outside_the_catalogue_is_counted_by_its_stored_trials():
-    *papers, third = exclusion_rows(with_third(invent(6), "toy_slam:Slam"))
-    assert papers == exclusion_rows(invent(6))
-    assert (third["filter"], third["excluded"], third["worlds"]) == ("toy_slam:Slam", 2, 6)
-    assert (third["limit"], third["paper"]) == (None, None)
-    assert third["diverged"] == {"active": 24, "fused": 24, "passive": 2}

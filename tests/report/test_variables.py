@@ -1,15 +1,25 @@
 """What varies: in which order, under which names, on which axis."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
 from pipistrelle.report.variables import (
+    amount,
+    beam_name,
     beam_variable,
     geometric,
+    interval,
+    listed,
+    number_word,
     places,
     setting_variable,
+    three_digits,
+    two_sided,
+    width_name,
     word_of,
     written,
 )
@@ -74,3 +84,38 @@ def test_a_geometric_series_is_recognised_and_an_arithmetic_series_is_not(first,
 @pytest.mark.parametrize("numbers", [[-1.0, 0.1, 1.0], [0.0, 1.0, 10.0], [1.0, 100.0]])
 def test_numbers_without_logarithms_and_pairs_are_no_geometric_row(numbers):
     assert not geometric(numbers)
+
+
+@pytest.mark.parametrize(
+    ("values", "words"),
+    [
+        ([1.0, 2.5], "1; 2.5"),
+        ([1.0, 1.0000001], "1.0; 1.0000001"),
+        ([True, "paper", [0.5, 20.0]], "true; paper; [0.5, 20]"),
+        ([[], [{}], [{"course": "walk"}], [{}, {"frequency": 25e3}]], "nobody; beacon; walk; 2"),
+        (
+            [[{}], [{}, {"frequency": 25e3}], [{}, {"frequency": 25e3, "course": "circle"}]],
+            "beacon; beacon, caller2; beacon, caller2 (circle)",
+        ),
+    ],
+)
+def test_words_are_as_short_as_they_can_be(values, words):
+    assert "; ".join(written(values)) == words
+
+
+def test_numbers_are_written_for_readers():
+    assert [width_name(width) for width in (11.5, 11.575, 42.123)] == ["11.5°", "11°", "42.1°"]
+    assert [beam_name(width) for width in (11.575, 12.5)] == ["11°", "12°"]
+    digits = [three_digits(value) for value in (0.12345, 43.71, -1234.5, np.inf)]
+    assert digits == ["0.123", "43.7", "−1234", "∞"]
+    assert (amount(0.34, "m"), amount(0.02, "rad")) == ("0.34 m", "1.15°")
+    assert (amount(3.0, "landmarks"), interval((0.21, 0.47), "m")) == ("3", "[0.21, 0.47]")
+    assert [number_word(count) for count in (0, 8, 30)] == ["none", "eight", "30"]
+    assert listed(["EKF"]) == "EKF"
+    assert listed(["active", "fused", "passive"]) == "active, fused and passive"
+
+
+def test_a_variable_is_two_sided_around_an_inner_reference():
+    sound = setting_variable("assumed.speed_of_sound", [337.0, 343.0, 349.0])
+    sides = [two_sided(replace(sound, base=base)) for base in range(3)]
+    assert sides == [False, True, False]

@@ -81,11 +81,6 @@ class Statement:
 class Finding:
     """Test result of a statement within its family."""
 
-    label: str
-    relation: Relation
-    margin: float
-    sigma: float
-    fitted: bool
     n: int
     """Number of worlds, of two samples in the smaller."""
     mean: float
@@ -278,12 +273,7 @@ def judge(statements: Sequence[Statement], confidence: float = 0.95) -> tuple[Fi
         centre = moments[1] if math.isfinite(moments[1]) else 0.0
         findings.append(
             Finding(
-                label=statement.label,
-                relation=statement.relation,
-                margin=statement.margin,
-                sigma=statement.sigma,
-                fitted=statement.fitted,
-                n=_worlds(statement),
+                n=min(len(one) for one in (statement.sample, statement.against) if one is not None),
                 mean=moments[1],
                 std=moments[2],
                 alone=(centre - width, centre + width),
@@ -348,12 +338,6 @@ def pseudovalues(
     mean = np.mean(curves, axis=0)
     without = (n * mean - curves) / (n - 1)
     return n * statistic(mean[None])[0] - (n - 1) * statistic(without)
-
-
-def _worlds(statement: Statement) -> int:
-    """Return the number of worlds of a statement, of two samples in the smaller."""
-    both = [statement.sample, *([] if statement.against is None else [statement.against])]
-    return min(map(len, both))
 
 
 def _moments(statement: Statement) -> tuple[float, float, float]:

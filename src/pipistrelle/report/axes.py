@@ -39,15 +39,8 @@ class Line:
     """Numbers of the combinations."""
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Facet:
-    """Title and lines of one panel."""
-
-    title: str
-    role: str = "ink"
-    lines: tuple[Line, ...]
-    many: bool = False
-    """Whether the lines are combinations, not strategies."""
+Facet = tuple[str, list[Line]]
+"""Title and lines of one panel."""
 
 
 def axis_of(variable: Variable) -> Axis:
@@ -78,13 +71,7 @@ def axis_of(variable: Variable) -> Axis:
 
 
 def axis_of_words(words: Sequence[str]) -> Axis:
-    """Return an axis with words as ticks.
-
-    Examples
-    --------
-    >>> axis_of_words(["EKF", "FastSLAM 2.0"]).ticks
-    ((0.0, 'EKF'), (1.0, 'FastSLAM 2.0'))
-    """
+    """Return an axis with words as ticks."""
     named = tuple((float(i), word) for i, word in enumerate(words))
     longest = MAX_LETTERS // len(named)
     slanted = longest < SHORTEST and max(map(len, words)) > longest
@@ -99,17 +86,17 @@ def axis_of_words(words: Sequence[str]) -> Axis:
     )
 
 
-def facets_of(study: Study, variable: Variable | None, axis: Axis) -> list[Facet]:
+def facets_of(study: Study, variable: Variable | None, axis: Axis) -> tuple[list[Facet], bool]:
     """Split a study's cases into panels over one of its variables, or over the filters.
 
     Returns: a panel per filter and combination of the other variables with the strategies as
-    lines; if these are more than `MOST_PANELS`, a panel per filter and strategy with the
-    combinations as lines.
+    lines; if these are more than `MOST_PANELS`, a panel per filter and strategy with a line per
+    distinct combination, the first strongest. And whether the lines are combinations.
     """
-    titles = filter_titles(study)
+    titles, trials = filter_titles(study), study.trials
     if variable is None:
         at = np.arange(len(titles), dtype=np.float64)
-        among = [one for one in STRATEGIES if any(one == way for _, way in study.trials)]
+        among = [one for one in STRATEGIES if any(one == way for _, way in trials)]
         lines = [
             Line(
                 way=(name, strategy),
@@ -120,34 +107,40 @@ def facets_of(study: Study, variable: Variable | None, axis: Axis) -> list[Facet
             )
             for strategy in STRATEGIES
             for i, name in enumerate(titles)
-            if (name, strategy) in study.trials
+            if (name, strategy) in trials
         ]
-        return [Facet(title="", lines=tuple(lines))]
+        return [("", lines)], False
     rows, x = along(study, variable), places(variable)
     count = rows.shape[1]
     many = count > 1 and len(titles) * count > MOST_PANELS
     names = [combination_name(study, int(i), [variable]) for i in rows[0]]
-    found = []
+    facets: list[Facet] = []
     for name, title in titles.items():
-        ways = [(name, strategy) for strategy in STRATEGIES if (name, strategy) in study.trials]
-        if many:
-            found += [_of_way(study, way, title, names, rows, x) for way in ways]
-            continue
-        among = [strategy for _, strategy in ways]
-        for j in range(count):
+        among = [strategy for strategy in STRATEGIES if (name, strategy) in trials]
+        for strategy in among if many else ():
+            at = trials[name, strategy].at[rows]
+            first = np.sort(np.unique(at, axis=1, return_index=True)[1]).tolist()
+            faint = 0.75 / max(len(first) - 1, 1)
+            look = {"way": (name, strategy), "x": x, "aside": x}
+            lines = [
+                Line(name=names[j], strength=1.0 - faint * i, cells=rows[:, j], **look)
+                for i, j in enumerate(first)
+            ]
+            facets.append((f"{title}, {strategy}", lines))
+        for j in () if many else range(count):
             lines = [
                 Line(
-                    way=way,
-                    name=way[1],
+                    way=(name, strategy),
+                    name=strategy,
                     x=x,
-                    aside=beside(axis, x, way[1], among),
+                    aside=beside(axis, x, strategy, among),
                     cells=rows[:, j],
                 )
-                for way in ways
+                for strategy in among
             ]
             parts = [title, names[j]] if len(titles) > 1 or count == 1 else [names[j]]
-            found.append(Facet(title=", ".join(filter(None, parts)), lines=tuple(lines)))
-    return found
+            facets.append((", ".join(filter(None, parts)), lines))
+    return facets, many
 
 
 def beside(
@@ -182,40 +175,8 @@ def each_combination(study: Study, variable: Variable) -> str:
 
 
 def slug(name: str) -> str:
-    """Replace characters that are not letters or digits, for the name of a file.
-
-    Examples
-    --------
-    >>> slug("beacon.level_db")
-    'beacon_level_db'
-    """
+    """Replace characters that are not letters or digits, for the name of a file."""
     return re.sub(r"\W+", "_", name)
-
-
-def _of_way(
-    study: Study,
-    way: Way,
-    title: str,
-    names: Sequence[str],
-    rows: Int[np.ndarray, "k m"],
-    x: Float[np.ndarray, " k"],
-) -> Facet:
-    """Return the panel of a way with a line per distinct combination, the first strongest."""
-    at = study.trials[way].at[rows]
-    first = np.sort(np.unique(at, axis=1, return_index=True)[1]).tolist()
-    last = max(len(first) - 1, 1)
-    lines = [
-        Line(
-            way=way,
-            name=names[j],
-            strength=1.0 - 0.75 * i / last,
-            x=x,
-            aside=x,
-            cells=rows[:, j],
-        )
-        for i, j in enumerate(first)
-    ]
-    return Facet(title=f"{title}, {way[1]}", role=way[1], lines=tuple(lines), many=True)
 
 
 def _thinned(

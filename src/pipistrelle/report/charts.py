@@ -5,8 +5,9 @@ PDF and CSV follow. `evaluation.scores` lists the scores that are charted over a
 """
 
 import math
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -26,8 +27,9 @@ from pipistrelle.figures.chart import (
     linear_axis,
     log_axis,
 )
+from pipistrelle.report import claims as paper
+from pipistrelle.report import effects as changes
 from pipistrelle.report.axes import (
-    Facet,
     Line,
     axis_of,
     axis_of_words,
@@ -35,24 +37,6 @@ from pipistrelle.report.axes import (
     each_combination,
     facets_of,
     slug,
-)
-from pipistrelle.report.claims import (
-    FILTERS,
-    TABLE_II,
-    cell_of,
-    frame_time,
-    gains,
-    lap_time,
-    papers_cases,
-    row_name,
-)
-from pipistrelle.report.effects import (
-    Effect,
-    Measure,
-    compare,
-    effects_of,
-    families_of,
-    measures_of,
 )
 from pipistrelle.report.study import (
     COMMON,
@@ -179,43 +163,35 @@ def _level(name: str, score: Score) -> Level:
     return Level(**drawn | _OWN.get(name, {}))
 
 
-def error_charts(selection: Selection) -> list[Chart]:
-    """Chart each RMSE over the variables, a panel per filter, a colour per strategy.
+def level_charts(selection: Selection, only: str = "") -> list[Chart]:
+    """Chart scores over each variable, or over the filters without variables.
 
-    Worlds more than σ above the mean are single marks. Bradley & Abaid, Secs. V-C, V-D and
-    Appendix A.
+    A panel per filter, a colour per strategy; worlds more than σ above the mean are single marks.
+    `only`: part of the names of the scores. Bradley & Abaid, Secs. V-C, V-D, V-E and Appendix A.
     """
-    return _charts(selection, [one for one in levels() if "RMSE" in one.label])
-
-
-def landmark_charts(selection: Selection) -> list[Chart]:
-    """Chart the number of initialised landmarks over the variables (Bradley & Abaid, Sec. V-E)."""
-    return _charts(selection, [one for one in levels() if one.score == LANDMARKS])
-
-
-def level_charts(selection: Selection) -> list[Chart]:
-    """Chart every level over each variable, or over the filters without variables."""
-    return _charts(selection, levels())
-
-
-def _charts(selection: Selection, levels: Sequence[Level]) -> list[Chart]:
-    """Chart the levels that have numbers, over each variable."""
     axes = selection.study.variables or (None,)
-    there = [what for what in levels if has_numbers(selection.study, what.score)]
-    return [_chart(selection, what, variable) for variable in axes for what in there]
+    there = [what for what in levels() if has_numbers(selection.study, what.score)]
+    return [
+        _chart(selection, what, variable)
+        for variable in axes
+        for what in there
+        if only in what.score
+    ]
 
 
 def _chart(selection: Selection, what: Level, variable: Variable | None) -> Chart:
     """Chart one level over one variable."""
     study = selection.study
     axis = axis_of(variable) if variable else axis_of_words([*filter_titles(study).values()])
-    facets = facets_of(study, variable, axis)
-    found = [_drawn(selection, what, facet, axis) for facet in facets]
-    lines = [s for drawn in found for s in drawn if not MARKS[s.style].pinned]
+    facets, many = facets_of(study, variable, axis)
+    apart = axis.words and not many
+    found = [_drawn(selection, what, lines, apart=apart, many=many) for _, lines in facets]
+    top = ends(s for drawn in found for s in drawn if not MARKS[s.style].pinned)
     room = 1.07 if what.worlds else 1.0
-    top = [room * end for end in ends(lines)]
     vertical = (
-        log_axis(what.label, ends(lines)) if what.log else linear_axis(what.label, top, floor=0.0)
+        log_axis(what.label, top)
+        if what.log
+        else linear_axis(what.label, [room * end for end in top], floor=0.0)
     )
     name, title = what.name, what.title
     if variable and len(study.variables) > 1:
@@ -223,46 +199,50 @@ def _chart(selection: Selection, what: Level, variable: Variable | None) -> Char
     return Chart(
         name=name,
         title=title,
-        caption=_many(study, what, variable)
-        if variable and facets[0].many
-        else _caption(what, variable),
+        caption=_caption(study, what, variable, many=many),
         panels=tuple(
-            Panel(title=facet.title, role=facet.role, x=axis, y=vertical, series=tuple(series))
-            for facet, series in zip(facets, found, strict=True)
+            Panel(
+                title=title,
+                role=lines[0].way[1] if many else "ink",
+                x=axis,
+                y=vertical,
+                series=tuple(series),
+            )
+            for (title, lines), series in zip(facets, found, strict=True)
         ),
         columns=(variable.column if variable else "filter", what.column),
     )
 
 
-def _many(study: Study, what: Level, variable: Variable) -> str:
-    """Return the caption of a chart of many lines."""
-    mean = "Geometric mean" if what.log else "Mean"
-    dashed = f"; dashed: {'the bound' if what.named == 'bound' else what.named}"
-    more = "" if what.more == BOUND else what.more
-    lines = each_combination(study, variable)
-    return f"{mean} over worlds; {lines}{dashed if what.beside else ''}{more}"
+def _caption(study: Study, what: Level, variable: Variable | None, *, many: bool) -> str:
+    """Return the caption of a chart with a line per combination (`many`) or per strategy."""
+    if many and variable:
+        mean = "Geometric mean" if what.log else "Mean"
+        dashed = f"; dashed: {'the bound' if what.named == 'bound' else what.named}"
+        more = "" if what.more == BOUND else what.more
+        lines = each_combination(study, variable)
+        return f"{mean} over worlds; {lines}{dashed if what.beside else ''}{more}"
+    passive = PASSIVE if variable and variable.name == BEAM else ""
+    beyond = f"{passive}, triangles: those beyond the panel"
+    return what.caption + beyond * what.worlds + what.more
 
 
-def _caption(what: Level, variable: Variable | None) -> str:
-    """Return the caption of a chart with a line per strategy."""
-    words = what.caption
-    if what.worlds:
-        words += PASSIVE if variable and variable.name == BEAM else ""
-        words += ", triangles: those beyond the panel"
-    return words + what.more
+def _drawn(
+    selection: Selection, what: Level, lines: Sequence[Line], *, apart: bool, many: bool
+) -> list[Series]:
+    """Return the lines of a panel, single worlds above each, and the dashed bound.
 
-
-def _drawn(selection: Selection, what: Level, facet: Facet, axis: Axis) -> list[Series]:
-    """Return the lines of a panel, single worlds above each, and the dashed bound."""
-    found, apart = [], axis.words and not facet.many
-    for line in facet.lines:
+    `apart`: points beside each other in place of lines. `many`: lines of combinations.
+    """
+    found = []
+    for line in lines:
         at = selection.study.trials[line.way].at[line.cells]
         flat = len(at) > 1 and what.score != COMMON and bool(np.all(at == at[0]))
         per_place = _samples(selection, line, what.score, what.scale)
         style = "points" if apart else ("line" if flat else "dots")
         mean = _mean_line(line, per_place, style, log=what.log)
-        found.append(replace(mean, low=None, high=None) if facet.many else mean)
-        if what.worlds and not facet.many:
+        found.append(replace(mean, low=None, high=None) if many else mean)
+        if what.worlds and not many:
             found.append(_worlds_above(line, mean, per_place, flat=flat))
         if what.beside:
             found.append(_dashed(selection, line, what, apart=apart))
@@ -337,8 +317,14 @@ def effect_charts(selection: Selection) -> list[Chart]:
     Returns: without variables, the effects of strategies and filters.
     """
     study, titles = selection.study, filter_titles(selection.study)
+    families: dict[tuple[str, str], list[changes.Effect]] = {}
+    for effect in changes.effects_of(selection):
+        pairing = effect.pairing
+        if not study.variables or pairing.factor not in (changes.STRATEGY, changes.FILTER):
+            name = pairing.factor, pairing.filter or pairing.strategy
+            families.setdefault(name, []).append(effect)
     charts = []
-    for (factor, whose), family in families_of(study, effects_of(selection)).items():
+    for (factor, whose), family in families.items():
         variable = next((v for v in study.variables if v.name == factor), None)
         first = family[0].pairing.before
         words = (first, *dict.fromkeys(effect.pairing.after for effect in family))
@@ -354,7 +340,9 @@ def effect_charts(selection: Selection) -> list[Chart]:
                 caption=f"Difference to {first} in the same world, {mean}mean over worlds and its "
                 "95 % interval as one of its family. Full: shown, by Holm's correction. Map: "
                 "landmarks that both have placed. NEES: the ratio",
-                panels=tuple(_panel(measure, family, axis, at) for measure in measures_of(study)),
+                panels=tuple(
+                    _panel(measure, family, axis, at) for measure in changes.measures_of(study)
+                ),
                 columns=(variable.column if variable else factor, "change"),
             )
         )
@@ -363,8 +351,7 @@ def effect_charts(selection: Selection) -> list[Chart]:
 
 def gain_charts(selection: Selection) -> list[Chart]:
     """Chart the RMSE of active minus fused sensing over each variable, paired over worlds."""
-    study = selection.study
-    return [_gain_chart(selection, variable) for variable in study.variables]
+    return [_gain_chart(selection, variable) for variable in selection.study.variables]
 
 
 def about(
@@ -373,7 +360,7 @@ def about(
     x: Float[np.ndarray, " n"],
     mean: Float[np.ndarray, " n"],
     edges: Float[np.ndarray, "n 2"],
-    filled: Sequence[bool],
+    filled: Sequence[bool] | np.ndarray,
 ) -> Series:
     """Return a series of points with error bars that end at `edges`."""
     return Series(
@@ -389,10 +376,10 @@ def about(
 
 
 def _panel(
-    measure: Measure, family: Sequence[Effect], axis: Axis, at: Mapping[str, float]
+    measure: changes.Measure, family: Sequence[changes.Effect], axis: Axis, at: Mapping[str, float]
 ) -> Panel:
     """Return the panel of the effects in one measure, a series per strategy."""
-    ways: dict[str, list[Effect]] = {}
+    ways: dict[str, list[changes.Effect]] = {}
     for effect in family:
         if effect.measure == measure:
             ways.setdefault(effect.pairing.strategy, []).append(effect)
@@ -415,31 +402,27 @@ def _changes(
     strategy: str,
     axis: Axis,
     at: Mapping[str, float],
-    effects: Sequence[Effect],
+    effects: Sequence[changes.Effect],
 ) -> Series:
     """Return the differences of one strategy, with 0 at the reference value."""
     measure, findings = effects[0].measure, [effect.finding for effect in effects]
     mean, edges = _bars(findings)
     mean, edges = np.append(0.0, mean), np.vstack(([np.nan, np.nan], edges))
-    if measure.ratio:
-        mean, edges = np.exp(mean), np.exp(edges)
-    else:
-        mean, edges = UNITS[measure.unit][0] * mean, UNITS[measure.unit][0] * edges
+    factor = UNITS[measure.unit][0]
+    mean, edges = (np.exp(one) if measure.ratio else factor * one for one in (mean, edges))
     x = np.array([at[effects[0].pairing.before], *(at[e.pairing.after] for e in effects)])
     shown = [True, *(finding.holds is not None for finding in findings)]
     x = beside(axis, x.astype(np.float64), strategy, among, far=1.0 if axis.words else 3.0)
     rising = np.argsort(x)
-    shown = [shown[i] for i in rising]
-    name, role = strategy or "difference", strategy or "ink"
-    return about(name, role, x[rising], mean[rising], edges[rising], shown)
+    points = x[rising], mean[rising], edges[rising], np.array(shown)[rising]
+    return about(strategy or "difference", strategy or "ink", *points)
 
 
-def _bars(findings: Iterable[Finding]) -> tuple[np.ndarray, np.ndarray]:
+def _bars(findings: Sequence[Finding]) -> tuple[np.ndarray, np.ndarray]:
     """Return the means of findings and the ends of their intervals; NaN if infinite."""
-    found = list(findings)
-    edges = np.array([finding.family for finding in found]).reshape(-1, 2)
+    edges = np.array([finding.family for finding in findings]).reshape(-1, 2)
     edges[~np.isfinite(edges)] = np.nan
-    return np.array([finding.mean for finding in found]), edges
+    return np.array([finding.mean for finding in findings]), edges
 
 
 def _gain_chart(selection: Selection, variable: Variable) -> Chart:
@@ -476,28 +459,27 @@ def _gain_chart(selection: Selection, variable: Variable) -> Chart:
 
 def _gains(selection: Selection, name: str, score: str, variable: Variable) -> list[Series]:
     """Return a filter's gains along a variable: mean, and a series for each combination."""
-    study = selection.study
-    rows, judged = along(study, variable), gains(selection, name, score)
-    count, series = rows.shape[1], []
-    for j in range(count):
-        findings = [judged[i] for i in rows[:, j]]
-        mean, edges = _bars(findings)
-        shown = [finding.holds is not None for finding in findings]
-        one = about(DIFFERENCE, "fused", places(variable), mean, edges, shown)
-        if count > 1:
-            named = combination_name(study, int(rows[0, j]), [variable])
-            faint = 1.0 - 0.75 * j / (count - 1)
-            one = replace(one, name=named, style="dots", low=None, high=None, strength=faint)
-        series.append(one)
-    if count == 1:
-        return series
-    measure = Measure(title="", score=score, unit="m")
+    rows, x = along(selection.study, variable), places(variable)
+    judged = [finding for _, finding in paper.gains(selection, name, score)]
+    each = [_judged(DIFFERENCE, "fused", x, [judged[i] for i in column]) for column in rows.T]
+    if len(each) == 1:
+        return each
+    for j, one in enumerate(each):
+        named = combination_name(selection.study, int(rows[0, j]), [variable])
+        look = {"name": named, "style": "dots", "low": None, "high": None}
+        each[j] = replace(one, **look, strength=1.0 - 0.75 * j / (len(each) - 1))
+    measure = changes.Measure(title="", score=score, unit="m")
     pairs = [[((name, "fused", i), (name, "active", i)) for i in row] for row in rows.tolist()]
-    findings = [one.finding for one in compare(selection, [(0, measure, row) for row in pairs])]
-    shown = [finding.holds is not None for finding in findings]
+    means = changes.compare(selection, measure, pairs)
+    return [_judged(f"mean, {DIFFERENCE}", "ink", x, [one.finding for one in means]), *each]
+
+
+def _judged(
+    name: str, role: str, x: Float[np.ndarray, " n"], findings: Sequence[Finding]
+) -> Series:
+    """Return findings as points with their intervals, full where significant."""
     mean, edges = _bars(findings)
-    means = about(f"mean, {DIFFERENCE}", "ink", places(variable), mean, edges, shown)
-    return [means, *series]
+    return about(name, role, x, mean, edges, [one.holds is not None for one in findings])
 
 
 def anees_charts(selection: Selection) -> list[Chart]:
@@ -515,13 +497,18 @@ def _anees_chart(selection: Selection, name: str, title: str) -> Chart:
     ways = [(name, strategy) for strategy in STRATEGIES if (name, strategy) in study.trials]
     lines = {way: _anees_lines(selection, way) for way in ways}
     lines = {way: series for way, series in lines.items() if series}
-    runs = min((_runs(selection, way) for way in lines), default=0)
+    counts = [
+        int(np.sum(kept(selection, [(*way, i)])))
+        for way in lines
+        for i in own_cases(study.trials[way]).tolist()
+    ]
+    runs = min(filter(None, counts), default=0)
     alike = _drives_alike(study)
     if runs and alike:
         for way, of_way in lines.items():
             of_way.insert(0, _ideal(study, way, runs))
     vertical = log_axis("ANEES", ends(s for of_way in lines.values() for s in of_way) or [1.0, 9.0])
-    lap = lap_time(study) if alike else math.inf
+    lap = paper.lap_time(study) if alike else math.inf
     panels = [
         Panel(
             title=way[1],
@@ -563,18 +550,15 @@ def _anees_caption(study: Study, runs: int, *, alike: bool) -> str:
     return words[:1].upper() + words[1:]
 
 
-def _runs(selection: Selection, way: Way) -> int:
-    """Return the smallest number of worlds of any case that has some."""
-    cases = own_cases(selection.study.trials[way])
-    counts = [int(np.sum(kept(selection, [(*way, int(i))]))) for i in cases]
-    return min((count for count in counts if count), default=0)
-
-
 def _drives_alike(study: Study) -> bool:
     """Return whether all combinations have the same laps and times."""
     frames = next(iter(study.trials.values())).nees.shape[2]
     drives = {
-        (lap_time(study, i), *frame_time(study, frames, i)[-1:].tolist(), config.scenario.steps)
+        (
+            paper.lap_time(study, i),
+            *paper.frame_time(study, frames, i)[-1:].tolist(),
+            config.scenario.steps,
+        )
         for i, config in enumerate(study.configs)
     }
     return len(drives) == 1
@@ -587,7 +571,7 @@ def _ideal(study: Study, way: Way, runs: int) -> Series:
     return Series(
         name="a consistent filter",
         role="ink",
-        x=frame_time(study, expected.shape[1]),
+        x=paper.frame_time(study, expected.shape[1]),
         y=np.mean(expected, axis=0),
         low=np.min(low, axis=0),
         high=np.max(high, axis=0),
@@ -608,7 +592,7 @@ def _anees_lines(selection: Selection, way: Way) -> list[Series]:
                 Series(
                     name=case_name(study, way, i) or way[1],
                     role=way[1],
-                    x=frame_time(study, nees.shape[2], i),
+                    x=paper.frame_time(study, nees.shape[2], i),
                     y=anees(nees[counts, column]),
                     strength=1.0 - 0.75 * column / max(len(cases) - 1, 1),
                 )
@@ -620,7 +604,7 @@ def table_ii_charts(selection: Selection) -> list[Chart]:
     """Chart the landmarks of the study and of the paper's Table II."""
     panels = []
     for kind, score in (("fully initialised", "landmarks_full"), ("total", "landmarks_total")):
-        found = {title: _counts(selection, name, score) for name, title in FILTERS.items()}
+        found = {title: _counts(selection, name, score) for name, title in paper.FILTERS.items()}
         axis = linear_axis("landmarks", ends(s for _, drawn in found.values() for s in drawn))
         for title, (rows, series) in found.items():
             names = tuple((float(i), text) for i, text in enumerate(rows))
@@ -648,19 +632,17 @@ Figure = Callable[[Selection], list[Chart]]
 CHARTS: tuple[Figure, ...] = (effect_charts, level_charts, gain_charts, anees_charts)
 """Figures of any study, in the page's order."""
 PAPERS: tuple[Figure, ...] = (
-    gain_charts, anees_charts, error_charts, landmark_charts, table_ii_charts,
-)  # fmt: skip
+    gain_charts,
+    anees_charts,
+    partial(level_charts, only="rmse"),
+    partial(level_charts, only=LANDMARKS),
+    table_ii_charts,
+)
 """Figures of a study that holds the paper's cases."""
 
 
 def answers(name: str) -> bool:
-    """Return whether the chart of a name shows a score that the answer names.
-
-    Examples
-    --------
-    >>> answers("gain"), answers("nees_by_rays_power"), answers("anees_ekf")
-    (True, True, False)
-    """
+    """Return whether the chart of a name shows a score that the answer names."""
     answering = {level.name for level in levels()} - {"map_rmse_aligned"} | {"gain"}
     return name.partition("_by_")[0] in answering or name.startswith("effect_")
 
@@ -672,17 +654,17 @@ def study_charts(selection: Selection, charts: Sequence[Figure] | None = None) -
     holds the paper's cases, otherwise `CHARTS`.
     """
     if charts is None:
-        charts = PAPERS if papers_cases(selection.study) else CHARTS
+        charts = PAPERS if paper.papers_cases(selection.study) else CHARTS
     return [chart for drawn in charts for chart in drawn(selection) if chart.panels]
 
 
 def _counts(selection: Selection, name: str, score: str) -> tuple[list[str], tuple[Series, Series]]:
     """Return the names of Table II's rows, the paper's counts and ours."""
     rows, printed, ours = [], [], []
-    for row in TABLE_II:
-        cell = cell_of(selection.study, row) if row.filter == name else None
+    for row in paper.TABLE_II:
+        cell = paper.cell_of(selection.study, row) if row.filter == name else None
         if cell is not None:
-            rows.append(row_name(row).split()[0])
+            rows.append(paper.row_name(row).split()[0])
             printed.append(row.full if score == "landmarks_full" else row.total)
             ours.append(mean_std(samples(selection, score, [cell])[0]))
     at = np.arange(len(rows), dtype=np.float64)

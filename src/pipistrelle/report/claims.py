@@ -4,7 +4,7 @@ A claim has parts, a part has statements about means over worlds, and all statem
 one family (`pipistrelle.evaluation.comparison`). Claims only concern the paper's two filters, since
 further statements would make the paper's harder to prove. A part for which a study has no cases is
 empty. `CLAIMS` is the only list: to add a claim, give it a sentence and parts, most of which are
-differences of a score between two ways (`_compare`).
+differences of a score between two ways (`_differs`).
 
 *Reproduced*: every part holds under every rule of exclusion. *Not reproduced*: the opposite of some
 part is significant under every rule, in the same direction. *Open*: neither. Rules are compared
@@ -13,10 +13,10 @@ significant; a part that must hold at most beamwidths by more than half of them.
 """
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 from jaxtyping import Float
@@ -87,8 +87,7 @@ WITHOUT: dict[Rule, str] = {
 Verdict = Literal["reproduced", "not-reproduced", "open"]
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Printed:
+class Printed(NamedTuple):
     """Row of Table II for one filter: mean and standard deviation of landmarks."""
 
     filter: str
@@ -101,14 +100,14 @@ class Printed:
 
 
 TABLE_II = (
-    Printed(filter="ekf", beamwidth=180.0, full=(37.7, 2.9), total=(43.7, 2.6)),
-    Printed(filter="ekf", beamwidth=33.2, full=(31.9, 3.3), total=(40.8, 3.2)),
-    Printed(filter="ekf", beamwidth=11.4, full=(30.0, 3.3), total=(40.1, 3.2)),
-    Printed(filter="ekf", beamwidth=0.0, full=(26.6, 3.3), total=(39.5, 3.4)),
-    Printed(filter="fastslam", beamwidth=180.0, full=(39.3, 2.8), total=(43.7, 2.4)),
-    Printed(filter="fastslam", beamwidth=33.2, full=(32.6, 3.3), total=(40.7, 3.1)),
-    Printed(filter="fastslam", beamwidth=11.4, full=(30.5, 3.2), total=(40.2, 3.1)),
-    Printed(filter="fastslam", beamwidth=0.0, full=(22.1, 4.9), total=(39.4, 3.3)),
+    Printed("ekf", 180.0, full=(37.7, 2.9), total=(43.7, 2.6)),
+    Printed("ekf", 33.2, full=(31.9, 3.3), total=(40.8, 3.2)),
+    Printed("ekf", 11.4, full=(30.0, 3.3), total=(40.1, 3.2)),
+    Printed("ekf", 0.0, full=(26.6, 3.3), total=(39.5, 3.4)),
+    Printed("fastslam", 180.0, full=(39.3, 2.8), total=(43.7, 2.4)),
+    Printed("fastslam", 33.2, full=(32.6, 3.3), total=(40.7, 3.1)),
+    Printed("fastslam", 11.4, full=(30.5, 3.2), total=(40.2, 3.1)),
+    Printed("fastslam", 0.0, full=(22.1, 4.9), total=(39.4, 3.3)),
 )
 """Bradley & Abaid, Table II."""
 FITTED = {
@@ -142,41 +141,6 @@ class Claim:
     parts: tuple[Callable[[Selection], list[Part]], ...]
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class JudgedPart:
-    """A part of a claim with the findings of its statements."""
-
-    sentence: str
-    unit: str
-    need: str
-    findings: tuple[Finding, ...]
-    holds: bool | None
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Judgement:
-    """A claim judged under one exclusion rule."""
-
-    verdict: Verdict
-    parts: tuple[JudgedPart, ...]
-    decisive: Finding | None
-    """The statement farthest from holding, or nearest to failing."""
-    unit: str
-    """Of the decisive statement."""
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class JudgedClaim:
-    """A claim judged under every exclusion rule, with its verdict."""
-
-    number: int
-    """From 1."""
-    sentence: str
-    verdict: Verdict
-    reason: str
-    by_rule: dict[Rule, Judgement]
-
-
 def papers_cases(study: Study) -> bool:
     """Return whether a study holds the cases of the paper.
 
@@ -201,13 +165,7 @@ def cell_of(study: Study, printed: Printed) -> Cell | None:
 
 
 def row_name(printed: Printed) -> str:
-    """Name a row as in Table II.
-
-    Examples
-    --------
-    >>> row_name(TABLE_II[1]), row_name(TABLE_II[3])
-    ('33°', 'passive (0°)')
-    """
+    """Name a row as in Table II: by its beam, or as passive."""
     return beam_name(printed.beamwidth) if printed.beamwidth else "passive (0°)"
 
 
@@ -222,32 +180,15 @@ def differences(
     above: float = 0.0,
     below: float = math.inf,
     sigma: bool = False,
-    fitted: Callable[[float], bool] = lambda width: False,
+    fitted_above: float = math.inf,
 ) -> list[Statement]:
-    """Make a statement on the difference of two ways' scores at each combination.
+    """State the difference of two ways' scores at each combination.
 
-    Parameters
-    ----------
-    selection : Selection
-    score : str
-        One of `study.READ`, or `study.COMMON`.
-    first, second : filter and strategy
-        Cases that do not depend on the beamwidth count once.
-    name : str
-        Label of the pair.
-    relation : str
-        As in `Statement`.
-    above, below : float
-        [deg] Only beamwidths from `above` on and below `below`.
-    sigma : bool
-        Whether the margin is the pooled standard deviation over worlds; otherwise 0.
-    fitted : function of a beamwidth [deg]
-        Whether settings were fitted to the number.
-
-    Returns
-    -------
-    list of Statement
-        Empty if the study lacks one of the two.
+    `score`: one of `study.READ`, or `study.COMMON`. `first`, `second`: filter and strategy; cases
+    that do not depend on the beamwidth count once. `name`: label of the pair. `relation`: as in
+    `Statement`. `above`, `below` [deg]: only beamwidths from `above` on and below `below`. `sigma`:
+    whether the margin is the pooled standard deviation over worlds; otherwise 0. `fitted_above`
+    [deg]: settings were fitted to wider beams. Returns: empty if the study lacks one of the two.
     """
     study = selection.study
     if not {first, second} <= study.trials.keys():
@@ -269,15 +210,16 @@ def differences(
                 relation=relation,
                 margin=spread if sigma and len(pair[0]) > 1 else 0.0,
                 sigma=spread,
-                fitted=bool(fitted(width)),
+                fitted=width > fitted_above,
             )
         )
     return statements
 
 
-def gains(selection: Selection, name: str, score: str) -> tuple[Finding, ...]:
-    """Judge active minus fused sensing of a filter at each combination, as a family."""
-    return judge(differences(selection, score, (name, "active"), (name, "fused"), name=name))
+def gains(selection: Selection, name: str, score: str) -> list[tuple[str, Finding]]:
+    """Judge active minus fused sensing of a filter at each combination, with its label."""
+    statements = differences(selection, score, (name, "active"), (name, "fused"), name=name)
+    return list(zip((s.label for s in statements), judge(statements), strict=True))
 
 
 def approach(selection: Selection, score: str, name: str) -> Float[np.ndarray, " m"] | None:
@@ -287,8 +229,8 @@ def approach(selection: Selection, score: str, name: str) -> Float[np.ndarray, "
 
     .. math:: |s_{fused} - s_{passive}| \approx a + b \log_2(\mathrm{HPBW})
 
-    `name`: the filter. Returns: b of each world, in the score's unit per doubling; None if the
-    study lacks one of the two or has a single beamwidth.
+    Returns: b of each world, in the score's unit per doubling; None if the filter lacks one of the
+    two, or the study has a single beamwidth.
     """
     fused, passive = (name, "fused"), (name, "passive")
     study = selection.study
@@ -341,11 +283,6 @@ def anees_departure(
 
     Bradley & Abaid, Eq. (24) and Sec. V-B, compare with 3: over-confident above, under-confident
     below.
-
-    Examples
-    --------
-    >>> anees_departure(np.array([[3.0, 2.0], [3.0 * np.e, 2.0 / np.e]]), np.array([3.0, 2.0]))
-    array([0., 1.])
     """
     return np.mean(np.square(np.log(anees / expected)), axis=-1)
 
@@ -419,13 +356,11 @@ def counts_as_printed(selection: Selection) -> list[Part]:
 
 
 def ekf_more_consistent(selection: Selection) -> list[Part]:
-    """Return the parts of claim 2: departure, swing and rise of the ANEES.
+    """Return the parts of claim 2: departure, swing and rise of the ANEES (Sec. V-B).
 
-    Departure has a statement per strategy, averaged over the beamwidths; swing and rise have a
-    statement per filter and strategy, none for drives of less than two laps. The paper calls
-    FastSLAM's fused ANEES anomalous and does not count it among the periodic ones.
-
-    Bradley & Abaid, Sec. V-B.
+    Departure has a statement per strategy, averaged over the beamwidths; swing and rise have one
+    per filter and strategy, none for drives of less than two laps. The paper does not count
+    FastSLAM's fused ANEES among the periodic ones.
     """
     nearer, swing, rise = [], [], []
     fit = lap_fit(selection.study)
@@ -474,43 +409,40 @@ def _nears_passive(selection: Selection) -> list[Part]:
     ]
 
 
-Pairs = tuple[tuple[str, Way, Way], ...]
-
-
-def _by_filter(first: Strategy, second: Strategy) -> Pairs:
-    """Pair two strategies with each filter, under the filter's title."""
-    return tuple((label, (name, first), (name, second)) for name, label in FILTERS.items())
-
-
-def _compare(
+def _differs(
     sentence: str,
     unit: str,
     score: str,
-    pairs: Pairs,
+    pairs: Iterable[tuple[str, Way, Way]],
     *,
     need: Literal["all", "most"] = "all",
     narrowest: bool = False,
     **options: Any,
 ) -> Callable[[Selection], list[Part]]:
-    """Return a part on differences of a score, first minus second of each pair.
+    """Return a part on differences of a score, first minus second of each labelled pair.
 
     `narrowest`: only the narrowest beam of each pair. `options`: of `differences`.
     """
-    most = 1 if narrowest else None
 
     def part(selection: Selection) -> list[Part]:
         statements = [
             statement
             for label, *pair in pairs
-            for statement in differences(selection, score, *pair, name=label, **options)[:most]
+            for statement in differences(selection, score, *pair, name=label, **options)[
+                : 1 if narrowest else None
+            ]
         ]
         return [Part(sentence=sentence, unit=unit, need=need, statements=tuple(statements))]
 
     return part
 
 
-_EKF = (("EKF", ("ekf", "active"), ("ekf", "fused")),)
-_FASTSLAM = ((FILTERS["fastslam"], ("fastslam", "active"), ("fastslam", "fused")),)
+def _by_filter(first: Strategy, second: Strategy) -> tuple[tuple[str, Way, Way], ...]:
+    """Pair two strategies with each filter, under the filter's title."""
+    return tuple((label, (name, first), (name, second)) for name, label in FILTERS.items())
+
+
+_EKF, _FASTSLAM = ((pair,) for pair in _by_filter("active", "fused"))
 _TWO_FILTERS = tuple((way, ("fastslam", way), ("ekf", way)) for way in STRATEGIES)
 _OVER_PASSIVE = tuple(
     (f"{label}, {way}", (name, "passive"), (name, way))
@@ -519,92 +451,49 @@ _OVER_PASSIVE = tuple(
 )
 _OVER_FUSED, _OVER_ACTIVE = _by_filter("passive", "fused"), _by_filter("passive", "active")
 _GAINS = _by_filter("active", "fused")
-
-CLAIMS = (
-    Claim(
-        sentence="Landmarks, in total and fully initialised, number as in Table II, within its σ.",
-        parts=(counts_as_printed,),
-    ),
-    Claim(
-        sentence="EKF-SLAM is more consistent than FastSLAM 2.0; ANEES swings with the laps and "
-        "rises.",
-        parts=(ekf_more_consistent,),
-    ),
-    Claim(
-        sentence="EKF-SLAM has the lower position RMSE everywhere; passive sensing has the "
-        "highest.",
-        parts=(
-            _compare(
-                "Position RMSE: FastSLAM 2.0 minus EKF is above 0", "m", POSITION, _TWO_FILTERS
-            ),
-            _compare(
-                "Position RMSE: passive minus active, and minus fused, is above 0",
-                "m", POSITION, _OVER_PASSIVE,
-            ),
-        ),
-    ),
-    Claim(
-        sentence="With EKF-SLAM, fused beats active in position below about 42°, on average but "
-        "not significantly, and in heading at every beamwidth.",
-        parts=(
-            _compare(
-                "Position RMSE below 42°: active minus fused is above 0, not significantly",
-                "m", POSITION, _EKF, relation="slightly above", below=CROSSING,
-            ),
-            _compare("Heading RMSE: active minus fused is above 0", "rad", HEADING, _EKF),
-        ),
-    ),
-    Claim(
-        sentence="With FastSLAM 2.0, fused never beats active in position.",
-        parts=(
-            _compare(
-                "Position RMSE: active minus fused is not significantly above 0",
-                "m", POSITION, _FASTSLAM, relation="not above",
-            ),
-        ),
-    ),
-    Claim(
-        sentence="Fused tends to passive as the beam narrows.",
-        parts=(
-            _nears_passive,
-            _compare(
-                "Position RMSE at the narrowest beam: passive minus fused lies within σ",
-                "m", POSITION, _OVER_FUSED, narrowest=True, relation="within", sigma=True,
-            ),
-        ),
-    ),
-    Claim(
-        sentence="In map RMSE, fused never beats active, and is within about one σ.",
-        parts=(
-            _compare(
-                "Map RMSE: active minus fused is not significantly above 0",
-                "m", COMMON, _GAINS, relation="not above",
-            ),
-            _compare(
-                "Map RMSE: at most beamwidths, active minus fused lies within σ",
-                "m", COMMON, _GAINS, need="most", relation="within", sigma=True,
-            ),
-        ),
-    ),
-    Claim(
-        sentence="Passive sees more landmarks than active at every beamwidth, by more than σ "
-        "only below 65°.",
-        parts=(
-            _compare(
-                "Landmarks seen: passive minus active is above 0",
-                "landmarks", SEEN, _OVER_ACTIVE, fitted=lambda width: width > 179.0,
-            ),
-            _compare(
-                "Landmarks seen below 65°: passive minus active is above σ",
-                "landmarks", SEEN, _OVER_ACTIVE, below=NARROW, sigma=True,
-            ),
-            _compare(
-                "Landmarks seen from 65° on: passive minus active is not significantly above σ",
-                "landmarks", SEEN, _OVER_ACTIVE, relation="not above", above=NARROW, sigma=True,
-            ),
-        ),
-    ),
+_TABLE: tuple[tuple[str, tuple[Callable[[Selection], list[Part]], ...]], ...] = (
+    ("Landmarks, in total and fully initialised, number as in Table II, within its σ.", (
+        counts_as_printed,
+    )),
+    ("EKF-SLAM is more consistent than FastSLAM 2.0; ANEES swings with the laps and rises.", (
+        ekf_more_consistent,
+    )),
+    ("EKF-SLAM has the lower position RMSE everywhere; passive sensing has the highest.", (
+        _differs("Position RMSE: FastSLAM 2.0 minus EKF is above 0", "m", POSITION, _TWO_FILTERS),
+        _differs("Position RMSE: passive minus active, and minus fused, is above 0",
+                 "m", POSITION, _OVER_PASSIVE),
+    )),
+    ("With EKF-SLAM, fused beats active in position below about 42°, on average but not "
+     "significantly, and in heading at every beamwidth.", (
+        _differs("Position RMSE below 42°: active minus fused is above 0, not significantly",
+                 "m", POSITION, _EKF, relation="slightly above", below=CROSSING),
+        _differs("Heading RMSE: active minus fused is above 0", "rad", HEADING, _EKF),
+    )),
+    ("With FastSLAM 2.0, fused never beats active in position.", (
+        _differs("Position RMSE: active minus fused is not significantly above 0",
+                 "m", POSITION, _FASTSLAM, relation="not above"),
+    )),
+    ("Fused tends to passive as the beam narrows.", (
+        _nears_passive,
+        _differs("Position RMSE at the narrowest beam: passive minus fused lies within σ",
+                 "m", POSITION, _OVER_FUSED, narrowest=True, relation="within", sigma=True),
+    )),
+    ("In map RMSE, fused never beats active, and is within about one σ.", (
+        _differs("Map RMSE: active minus fused is not significantly above 0",
+                 "m", COMMON, _GAINS, relation="not above"),
+        _differs("Map RMSE: at most beamwidths, active minus fused lies within σ",
+                 "m", COMMON, _GAINS, need="most", relation="within", sigma=True),
+    )),
+    ("Passive sees more landmarks than active at every beamwidth, by more than σ only below 65°.", (
+        _differs("Landmarks seen: passive minus active is above 0",
+                 "landmarks", SEEN, _OVER_ACTIVE, fitted_above=179.0),
+        _differs("Landmarks seen below 65°: passive minus active is above σ",
+                 "landmarks", SEEN, _OVER_ACTIVE, below=NARROW, sigma=True),
+        _differs("Landmarks seen from 65° on: passive minus active is not significantly above σ",
+                 "landmarks", SEEN, _OVER_ACTIVE, relation="not above", above=NARROW, sigma=True),
+    )),
 )  # fmt: skip
+CLAIMS = tuple(Claim(sentence=sentence, parts=parts) for sentence, parts in _TABLE)
 """Claims of Bradley & Abaid, Sec. V, in its order."""
 
 
@@ -612,11 +501,12 @@ def judge_claims(
     selections: Mapping[Rule, Selection],
     claims: Sequence[Claim] = CLAIMS,
     confidence: float = 0.95,
-) -> tuple[JudgedClaim, ...]:
+) -> list[dict[str, Any]]:
     """Judge each claim as a family under every exclusion rule.
 
     `selections`: as `study.selections` gives them. `confidence`: that all intervals of a claim
-    hold.
+    hold. Returns: the claims of ``summary.json``, and with each rule its `decisive` finding, which
+    is the farthest from holding, or the nearest to failing. None replaces numbers not finite.
     """
     judged = []
     for number, claim in enumerate(claims, start=1):
@@ -624,100 +514,86 @@ def judge_claims(
             rule: _judged([part for make in claim.parts for part in make(selection)], confidence)
             for rule, selection in selections.items()
         }
-        parts = zip(*(judgement.parts for judgement in by_rule.values()), strict=True)
-        verdict = _verdict([_holds_throughout(same) for same in parts])
-        judged.append(
-            JudgedClaim(
-                number=number,
-                sentence=claim.sentence,
-                verdict=verdict,
-                reason=_reason(verdict, by_rule),
-                by_rule=by_rule,
-            )
+        first, everything = (
+            [finding for part in by_rule[rule]["parts"] for finding in part["findings"]]
+            for rule in ("world", "none")
         )
-    return tuple(judged)
+        decisive = by_rule["world"]["decisive"]
+        twins = (twin for one, twin in zip(first, everything, strict=True) if one is decisive)
+        same = zip(*(judgement["parts"] for judgement in by_rule.values()), strict=True)
+        verdict = _verdict([_holds_throughout(parts) for parts in same])
+        judged.append(
+            {
+                "claim": number,
+                "sentence": claim.sentence,
+                **by_rule["world"],
+                "verdict": verdict,
+                "with_everything": next(twins, None),
+                "rule": _reason(verdict, by_rule),
+                "by_exclusion": by_rule,
+            }
+        )
+    return judged
 
 
-def with_everything(claim: JudgedClaim) -> Finding | None:
-    """Return the deciding statement of a claim with all worlds counted; None if none decides."""
-    first = claim.by_rule["world"]
-    for part, same in zip(first.parts, claim.by_rule["none"].parts, strict=True):
-        for finding, twin in zip(part.findings, same.findings, strict=True):
-            if finding is first.decisive:
-                return twin
-    return None
-
-
-def record(claim: JudgedClaim) -> dict[str, Any]:
-    """Return a claim as JSON values for ``summary.json``; None replaces numbers not finite."""
+def record(claim: dict[str, Any]) -> dict[str, Any]:
+    """Return a judged claim as in ``summary.json``."""
     by_rule = {
-        rule: {
-            "verdict": judgement.verdict,
-            **_statistic(judgement),
-            "parts": [
-                {
-                    "sentence": part.sentence,
-                    "unit": part.unit,
-                    "need": part.need,
-                    "holds": part.holds,
-                    "findings": [_plain(finding) for finding in part.findings],
-                }
-                for part in judgement.parts
-            ],
-        }
-        for rule, judgement in claim.by_rule.items()
+        rule: {key: value for key, value in one.items() if key != "decisive"}
+        for rule, one in claim["by_exclusion"].items()
     }
-    return {
-        "claim": claim.number,
-        "sentence": claim.sentence,
-        "verdict": claim.verdict,
-        **_statistic(claim.by_rule["world"]),
-        "with_everything": None if (twin := with_everything(claim)) is None else _plain(twin),
-        "rule": claim.reason,
-        "by_exclusion": by_rule,
-    }
+    plain = {key: value for key, value in claim.items() if key not in ("decisive", "parts")}
+    return plain | {"by_exclusion": by_rule}
 
 
-def tally(part: JudgedPart) -> tuple[int, int, int]:
+def tally(part: dict[str, Any]) -> list[int]:
     """Count the statements of a part that hold, are undecided, and are refuted."""
-    found = [finding.holds for finding in part.findings]
-    return found.count(True), found.count(None), found.count(False)
+    verdicts = [finding["holds"] for finding in part["findings"]]
+    return [verdicts.count(verdict) for verdict in (True, None, False)]
 
 
-def _judged(parts: Sequence[Part], confidence: float) -> Judgement:
+def _judged(parts: Sequence[Part], confidence: float) -> dict[str, Any]:
     """Judge a claim's statements as a family, then its parts, then the claim."""
     findings = iter(judge([s for part in parts for s in part.statements], confidence))
-    judged = []
+    judged, ranks = [], []
     for part in parts:
-        of_part = tuple(next(findings) for _ in part.statements)
-        judged.append(
-            JudgedPart(
-                sentence=part.sentence,
-                unit=part.unit,
-                need=part.need,
-                findings=of_part,
-                holds=_holds([finding.holds for finding in of_part], part.need),
-            )
-        )
-    pairs = [(finding, part) for part in judged for finding in part.findings]
-    decisive, part = min(pairs, key=_standing, default=(None, None))
-    return Judgement(
-        verdict=_verdict([part.holds for part in judged]),
-        parts=tuple(judged),
-        decisive=decisive,
-        unit=part.unit if part else "",
-    )
+        own = [next(findings) for _ in part.statements]
+        holds = _holds([finding.holds for finding in own], part.need)
+        plain = [
+            {
+                "label": statement.label,
+                "relation": statement.relation,
+                "margin": statement.margin if math.isfinite(statement.margin) else None,
+                "sigma": statement.sigma if math.isfinite(statement.sigma) else None,
+                "fitted": statement.fitted,
+                **json_finding(finding),
+                "holds": finding.holds,
+            }
+            for statement, finding in zip(part.statements, own, strict=True)
+        ]
+        head = {"sentence": part.sentence, "unit": part.unit, "need": part.need, "holds": holds}
+        judged.append(head | {"findings": plain})
+        ranks += [(_rank(finding, holds), finding, part.unit) for finding in plain]
+    _, decisive, unit = min(ranks, key=lambda rank: rank[0], default=((), None, ""))
+    shown = decisive or {"interval": None, "sigma": None, "p": None, "n": 0}
+    return {
+        "verdict": _verdict([part["holds"] for part in judged]),
+        "statistic": shown.get("mean"),
+        "of": shown.get("label"),
+        "unit": unit,
+        **{key: shown[key] for key in ("interval", "sigma", "p", "n")},
+        "decisive": decisive,
+        "parts": judged,
+    }
 
 
-def _holds(found: Sequence[bool | None], need: str) -> bool | None:
+def _holds(verdicts: list[bool | None], need: str) -> bool | None:
     """Decide a part from its statements; an empty part is undecided."""
-    if not found:
-        return None
-    enough = len(found) // 2 + 1 if need == "most" else len(found)
-    refuted = len(found) // 2 + 1 if need == "most" else 1
-    if list(found).count(False) >= refuted:
+    most = len(verdicts) // 2 + 1
+    if verdicts.count(False) >= (most if need == "most" else 1):
         return False
-    return True if list(found).count(True) >= enough else None
+    enough = verdicts.count(True) >= (most if need == "most" else len(verdicts))
+    return True if verdicts and enough else None
 
 
 def _verdict(parts: Sequence[bool | None]) -> Verdict:
@@ -727,88 +603,57 @@ def _verdict(parts: Sequence[bool | None]) -> Verdict:
     return "reproduced" if all(parts) else "open"
 
 
-def _holds_throughout(part: Sequence[JudgedPart]) -> bool | None:
+def _holds_throughout(same: Sequence[dict[str, Any]]) -> bool | None:
     """Decide a part over all exclusion rules; it is undecided if the rules disagree."""
-    if all(judged.holds for judged in part):
+    if all(part["holds"] for part in same):
         return True
-    refuted = all(judged.holds is False for judged in part)
-    sides = ({_side(f) for f in judged.findings if f.holds is False} for judged in part)
+    refuted = all(part["holds"] is False for part in same)
+    sides = ({_side(f) for f in part["findings"] if f["holds"] is False} for part in same)
     return False if refuted and set.intersection(*sides) else None
 
 
-def _side(finding: Finding) -> float:
+def _side(finding: dict[str, Any]) -> float:
     """Return the side of a refuted mean: -1 too low for its claim, 1 too high."""
-    if finding.relation in ("above", "not above"):
-        return -1.0 if finding.relation == "above" else 1.0
-    return math.copysign(1.0, finding.mean - (finding.relation != "within") * finding.margin)
+    if finding["relation"] in ("above", "not above"):
+        return -1.0 if finding["relation"] == "above" else 1.0
+    edge = 0.0 if finding["relation"] == "within" else finding["margin"]
+    return math.copysign(1.0, finding["mean"] - edge)
 
 
-def _standing(pair: tuple[Finding, JudgedPart]) -> tuple[int, float]:
+def _rank(finding: dict[str, Any], holds: bool | None) -> tuple[int, float]:
     """Return a sort key: the verdict of the part, then the distance from failing in std errors."""
-    finding, part = pair
-    order = {False: 0, None: 1, True: 2}
-    if not (finding.std > 0.0):
-        return order[part.holds], -math.inf
-    error = finding.std / math.sqrt(finding.n)
-    beyond = finding.mean - finding.margin
+    order = {False: 0, None: 1, True: 2}[holds]
+    if not finding["std"]:
+        return order, -math.inf
+    beyond = finding["mean"] - finding["margin"]
     distance = {
         "above": beyond,
         "not above": -beyond,
         "slightly above": -abs(beyond),
-        "within": finding.margin - abs(finding.mean),
-    }[finding.relation]
-    return order[part.holds], distance / error
+        "within": finding["margin"] - abs(finding["mean"]),
+    }[finding["relation"]]
+    return order, distance / (finding["std"] / math.sqrt(finding["n"]))
 
 
-def _reason(verdict: Verdict, by_rule: dict[Rule, Judgement]) -> str:
+def _reason(verdict: Verdict, by_rule: Mapping[Rule, dict[str, Any]]) -> str:
     """Return the sentence that explains a verdict."""
-    first = by_rule["world"]
-    if all(not part.findings for part in first.parts):
+    first, verdicts = by_rule["world"], {one["verdict"] for one in by_rule.values()}
+    if not any(part["findings"] for part in first["parts"]):
         return "The study has no cases for this claim."
-    if verdict == "open" and {one.verdict for one in by_rule.values()} == {"not-reproduced"}:
+    if verdict == "open" and verdicts == {"not-reproduced"}:
         return "It fails whatever is left out, but for another reason each time: see its parts."
-    if len({one.verdict for one in by_rule.values()}) > 1:
+    if len(verdicts) > 1:
         words = ", ".join(
-            f"{judgement.verdict.replace('-', ' ')} {WITHOUT[rule]}"
-            for rule, judgement in by_rule.items()
+            f"{one['verdict'].replace('-', ' ')} {WITHOUT[rule]}" for rule, one in by_rule.items()
         )
         return f"The verdict depends on what is left out: {words}."
-    if first.verdict == "open" and any(not part.findings for part in first.parts):
+    if first["verdict"] == "open" and not all(part["findings"] for part in first["parts"]):
         return "The study has no cases for a part of this claim."
     return {
         "reproduced": "Every part holds, whatever is left out.",
         "not-reproduced": "The opposite of a part is significant, whatever is left out.",
         "open": "Not every part holds, and the opposite of none is significant.",
     }[verdict]
-
-
-def _statistic(judgement: Judgement) -> dict[str, Any]:
-    """Return the deciding number of a judgement as JSON values."""
-    finding = judgement.decisive
-    keys = ("interval", "sigma", "p")
-    if finding is None:
-        return {"statistic": None, "of": None, "unit": "", **dict.fromkeys(keys), "n": 0}
-    plain = _plain(finding)
-    return {
-        "statistic": plain["mean"],
-        "of": finding.label,
-        "unit": judgement.unit,
-        **{key: plain[key] for key in keys},
-        "n": finding.n,
-    }
-
-
-def _plain(finding: Finding) -> dict[str, Any]:
-    """Return a finding and its claim as JSON values."""
-    return {
-        "label": finding.label,
-        "relation": finding.relation,
-        "margin": finding.margin if math.isfinite(finding.margin) else None,
-        "sigma": finding.sigma if math.isfinite(finding.sigma) else None,
-        "fitted": finding.fitted,
-        **json_finding(finding),
-        "holds": finding.holds,
-    }
 
 
 COMPARED = {
@@ -820,7 +665,9 @@ COMPARED = {
 """Scores in which fused is compared with active sensing: title and unit."""
 
 
-def papers_answer(selections: Mapping[Rule, Selection], claims: Sequence[JudgedClaim]) -> list[str]:
+def papers_answer(
+    selections: Mapping[Rule, Selection], claims: Sequence[dict[str, Any]]
+) -> list[str]:
     """Answer the paper's question for each filter, then count the verdicts.
 
     The first line leaves out diverged worlds, as the paper does. If the rules of exclusion
@@ -831,7 +678,7 @@ def papers_answer(selections: Mapping[Rule, Selection], claims: Sequence[JudgedC
     if len(set(by_rule.values())) > 1:
         lines = ["It depends on which worlds are counted."]
         lines += [f"{WITHOUT[rule].capitalize()}: {line}" for rule, line in by_rule.items()]
-    verdicts = [claim.verdict for claim in claims]
+    verdicts = [claim["verdict"] for claim in claims]
     words = []
     for verdict in ("reproduced", "not-reproduced", "open"):
         count = verdicts.count(verdict)
@@ -868,7 +715,7 @@ def _fused_minus_active(selection: Selection, name: str, score: str) -> Finding:
     """Judge fused minus active sensing of a filter, averaged over the combinations."""
     numbers = range(len(selection.study.beamwidth))
     pairs = [((name, "active", i), (name, "fused", i)) for i in numbers]
-    (contrast,) = compare(selection, [(0, Measure(title="", score=score, unit=""), pairs)])
+    (contrast,) = compare(selection, Measure(title="", score=score, unit=""), [pairs])
     return contrast.finding
 
 
@@ -908,7 +755,7 @@ def _texts(selection: Selection, name: str) -> dict[str, str]:
                 text += f" {interval(mean.family, unit)}"
             family, fuller = gains(selection, name, score), score == LANDMARKS
             for word, holds in (("better", not fuller), ("worse", fuller)):
-                beams = [f.label.split(", ")[-1] for f in family if f.holds is holds]
+                beams = [at.split(", ")[-1] for at, one in family if one.holds is holds]
                 if beams:
                     count = f"{len(beams)} of {len(family)} beamwidths"
                     text += f"; {word} at {count} ({', '.join(beams)})"

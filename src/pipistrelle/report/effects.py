@@ -8,9 +8,9 @@ between the ends of a number are another. Gains over active sensing are measures
 """
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from jaxtyping import Float
@@ -48,6 +48,9 @@ from pipistrelle.report.variables import (
     listed,
     with_article,
 )
+
+if TYPE_CHECKING:
+    import polars as pl
 
 STRATEGY, FILTER = "strategy", "filter"
 """Factors of a study besides its variables."""
@@ -172,59 +175,58 @@ def _numbers(study: Study, score: str, cells: Sequence[Cell]) -> list[Float[np.n
 
 
 def compare(
-    selection: Selection,
-    rows: Sequence[tuple[Any, Measure, Sequence[Pair]]],
-    *,
-    apart: bool = False,
-    set_same_aside: bool = False,
+    selection: Selection, measure: Measure, rows: Sequence[Sequence[Pair]]
 ) -> tuple[Contrast, ...]:
-    """Compare pairs of cases, averaged over the pairs of a row in each world.
+    """Compare the pairs of each row, averaged in each world; the rows are one family."""
+    if not any(rows):
+        return ()
+    frame = _frame(selection, [(0, measure, pairs) for pairs in rows])
+    return contrasts(frame, "level", ["row"], over=["combination"])
 
-    `rows`: family, measure and pairs. `apart`: each pair by itself instead. `set_same_aside`: as
-    for `contrasts`. Returns: a contrast per row, or per pair.
+
+def _frame(
+    selection: Selection, rows: Iterable[tuple[int, Measure, Sequence[Pair]]]
+) -> "pl.DataFrame":
+    """Return the numbers of pairs of cases in each world, for `contrasts`.
+
+    `rows`: family, measure and pairs.
     """
     import polars as pl
 
-    if not any(pairs for _, _, pairs in rows):
-        return ()
-    world = selection.study.worlds
-    numbers: dict[Any, int] = {}
-    heads, columns = [], []
+    heads, columns, world = [], [], selection.study.worlds
     for row, (family, measure, pairs) in enumerate(rows):
-        number = numbers.setdefault(family, len(numbers))
         for i, pair in enumerate(pairs):
             for level, column in enumerate(measured(selection, measure, *pair)):
-                heads.append((row, number, i, level))
+                heads.append((row, family, i, level))
                 columns.append(column)
-    names = ("row", "family", "combination", "level")
     index = np.repeat(np.array(heads), len(world), axis=0)
-    frame = pl.DataFrame(
-        {name: index[:, i] for i, name in enumerate(names)}
-        | {"world": np.tile(world, len(heads)), "value": np.concatenate(columns)}
-    )
-    by, over = (["row", "combination"], []) if apart else (["row"], ["combination"])
-    return contrasts(
-        frame, "level", by, over=over, family=["family"], set_same_aside=set_same_aside
-    )
+    names = ("row", "family", "combination", "level")
+    frame = pl.DataFrame(index, schema=dict.fromkeys(names, pl.Int64))
+    worlds = pl.Series("world", np.tile(world, len(heads)))
+    return frame.with_columns(worlds, pl.Series("value", np.concatenate(columns)))
 
 
-def pairings_of(study: Study) -> tuple[Pairing, ...]:
-    """List the comparisons of a study: its variables in order, then strategies, then filters."""
-    return (*_of_variables(study), *_of_strategies(study), *_of_filters(study))
-
-
-def _of_variables(study: Study) -> Iterator[Pairing]:
-    """Pair the values of each variable in every strategy, and in its gain over active."""
-    measures, gains = measures_of(study), gains_of(study)
+def pairings_of(study: Study) -> Iterator[Pairing]:
+    """Yield the comparisons of values, and of gains over active, then of strategies and filters."""
+    titles, measures, gains = filter_titles(study), measures_of(study), gains_of(study)
+    strategies = {
+        name: [way for way in STRATEGIES if (name, way) in study.trials] for name in titles
+    }
     for variable in study.variables:
-        for name in filter_titles(study):
-            ways = [(name, strategy) for strategy in STRATEGIES if (name, strategy) in study.trials]
-            for way in ways:
-                yield from _of_values(study, variable, [way], measures)
-            over = name, "active"
-            for way in ways:
-                if over in ways and way != over:
-                    yield from _of_values(study, variable, [way, over], gains)
+        for name, (first, *others) in strategies.items():
+            for strategy in (first, *others):
+                yield from _of_values(study, variable, [(name, strategy)], measures)
+            for strategy in others if first == "active" else ():
+                yield from _of_values(study, variable, [(name, strategy), (name, first)], gains)
+    for name, (first, *others) in strategies.items():
+        for after in others:
+            head = {"factor": STRATEGY, "filter": name, "before": first, "after": after}
+            yield _of_ways(study, (name, first), (name, after), **head)
+    for strategy in STRATEGIES:
+        first, *others = [name for name in titles if strategy in strategies[name]] or [""]
+        for name in others:
+            head = {"factor": FILTER, "before": titles[first], "after": titles[name]}
+            yield _of_ways(study, (first, strategy), (name, strategy), strategy=strategy, **head)
 
 
 def _of_values(
@@ -238,11 +240,12 @@ def _of_values(
     rows, base = along(study, variable), variable.base
     ends = range(len(rows)) if variable.numbers is None else (0, len(rows) - 1)
     at = np.array([study.trials[way].at[rows] for way in ways])
-    if np.all(at == at[:, :1]):
-        return
-    for j in (j for j in range(len(rows)) if j != base):
+    for j in range(len(rows)) if np.any(at != at[:, :1]) else ():
+        if j == base:
+            continue
         cases = at[:, [base, j]].reshape(-1, rows.shape[1])
         first = np.sort(np.unique(cases, axis=1, return_index=True)[1])
+        before, after = rows[base, first].tolist(), rows[j, first].tolist()
         yield Pairing(
             factor=variable.name,
             filter=ways[0][0],
@@ -250,32 +253,10 @@ def _of_values(
             before=variable.words[base],
             after=variable.words[j],
             end=j in ends,
-            pairs=tuple(
-                ((*ways[0], int(rows[base, m])), (*ways[0], int(rows[j, m]))) for m in first
-            ),
-            names=tuple(combination_name(study, int(rows[base, m]), [variable]) for m in first),
+            pairs=tuple(((*ways[0], a), (*ways[0], b)) for a, b in zip(before, after, strict=True)),
+            names=tuple(combination_name(study, a, [variable]) for a in before),
             measures=measures,
         )
-
-
-def _of_strategies(study: Study) -> Iterator[Pairing]:
-    """Pair the first strategy of each filter with the others."""
-    for name in filter_titles(study):
-        first, *others = (way for way in STRATEGIES if (name, way) in study.trials)
-        for other in others:
-            ways = (name, first), (name, other)
-            yield _of_ways(study, *ways, factor=STRATEGY, filter=name, before=first, after=other)
-
-
-def _of_filters(study: Study) -> Iterator[Pairing]:
-    """Yield the pairs of results to compare: the first filter of each strategy with each other."""
-    titles = filter_titles(study)
-    for strategy in STRATEGIES:
-        names = [name for name in titles if (name, strategy) in study.trials]
-        for other in names[1:]:
-            words = {"before": titles[names[0]], "after": titles[other], "strategy": strategy}
-            ways = (names[0], strategy), (other, strategy)
-            yield _of_ways(study, *ways, factor=FILTER, **words)
 
 
 def _of_ways(study: Study, one: Way, other: Way, **fields: Any) -> Pairing:
@@ -292,24 +273,26 @@ def _of_ways(study: Study, one: Way, other: Way, **fields: Any) -> Pairing:
 
 def effects_of(selection: Selection) -> tuple[Effect, ...]:
     """Judge every comparison of a study in every measure."""
+    import polars as pl
+
     families: dict[tuple[Any, ...], list[Pairing]] = {}
     for pairing in pairings_of(selection.study):
         name = pairing.factor, pairing.filter or pairing.strategy, pairing.end, pairing.measures
         families.setdefault(name, []).append(pairing)
-    rows = [
-        ((number, measure), measure, pairing)
-        for number, family in enumerate(families.values())
+    grouped = [
+        [(measure, pairing) for pairing in family]
+        for family in families.values()
         for measure in family[0].measures
-        for pairing in family
     ]
-    means = compare(
-        selection, [(name, m, pairing.pairs) for name, m, pairing in rows], set_same_aside=True
-    )
-    several = [
-        (name, m, pairing.pairs if len(pairing.pairs) > 1 else ()) for name, m, pairing in rows
-    ]
+    rows = [(number, *one) for number, family in enumerate(grouped) for one in family]
+    if not rows:
+        return ()
+    frame = _frame(selection, [(number, m, pairing.pairs) for number, m, pairing in rows])
+    aside = {"family": ["family"], "set_same_aside": True}
+    means = contrasts(frame, "level", ["row"], over=["combination"], **aside)
+    several = frame.filter(pl.col("combination").max().over("row") > 0)
     apart: dict[int, list[Finding]] = {}
-    for contrast in compare(selection, several, apart=True, set_same_aside=True):
+    for contrast in contrasts(several, "level", ["row", "combination"], **aside):
         apart.setdefault(contrast.by["row"], []).append(contrast.finding)
     return tuple(
         Effect(
@@ -323,34 +306,9 @@ def effects_of(selection: Selection) -> tuple[Effect, ...]:
     )
 
 
-def families_of(study: Study, effects: Sequence[Effect]) -> dict[tuple[str, str], list[Effect]]:
-    """Group effects by factor, and by filter (or strategy, if filters are compared).
-
-    Returns: only the variables if the study has any, otherwise strategies and filters.
-    """
-    families: dict[tuple[str, str], list[Effect]] = {}
-    for effect in effects:
-        pairing = effect.pairing
-        if not study.variables or pairing.factor not in (STRATEGY, FILTER):
-            family = pairing.factor, pairing.filter or pairing.strategy
-            families.setdefault(family, []).append(effect)
-    return families
-
-
-def variable_of(study: Study, effect: Effect) -> Variable | None:
-    """Return the variable of an effect; None for strategies and filters."""
-    return next((v for v in study.variables if v.name == effect.pairing.factor), None)
-
-
 def direction(finding: Finding) -> int:
     """Return 1 for a significant rise, -1 for a significant fall, otherwise 0."""
     return {True: 1, False: -1, None: 0}[finding.holds]
-
-
-def resolvable(finding: Finding) -> float:
-    """Return the smallest effect that would have been significant: half an interval's width."""
-    low, high = finding.family
-    return (high - low) / 2.0
 
 
 def record(by_rule: Mapping[Rule, Sequence[Effect]], headline: Rule) -> list[dict[str, Any]]:
@@ -360,38 +318,37 @@ def record(by_rule: Mapping[Rule, Sequence[Effect]], headline: Rule) -> list[dic
     at single combinations are given. Ratios replace logarithms; None replaces numbers that are not
     finite.
     """
-    return [
-        {
-            "variable": one[0].pairing.factor,
-            "filter": one[0].pairing.filter or None,
-            "strategy": one[0].pairing.strategy or None,
-            "from": one[0].pairing.before,
-            "to": one[0].pairing.after,
-            "measure": "gain_" * bool(one[0].measure.over) + one[0].measure.score,
-            "unit": "ratio" if one[0].measure.ratio else one[0].measure.unit,
-            "averaged_over": len(one[0].pairing.pairs),
-            "by_exclusion": {
-                rule: _plain_effect(effect) for rule, effect in zip(by_rule, one, strict=True)
-            },
-            "apart": [
-                {"at": name}
-                | json_finding(finding, effect=True, ratio=one[0].measure.ratio)
-                | {"shown": finding.holds is not None}
-                for name, finding in zip(
-                    one[0].pairing.names,
-                    dict(zip(by_rule, one, strict=True))[headline].apart,
-                    strict=False,
-                )
-            ],
-        }
-        for one in zip(*by_rule.values(), strict=True)
-    ]
+    rows = []
+    for effects in zip(*by_rule.values(), strict=True):
+        same = dict(zip(by_rule, effects, strict=True))
+        pairing, measure, apart = effects[0].pairing, effects[0].measure, same[headline].apart
+        rows.append(
+            {
+                "variable": pairing.factor,
+                "filter": pairing.filter or None,
+                "strategy": pairing.strategy or None,
+                "from": pairing.before,
+                "to": pairing.after,
+                "measure": "gain_" * bool(measure.over) + measure.score,
+                "unit": "ratio" if measure.ratio else measure.unit,
+                "averaged_over": len(pairing.pairs),
+                "by_exclusion": {rule: _plain_effect(effect) for rule, effect in same.items()},
+                "apart": [
+                    {"at": name}
+                    | json_finding(finding, effect=True, ratio=measure.ratio)
+                    | {"shown": finding.holds is not None}
+                    for name, finding in zip(pairing.names, apart, strict=False)
+                ],
+            }
+        )
+    return rows
 
 
 def _plain_effect(effect: Effect) -> dict[str, Any]:
     """Return an effect under one exclusion rule as JSON values."""
     ratio, finding = effect.measure.ratio, effect.finding
-    would = math.nan if finding.holds is not None or effect.untouched else resolvable(finding)
+    low, high = finding.family
+    would = math.nan if finding.holds is not None or effect.untouched else (high - low) / 2.0
     would = math.exp(would) if ratio and would < 700.0 else would
     return {
         **json_finding(finding, effect=True, ratio=ratio),
@@ -407,19 +364,17 @@ def json_finding(finding: Finding, *, effect: bool = False, ratio: bool = False)
     `effect`: give Bonferroni's interval, not Holm's. `ratio`: convert logarithms to ratios.
     """
 
-    def size(value: float) -> float | None:
+    def finite(value: float, *, ratio: bool = ratio) -> float | None:
+        value = float(np.exp(value)) if ratio and math.isfinite(value) else value
         return value if math.isfinite(value) else None
-
-    def finite(value: float) -> float | None:
-        return size(float(np.exp(value))) if ratio and math.isfinite(value) else size(value)
 
     return {
         "n": finding.n,
         "mean": finite(finding.mean),
-        "std": size(finding.std),
+        "std": finite(finding.std, ratio=False),
         "alone": [finite(bound) for bound in finding.alone],
         "interval": [finite(bound) for bound in (finding.family if effect else finding.interval)],
-        "p": size(finding.p),
+        "p": finite(finding.p, ratio=False),
     }
 
 
@@ -467,15 +422,12 @@ def answer(selection: Selection, effects: Sequence[Effect]) -> list[str]:
     `effects`: under the rule `HEADLINE`. Each sentence is the change of the position RMSE between
     two values, averaged over everything else; of several values of a variable the largest shown.
     """
-    study = selection.study
+    study, first = selection.study, [effect for effect in effects if is_first(effect.measure)]
     if study.variables:
-        return [_of_variable(selection, variable, effects) for variable in study.variables]
-    lines = []
-    for factor in (STRATEGY, FILTER):
-        rows = [e for e in effects if e.pairing.factor == factor and is_first(e.measure)]
-        lines += [sentence for _, sentence in _averaged(selection, rows)]
-    if lines:
-        return lines
+        return [_of_variable(selection, variable, first) for variable in study.variables]
+    if first:
+        by_factor = ([e for e in first if e.pairing.factor == name] for name in (STRATEGY, FILTER))
+        return [sentence for some in by_factor for _, sentence in _averaged(selection, some)]
     (way,) = study.trials
     (errors,) = samples(selection, POSITION, [(*way, 0)])
     if not len(errors):
@@ -488,15 +440,15 @@ def answer(selection: Selection, effects: Sequence[Effect]) -> list[str]:
 
 def _of_variable(selection: Selection, variable: Variable, effects: Sequence[Effect]) -> str:
     """Return the sentence of a variable: of its values with the largest effect shown."""
-    first = [e for e in effects if e.pairing.factor == variable.name and is_first(e.measure)]
-    if not first:
+    own = [effect for effect in effects if effect.pairing.factor == variable.name]
+    if not own:
         return f"No measurement depends on {with_article(variable)}."
-    answers = [
-        _averaged(selection, [e for e in first if e.pairing.end is end], variable)
+    ends, between = (
+        _averaged(selection, [e for e in own if e.pairing.end is end], variable)
         for end in (True, False)
-    ]
-    shown = [one for some in answers for one in some if direction(one[0])]
-    return max(shown or answers[0], key=lambda one: (one[0].n, abs(one[0].mean)))[1]
+    )
+    shown = [one for one in (*ends, *between) if direction(one[0])]
+    return max(shown or ends, key=lambda one: (one[0].n, abs(one[0].mean)))[1]
 
 
 def _averaged(
@@ -510,11 +462,9 @@ def _averaged(
     for effect in effects:
         groups.setdefault((effect.pairing.before, effect.pairing.after), []).append(effect)
     pairs = [[pair for e in group for pair in e.pairing.pairs] for group in groups.values()]
-    rows = [(0, effects[0].measure, some) for some in pairs]
+    judged = compare(selection, effects[0].measure, pairs) if effects else ()
     answers = []
-    for ((before, after), group), some, contrast in zip(
-        groups.items(), pairs, compare(selection, rows), strict=True
-    ):
+    for ((before, after), group), some, contrast in zip(groups.items(), pairs, judged, strict=True):
         sensing = " sensing" * (group[0].pairing.factor == STRATEGY)
         subject = f"{after} instead of {before}{sensing}"
         if variable is not None:
@@ -534,9 +484,7 @@ def _shown_by(study: Study, group: Sequence[Effect]) -> str:
     titles, parts = filter_titles(study), []
     for sign, verb in ((1, "rise"), (-1, "fall")):
         shown = [e.pairing for e in group if direction(e.finding) == sign]
-        names = [
-            " ".join(filter(None, (p.strategy, titles.get(p.filter, "sensing")))) for p in shown
-        ]
+        names = [f"{p.strategy} {titles.get(p.filter, 'sensing')}".strip() for p in shown]
         if len(names) > MOST_NAMES:
             names = [f"{len(names)} of {len(group)} filters and strategies"]
         parts += [f"{verb} with {listed(names)}"] if names else []

@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float
@@ -59,7 +60,12 @@ def example_map(study: Study, world: Scenario) -> Chart:
         x, y = setup.radius * np.cos(turn), setup.radius * np.sin(turn)
         edge = Series(name="edge", role="grid", x=x, y=y, dashed=True, listed=False)
         series = (edge, *series)
-    x, y = _square(series)
+    places = np.array([[part(s.x), part(s.y)] for s in series for part in (np.min, np.max)])
+    low, high = places.min(axis=0), places.max(axis=0)
+    middle, reach = (low + high) / 2.0, 0.52 * np.max(high - low)  # axes of equal length
+    x, y = (
+        Axis(label="", limits=(float(at - reach), float(at + reach)), ticks=()) for at in middle
+    )
     count, others = len(world.landmarks), [caller.name for caller in world.callers[VEHICLE + 1 :]]
     shown = listed([f"{count} landmarks", *(f"the {name}" for name in others)])
     where = f" where {combination_name(study, 0)}" if study.drawing.any() else ""
@@ -71,15 +77,6 @@ def example_map(study: Study, world: Scenario) -> Chart:
         panels=(Panel(title="", x=x, y=y, series=series, equal=True),),
         columns=("x_m", "y_m"),
     )
-
-
-def _square(series: Sequence[Series]) -> tuple[Axis, Axis]:
-    """Return axes of equal length with a margin around some series."""
-    places = np.array([[part(s.x), part(s.y)] for s in series for part in (np.min, np.max)])
-    low, high = places.min(axis=0), places.max(axis=0)
-    reach = 0.52 * float(np.max(high - low))
-    x, y = ((float(at) - reach, float(at) + reach) for at in (low + high) / 2.0)
-    return Axis(label="", limits=x, ticks=()), Axis(label="", limits=y, ticks=())
 
 
 def _beam(config: Config, width: float, strength: float) -> list[Series]:
@@ -133,27 +130,14 @@ def _protractor() -> list[Series]:
 
 def _world(world: Scenario) -> tuple[Series, ...]:
     """Return the series of a world: path, landmarks and callers."""
-    start = world.path[:1, :2]
-    labels = [f"landmark {i}" for i in range(1, len(world.landmarks) + 1)]
+    count = len(world.landmarks)
+    look = {"role": "ink", "style": "points", "filled": np.zeros(count, bool)}
+    path, start = world.path[:, :2], world.path[:1, :2]
+    numbered = [f"landmark {i}" for i in range(1, count + 1)]
     return (
-        Series(name="true path", role="truth", x=world.path[:, 0], y=world.path[:, 1]),
-        Series(
-            name="start",
-            role="truth",
-            x=start[:, 0],
-            y=start[:, 1],
-            style="points",
-            tips=_places(["start"], start),
-        ),
-        Series(
-            name="landmark",
-            role="ink",
-            x=world.landmarks[:, 0],
-            y=world.landmarks[:, 1],
-            style="points",
-            filled=np.zeros(len(world.landmarks), bool),
-            tips=_places(labels, world.landmarks),
-        ),
+        Series(name="true path", role="truth", x=path[:, 0], y=path[:, 1]),
+        _places("start", start, ["start"], role="truth", style="points"),
+        _places("landmark", world.landmarks, numbered, **look),
         *(_caller(caller) for caller in world.callers[VEHICLE + 1 :]),
     )
 
@@ -161,13 +145,16 @@ def _world(world: Scenario) -> tuple[Series, ...]:
 def _caller(caller: Caller) -> Series:
     """Return the path of a moving caller, or a star at the position of another."""
     place = np.reshape(np.asarray(caller.place), (-1, 2))
-    look = {"name": caller.name, "role": "fused", "x": place[:, 0], "y": place[:, 1]}
     if moves(caller):
-        return Series(**look)
-    return Series(**look, style="stars", tips=_places([caller.name], place))
+        return Series(name=caller.name, role="fused", x=place[:, 0], y=place[:, 1])
+    return _places(caller.name, place, [caller.name], role="fused", style="stars")
 
 
-def _places(names: list[str], points: Float[np.ndarray, "n 2"]) -> tuple[str, ...]:
-    return tuple(
-        f"{name}\nx: {x:.1f} m\ny: {y:.1f} m" for name, (x, y) in zip(names, points, strict=True)
+def _places(
+    name: str, points: Float[np.ndarray, "n 2"], labels: Sequence[str], **look: Any
+) -> Series:
+    """Return points with their labels and coordinates to read out."""
+    tips = tuple(
+        f"{label}\nx: {x:.1f} m\ny: {y:.1f} m" for label, (x, y) in zip(labels, points, strict=True)
     )
+    return Series(name=name, x=points[:, 0], y=points[:, 1], tips=tips, **look)

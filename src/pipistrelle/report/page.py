@@ -9,9 +9,10 @@ their variables.
 import json
 import platform
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from importlib.metadata import PackageNotFoundError, version
 from importlib.resources import files
+from math import inf, nan
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -19,7 +20,7 @@ from markupsafe import Markup
 
 from pipistrelle import __version__
 from pipistrelle.evaluation.bound import IN_ONE_WORLD
-from pipistrelle.evaluation.comparison import INTERVALS, Finding
+from pipistrelle.evaluation.comparison import INTERVALS
 from pipistrelle.evaluation.scores import shown_in
 from pipistrelle.figures.chart import Chart, columns_of, csv_rows, csv_text
 from pipistrelle.figures.style import page_colours
@@ -28,17 +29,7 @@ from pipistrelle.report import claims as paper
 from pipistrelle.report import effects as changes
 from pipistrelle.report import tables
 from pipistrelle.report.charts import Figure, answers, study_charts
-from pipistrelle.report.claims import (
-    CLAIMS,
-    FILTERS,
-    WITHOUT,
-    Claim,
-    JudgedClaim,
-    judge_claims,
-    papers_cases,
-    tally,
-    with_everything,
-)
+from pipistrelle.report.claims import CLAIMS, FILTERS, WITHOUT, Claim, papers_cases, tally
 from pipistrelle.report.effects import HEADLINE, OTHERWISE, Effect, effects_of, measures_of
 from pipistrelle.report.models import model_charts
 from pipistrelle.report.study import (
@@ -58,7 +49,6 @@ from pipistrelle.settings import to_toml
 if TYPE_CHECKING:
     from jinja2 import Template
 
-FORMAT = 1
 LIBRARIES = ("numpy", "scipy", "numba", "polars", "pydantic", "matplotlib", "jinja2")
 PAPERS_QUESTION = "Does listening to someone else’s calls as well as one’s own build a better map?"
 SPOKEN = {"reproduced": "Reproduced", "not-reproduced": "Not reproduced", "open": "Open"}
@@ -79,7 +69,8 @@ class Answered:
     selections: Mapping[Rule, Selection]
     effects: Mapping[Rule, tuple[Effect, ...]]
     """Effects and selections under each rule."""
-    claims: tuple[JudgedClaim, ...]
+    claims: list[dict[str, Any]]
+    """Judged, as `judge_claims` returns them."""
     answer: list[str]
     """A headline, then further sentences."""
     findings: list[dict[str, str]]
@@ -91,7 +82,7 @@ def answered(study: Study, claims: Sequence[Claim] | None = None) -> Answered:
     papers, by_rule = papers_cases(study), selections(study)
     effects = {rule: effects_of(selection) for rule, selection in by_rule.items()}
     asked = (CLAIMS if papers else ()) if claims is None else claims
-    judged = judge_claims(by_rule, asked)
+    judged = paper.judge_claims(by_rule, asked)
     return Answered(
         study=study,
         papers=papers,
@@ -112,10 +103,16 @@ def summary(result: Answered) -> dict[str, Any]:
     study, selection, rule = result.study, result.selections[result.rule], result.rule
     effects = result.effects[rule], result.effects[OTHERWISE]
     exclusions = tables.exclusion_rows(study)
+    versions = {"python": platform.python_version()}
+    for name in LIBRARIES:
+        try:
+            versions[name] = version(name)
+        except PackageNotFoundError:
+            versions[name] = "unknown"
     return {
-        "format": FORMAT,
+        "format": 1,
         "version": __version__,
-        "versions": {"python": platform.python_version()} | _versions(),
+        "versions": versions,
         "study": study.name,
         "seed": study.config.seed,
         "worlds_planned": study.planned,
@@ -141,19 +138,8 @@ def summary(result: Answered) -> dict[str, Any]:
         "trials_failed": sum(row["failed"] for row in exclusions),
         "table_ii": tables.table_ii_rows(selection) if result.papers else [],
         "consistency": tables.consistency_rows(selection),
-        "failed": [asdict(failure) for failure in study.errors],
+        "failed": [*study.errors],
     }
-
-
-def _versions() -> dict[str, str]:
-    """Return the versions of the libraries that numbers and figures depend on."""
-    versions = {}
-    for name in LIBRARIES:
-        try:
-            versions[name] = version(name)
-        except PackageNotFoundError:
-            versions[name] = "unknown"
-    return versions
 
 
 def write_report(
@@ -175,20 +161,22 @@ def write_report(
     """
     own = claim(folder, REPORT, overwrite=True)
     result = answered(study, claims)
-    rules = sorted(RULES, key=lambda rule: rule != result.rule)  # the rule of the answer is printed
-    by_rule = {rule: study_charts(result.selections[rule], charts) for rule in rules}
+    figures: dict[str, dict[Rule, Chart]] = {}
+    for rule in sorted(RULES, key=lambda rule: rule != result.rule):  # the answer's is printed
+        for chart in study_charts(result.selections[rule], charts):
+            figures.setdefault(chart.name, {})[rule] = chart
     models = model_charts(study)
-    drawn, texts = [*_distinct(by_rule), *models], _csv_texts(result, by_rule, models)
 
     def draw(room: Path) -> None:
-        for chart in drawn:
+        for chart in [*(next(iter(views.values())) for views in figures.values()), *models]:
             progress(chart.name)
             _write_figure(chart, room)
 
     numbers = summary(result)
     written = drawn_files(draw, "figures/")
-    written |= {f"figures/{name}.csv": text.encode() for name, text in texts.items()}
-    written["index.html"] = page(result, by_rule, models, numbers).encode()
+    for name, text in _csv_texts(result, figures, models).items():
+        written[f"figures/{name}.csv"] = text.encode()
+    written["index.html"] = page(result, figures, models, numbers).encode()
     written["summary.json"] = (json.dumps(numbers, indent=1, allow_nan=False) + "\n").encode()
     own.replace(written)
     return numbers
@@ -196,13 +184,17 @@ def write_report(
 
 def page(
     result: Answered,
-    by_rule: dict[Rule, list[Chart]],
-    models: list[Chart],
+    figures: Mapping[str, Mapping[Rule, Chart]],
+    models: Sequence[Chart],
     numbers: dict[str, Any],
 ) -> str:
-    """Return the page as HTML; `numbers`: the content of ``summary.json``."""
+    """Return the page as HTML.
+
+    `figures`: under each rule that has them. `numbers`: the content of ``summary.json``.
+    """
     here, study = files("pipistrelle.report"), result.study
-    figures = [_figure(chart.name, by_rule) for chart in _distinct(by_rule)]
+    rules = sorted(RULES, key=lambda rule: rule != result.rule)
+    shown = [_figure(views, rules) for views in figures.values()]
     text = _template().render(
         study=study,
         papers=result.papers,
@@ -218,9 +210,9 @@ def page(
         online=has_numbers(study, ONLINE_POSITION),
         measures=measures_of(study),
         units=UNITS,
-        figures=_side_by_side([figure for figure in figures if answers(figure["name"])]),
-        further=_side_by_side([figure for figure in figures if not answers(figure["name"])]),
-        models=_side_by_side([_figure(chart.name, {"always": [chart]}) for chart in models]),
+        figures=_side_by_side([figure for figure in shown if answers(figure["name"])]),
+        further=_side_by_side([figure for figure in shown if not answers(figure["name"])]),
+        models=_side_by_side([_figure({"always": chart}, ["always"]) for chart in models]),
         style=Markup((here / "page.css").read_text(encoding="utf-8")),
         script=Markup((here / "page.js").read_text(encoding="utf-8")),
         colours=Markup(page_colours()),
@@ -231,7 +223,6 @@ def page(
         without=WITHOUT,
         spoken=SPOKEN,
         tally=tally,
-        with_everything=with_everything,
         departures=tables.not_the_papers_line(numbers["not_the_papers"]) if result.papers else "",
         consistency=tables.by_strategy(numbers["consistency"]),
         config=to_toml(study.config),
@@ -261,31 +252,26 @@ def _side_by_side(figures: list[dict[str, Any]]) -> list[dict[str, Any]]:
     return figures
 
 
-def _distinct(by_rule: Mapping[Any, list[Chart]]) -> list[Chart]:
-    """Return each figure once, under the first rule that has it."""
-    charts: dict[str, Chart] = {}
-    for of_rule in by_rule.values():
-        for chart in of_rule:
-            charts.setdefault(chart.name, chart)
-    return list(charts.values())
-
-
-def _figure(name: str, by_rule: Mapping[Any, list[Chart]]) -> dict[str, Any]:
+def _figure(views: Mapping[Any, Chart], rules: Sequence[str]) -> dict[str, Any]:
     """Return a figure under all exclusion rules; None under rules without it."""
-    named = {rule: chart for rule, some in by_rule.items() for chart in some if chart.name == name}
-    views: dict[str, dict[str, Any] | None] = dict.fromkeys(by_rule)
-    for rule, chart in named.items():
+    by_rule: dict[str, dict[str, Any] | None] = dict.fromkeys(rules)
+    for rule, chart in views.items():
         panels = []
         for panel in chart.panels:
             numbers = readings(panel)
             names = list(dict.fromkeys(name for _, _, texts in numbers for name, _ in texts))
             parts = {"panel": panel, "svg": panel_svg(panel), "readings": numbers, "names": names}
             panels.append(parts)
-        views[rule] = {"chart": chart, "panels": panels, "legend": legend(chart.panels)}
-    first = next(iter(named.values()))
+        by_rule[rule] = {"chart": chart, "panels": panels, "legend": legend(chart.panels)}
+    first = next(iter(views.values()))
     count = len(first.panels)
-    columns = count if count <= 4 else columns_of(count)  # the style sheet has four as two by two
-    return {"name": name, "title": first.title, "by_rule": views, "columns": columns, "place": ""}
+    return {
+        "name": first.name,
+        "title": first.title,
+        "by_rule": by_rule,
+        "columns": count if count <= 4 else columns_of(count),  # the style has four as two by two
+        "place": "",
+    }
 
 
 def _write_figure(chart: Chart, folder: Path) -> None:
@@ -297,18 +283,15 @@ def _write_figure(chart: Chart, folder: Path) -> None:
 
 
 def _csv_texts(
-    result: Answered, by_rule: dict[Rule, list[Chart]], models: list[Chart]
+    result: Answered, figures: Mapping[str, Mapping[Rule, Chart]], models: Sequence[Chart]
 ) -> dict[str, str]:
     """Return the numbers of each figure under all exclusion rules, as CSV."""
     texts = {chart.name: csv_text(csv_rows(chart)) for chart in models}
-    for chart in _distinct(by_rule):
+    for name, views in figures.items():
         rows: list[list[str]] = []
-        for rule, of_rule in by_rule.items():
-            for other in of_rule:
-                if other.name == chart.name:
-                    new = csv_rows(other, exclusion=rule)
-                    rows += new[1:] if rows else new
-        texts[chart.name] = csv_text(rows)
+        for rule, chart in views.items():
+            rows += csv_rows(chart, exclusion=rule)[bool(rows) :]
+        texts[name] = csv_text(rows)
     if not result.papers:
         return texts
     table = []
@@ -331,20 +314,23 @@ def _p(p: float, sentence: bool = False) -> str:
     return ("= " if sentence else "") + (f"{p:.2g}" if p < 0.1 else f"{p:.2f}")
 
 
-def _shown(finding: Finding, unit: str) -> dict[str, str]:
-    """Format a finding in its unit, angles in degrees."""
+def _shown(finding: Mapping[str, Any], unit: str) -> dict[str, str]:
+    """Format a finding of a claim in its unit, angles in degrees."""
     factor, sign = UNITS[unit]
     end = f" {sign}" if sign not in ("", "°") else sign
-    edges = {finding.margin, -finding.margin} if finding.relation == "within" else {finding.margin}
-    low, high = finding.interval
-    words = (
-        ("above " if low in edges else "") + three_digits(factor * low),
-        ("below " if high in edges else "") + three_digits(factor * high),
-    )
-    margin = three_digits(factor * finding.margin) + (end if finding.margin else "")
+    within, edge = finding["relation"] == "within", finding["margin"]
+    edges = {edge, -edge} if within else {edge}
+    words = [
+        f"{word} " * (bound in edges) + three_digits(far if bound is None else factor * bound)
+        for word, bound, far in zip(
+            ("above", "below"), finding["interval"], (-inf, inf), strict=True
+        )
+    ]
+    mean = nan if finding["mean"] is None else finding["mean"]
+    margin = three_digits(factor * edge) + (end if edge else "")
     return {
-        "mean": three_digits(factor * finding.mean) + end if finding.n else "none",
+        "mean": three_digits(factor * mean) + end if finding["n"] else "none",
         "interval": " to ".join(words),
-        "margin": f"± {margin}" if finding.relation == "within" else margin,
-        "sigmas": three_digits(finding.mean / finding.sigma) if finding.sigma > 0.0 else "",
+        "margin": f"± {margin}" if within else margin,
+        "sigmas": three_digits(mean / finding["sigma"]) if finding["sigma"] else "",
     }

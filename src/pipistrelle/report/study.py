@@ -101,22 +101,6 @@ class Trials:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Failure:
-    """A trial that raised an error."""
-
-    iteration: int
-    """Number of the world."""
-    strategy: str
-    filter: str
-    beamwidth_deg: float | None
-    """None for passive sensing."""
-    settings: dict[str, str]
-    """Values of the variables as words, without the beamwidth."""
-    error: str
-    """The traceback."""
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
 class Study:
     """The finished part of a study: n worlds, c combinations of its variables."""
 
@@ -141,7 +125,8 @@ class Study:
     """First world of the first combination; None if it cannot be drawn again."""
     trials: dict[Way, Trials]
     """By filter and strategy."""
-    errors: tuple[Failure, ...]
+    errors: tuple[Mapping[str, Any], ...]
+    """The failed trials of ``summary.json``: world, case and traceback."""
     cpu_s: float
     """[s] Processor time of all filters."""
 
@@ -267,13 +252,7 @@ def samples(
 def rmse_of(
     off: Float[np.ndarray, "*n l"], shared: Bool[np.ndarray, "*n l"]
 ) -> Float[np.ndarray, "*n"]:
-    """Return the root mean square distance [m] over the landmarks of a mask; NaN without any.
-
-    Examples
-    --------
-    >>> rmse_of(np.array([[3.0, 4.0, 9.0]]), np.array([[True, True, False]])).round(3)
-    array([3.536])
-    """
+    """Return the root mean square distance [m] over the landmarks of a mask; NaN without any."""
     count = np.sum(shared, axis=-1)
     square = np.sum(np.where(shared, np.asarray(off, dtype=np.float64) ** 2, 0.0), axis=-1)
     mean = np.divide(square, count, out=np.full(count.shape, np.nan), where=count > 0)
@@ -281,13 +260,7 @@ def rmse_of(
 
 
 def mean_std(sample: Float[np.ndarray, " m"]) -> tuple[float, float]:
-    """Return the mean and standard deviation of a sample: NaN of no world, 0 spread of one.
-
-    Examples
-    --------
-    >>> mean_std(np.array([1.0, 3.0, 5.0])), mean_std(np.array([7.0]))
-    ((3.0, 2.0), (7.0, 0.0))
-    """
+    """Return the mean and standard deviation of a sample: NaN of no world, 0 spread of one."""
     if len(sample) == 0:
         return np.nan, np.nan
     return float(np.mean(sample)), float(np.std(sample, ddof=1)) if len(sample) > 1 else 0.0
@@ -457,22 +430,18 @@ def _drawings(plan: Plan, configs: Sequence[Config], world: int) -> Int[np.ndarr
 
 def _failures(
     plan: Plan, trials: "pl.DataFrame", variables: Sequence[Variable]
-) -> tuple[Failure, ...]:
-    """List the failed trials with their errors and settings."""
+) -> tuple[dict[str, Any], ...]:
+    """List the failed trials with the words of all variables except the beamwidth."""
     import polars as pl
 
     values = {case.number: case.values for case in cases_of(plan)}
     others = [variable for variable in variables if variable.name != BEAM]
     broken = trials.filter(pl.col("status") != "done").sort("iteration", "case")
+    keys = ("iteration", "strategy", "filter", "beamwidth_deg")
     return tuple(
-        Failure(
-            iteration=row["iteration"],
-            strategy=row["strategy"],
-            filter=row["filter"],
-            beamwidth_deg=row["beamwidth_deg"],
-            settings={v.name: word_of(v, values[row["case"]][v.setting]) for v in others},
-            error=row["error"] or "",
-        )
+        {key: row[key] for key in keys}
+        | {"settings": {v.name: word_of(v, values[row["case"]][v.setting]) for v in others}}
+        | {"error": row["error"] or ""}
         for row in broken.iter_rows(named=True)
     )
 
@@ -486,10 +455,25 @@ def _trials(
     landmarks: "pl.DataFrame",
 ) -> dict[Way, Trials]:
     """Return the trials of each filter and strategy, cases in the order of the combinations."""
-    count = len(cases_of(plan))
-    scores = _scores(trials, worlds, count)
-    nees, *ideal = (_over_time(steps, column, worlds, count) for column in STEPS[2:])
-    full, error = _maps(landmarks, worlds, count)
+    shape = len(worlds), len(cases_of(plan))
+    # Labels below 0 are of map entries that a data association took for no true landmark.
+    landmarks = landmarks.filter(landmarks["landmark"] >= 0)
+    failed = ~_array(trials, trials["status"] == "done", worlds, shape, empty=False)
+    diverged = _array(trials, trials["diverged"].fill_null(value=False), worlds, shape, empty=False)
+    scores = {
+        score: _array(trials, trials[score].cast(float).fill_null(np.nan), worlds, shape)
+        if score not in LATER or score in trials.columns
+        else np.full(shape, np.nan)
+        for score in READ
+    }
+    nees, *ideal = (
+        _array(steps, steps[column], worlds, shape, at=steps["frame"].to_numpy().astype(int) - 1)
+        for column in STEPS[2:]
+    )
+    label = landmarks["landmark"].to_numpy()
+    full = _array(landmarks, landmarks["full"], worlds, shape, at=label, empty=False)
+    none = np.float32(0.0)
+    error = _array(landmarks, landmarks["error_m"], worlds, shape, at=label, empty=none)
     shared = _common(numbers, full, error)
     by_way = {}
     for way, cases in numbers.items():
@@ -497,9 +481,9 @@ def _trials(
         c = cases[first]
         by_way[way] = Trials(
             at=np.argmax(cases[:, None] == c, axis=1),
-            failed=scores["failed"][:, c],
-            diverged=scores["diverged"][:, c],
-            scores={score: scores[score][:, c] for score in READ} | {COMMON: shared[way]},
+            failed=failed[:, c],
+            diverged=diverged[:, c],
+            scores={score: table[:, c] for score, table in scores.items()} | {COMMON: shared[way]},
             placed=full[:, c],
             off=error[:, c],
             nees=nees[:, c],
@@ -508,40 +492,26 @@ def _trials(
     return by_way
 
 
-def _scores(
-    trials: "pl.DataFrame", worlds: Int[np.ndarray, " n"], count: int
-) -> dict[str, np.ndarray]:
-    """Return each score by world and case; missing trials count as failed."""
-    import polars as pl
+def _array(
+    table: "pl.DataFrame",
+    values: "pl.Series",
+    worlds: Int[np.ndarray, " n"],
+    shape: tuple[int, ...],
+    *,
+    at: Int[np.ndarray, " r"] | None = None,
+    empty: Any = np.nan,
+) -> np.ndarray:
+    """Return values of the rows of a table by world and case, and by a third index if given.
 
-    shape, at = (len(worlds), count), _indices(trials, worlds)
-    scores: dict[str, np.ndarray] = {
-        "failed": np.ones(shape, bool),
-        "diverged": np.zeros(shape, bool),
-    }
-    scores["failed"][at] = (trials["status"] != "done").to_numpy()
-    scores["diverged"][at] = trials["diverged"].fill_null(value=False).to_numpy()
-    for score in READ:
-        scores[score] = np.full(shape, np.nan)
-        if score not in LATER or score in trials.columns:
-            scores[score][at] = trials[score].cast(pl.Float64).fill_null(np.nan).to_numpy()
-    return scores
-
-
-def _indices(table: "pl.DataFrame", worlds: Int[np.ndarray, " n"]) -> tuple[np.ndarray, np.ndarray]:
-    """Return the row of the world and the number of the case of each row of a table."""
-    case = table["case"].to_numpy().astype(np.intp)
-    return np.searchsorted(worlds, table["iteration"].to_numpy()), case
-
-
-def _over_time(
-    steps: "pl.DataFrame", column: str, worlds: Int[np.ndarray, " n"], count: int
-) -> Float[np.ndarray, "n a k"]:
-    """Return a column by world, case and frame; NaN for missing frames."""
-    curves = np.full((len(worlds), count, max(steps["frame"].to_list(), default=0)), np.nan)
-    frame = steps["frame"].to_numpy().astype(np.intp) - 1
-    curves[(*_indices(steps, worlds), frame)] = steps[column].to_numpy()
-    return curves
+    `empty`: the value without a row.
+    """
+    index = [np.searchsorted(worlds, table["iteration"].to_numpy()), table["case"].to_numpy()]
+    if at is not None:
+        index.append(at)
+        shape = (*shape, int(np.max(at, initial=-1)) + 1)
+    array = np.full(shape, empty)
+    array[tuple(part.astype(np.intp) for part in index)] = values.to_numpy()
+    return array
 
 
 def _means(*columns: Float[np.ndarray, "n b k"]) -> Float[np.ndarray, "i b k"]:
@@ -549,18 +519,6 @@ def _means(*columns: Float[np.ndarray, "n b k"]) -> Float[np.ndarray, "i b k"]:
     counts = [np.sum(np.isfinite(column), axis=0) for column in columns]
     with np.errstate(invalid="ignore"):
         return np.array([np.nansum(c, axis=0) / n for c, n in zip(columns, counts, strict=True)])
-
-
-def _maps(
-    landmarks: "pl.DataFrame", worlds: Int[np.ndarray, " n"], count: int
-) -> tuple[Bool[np.ndarray, "n a l"], Float[np.ndarray, "n a l"]]:
-    """Return which landmarks are fully initialised, and their errors [m]."""
-    shape = (len(worlds), count, max(landmarks["landmark"].to_list(), default=0) + 1)
-    full, error = np.zeros(shape, dtype=bool), np.zeros(shape, dtype=np.float32)
-    label = landmarks["landmark"].to_numpy().astype(np.intp)
-    at = (*_indices(landmarks, worlds), label)
-    full[at], error[at] = landmarks["full"].to_numpy(), landmarks["error_m"].to_numpy()
-    return full, error
 
 
 def _common(

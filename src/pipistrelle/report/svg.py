@@ -7,7 +7,7 @@ keys, and the browser by itself without scripts. The style sheet gives the colou
 import math
 from collections.abc import Sequence
 from itertools import pairwise
-from typing import NamedTuple
+from xml.etree.ElementTree import Element, SubElement, tostring
 
 import numpy as np
 from jaxtyping import Float
@@ -32,43 +32,42 @@ def panel_svg(panel: Panel) -> Markup:
     Examples
     --------
     >>> axis = Axis(label="", limits=(0.0, 1.0), ticks=())
-    >>> str(panel_svg(Panel(title="<EKF>", x=axis, y=axis, series=())))[:77]
-    '<svg class="panel" viewBox="0 0 400 280" role="img" tabindex="0" aria-label="'
-    >>> "<EKF>" in panel_svg(Panel(title="<EKF>", x=axis, y=axis, series=()))
-    False
+    >>> str(panel_svg(Panel(title="<EKF>", x=axis, y=axis, series=())))[25:61]
+    'viewBox="0 0 400 280" role="img" tab'
     """
-    frame = _frame(panel)
-    parts = [*_grid(panel, frame)]
+    _, _, top, bottom = _box(panel)
+    svg = Element("svg", {"class": "panel", "role": "img", "tabindex": "0"})
+    svg.set("viewBox", f"0 0 {WIDTH:g} {bottom if panel.equal else HEIGHT:g}")
+    svg.set(
+        "aria-label", f"{panel.title or panel.y.label or 'chart'}. Arrow keys read the numbers."
+    )
+    if not panel.equal:
+        _draw_grid(svg, panel)
     for series in panel.series:  # every band under every line
         if MARKS[series.style].spread == "band":
-            parts += _spread(series, frame)
+            _draw_spread(svg, series, panel)
     for series in panel.series:
-        parts += _series(series, frame)
-    if not panel.equal:
-        parts += [
-            _tip("rect", text, f'x="{x0:.1f}" y="{TOP:g}" width="{x1 - x0:.1f}" '
-                 f'height="{frame.bottom - TOP:.1f}"')
-            for text, x0, x1 in _columns(panel, frame)
-        ]  # fmt: skip
-    return Markup(
-        '<svg class="panel" viewBox="0 0 {} {}" role="img" tabindex="0" '
-        'aria-label="{}. Arrow keys read the numbers.">{}</svg>'
-    ).format(f"{WIDTH:g}", f"{frame.height:g}", panel.title or panel.y.label or "chart",
-             Markup("").join(parts))  # fmt: skip
+        _draw_series(svg, series, panel)
+    for text, left, right in [] if panel.equal else _columns(panel):
+        place = {"x": f"{left:.1f}", "width": f"{right - left:.1f}"}
+        place |= {"y": f"{top:g}", "height": f"{bottom - top:.1f}"}
+        _add(svg, "rect", "tip column", title=text, **place)
+    return Markup(tostring(svg, encoding="unicode"))
+
+
+def _add(
+    svg: Element, name: str, kind: str = "", text: str = "", title: str = "", **attributes: str
+) -> None:
+    """Append an element, with a title that can be read if it has one."""
+    given = {key.replace("_", "-"): value for key, value in attributes.items()}
+    element = SubElement(svg, name, ({"class": kind} if kind else {}) | given)
+    element.text = text
+    if title:
+        SubElement(element, "title").text = title
 
 
 def readings(panel: Panel) -> list[tuple[float, str, list[tuple[str, str]]]]:
-    """Return the numbers of a panel at each position: position, its name, series and texts.
-
-    Examples
-    --------
-    >>> axis = Axis(label="", limits=(0.0, 90.0), ticks=((33.0, "33"),))
-    >>> one, tenth = np.ones(1), np.full(1, 0.1)
-    >>> about = {"low": one - tenth, "high": one + tenth}
-    >>> dot = Series(name="fused", role="fused", x=33 * one, y=one, **about)
-    >>> readings(Panel(title="", x=axis, y=axis, series=(dot,)))
-    [(33.0, '33', [('fused', '1 ± 0.1')])]
-    """
+    """Return the numbers of a panel at each position: position, its name, series and texts."""
     named = [s for s in panel.series if s.listed and explained(s) and len(s.x)]
     if not named or panel.equal:
         return []
@@ -105,34 +104,23 @@ def _texts_at(named: Sequence[Series], axis: Axis, place: float) -> list[tuple[s
     return texts
 
 
-class _Frame(NamedTuple):
-    """A panel and the position of its axes in the drawing."""
-
-    panel: Panel
-    left: float
-    right: float
-    top: float
-    bottom: float
-    height: float
-
-
-def _frame(panel: Panel) -> _Frame:
-    """Return the frame of a panel; equal axes have no margins."""
+def _box(panel: Panel) -> tuple[float, float, float, float]:
+    """Return the left, right, upper and lower edges; equal axes have no margins."""
     if not panel.equal:
-        bottom = HEIGHT - BOTTOM - (SLANT if panel.x.slanted else 0.0)
-        return _Frame(panel, LEFT, WIDTH - RIGHT, TOP, bottom, HEIGHT)
+        return LEFT, WIDTH - RIGHT, TOP, HEIGHT - BOTTOM - SLANT * panel.x.slanted
     (left, right), (low, high) = panel.x.limits, panel.y.limits
-    height = WIDTH * (high - low) / (right - left)
-    return _Frame(panel, 0.0, WIDTH, 0.0, height, height)
+    return 0.0, WIDTH, 0.0, WIDTH * (high - low) / (right - left)
 
 
-def _across(frame: _Frame, values: Float[np.ndarray, "*n"] | float) -> Float[np.ndarray, "*n"]:
-    return np.asarray(frame.left + _share(frame.panel.x, values) * (frame.right - frame.left))
+def _across(panel: Panel, values: Float[np.ndarray, "*n"] | float) -> Float[np.ndarray, "*n"]:
+    left, right, _, _ = _box(panel)
+    return np.asarray(left + _share(panel.x, values) * (right - left))
 
 
-def _down(frame: _Frame, values: Float[np.ndarray, "*n"] | float) -> Float[np.ndarray, "*n"]:
-    share = np.clip(_share(frame.panel.y, values), 0.0, 1.0)
-    return np.asarray(frame.bottom - share * (frame.bottom - frame.top))
+def _down(panel: Panel, values: Float[np.ndarray, "*n"] | float) -> Float[np.ndarray, "*n"]:
+    _, _, top, bottom = _box(panel)
+    share = np.clip(_share(panel.y, values), 0.0, 1.0)
+    return np.asarray(bottom - share * (bottom - top))
 
 
 def _share(axis: Axis, values: Float[np.ndarray, "*n"] | float) -> Float[np.ndarray, "*n"]:
@@ -145,142 +133,116 @@ def _share(axis: Axis, values: Float[np.ndarray, "*n"] | float) -> Float[np.ndar
     return np.asarray((numbers - low) / (high - low))
 
 
-def _grid(panel: Panel, frame: _Frame) -> list[Markup]:
+def _draw_grid(svg: Element, panel: Panel) -> None:
     """Draw the background: span, grid, ticks, labels, rules and posts."""
-    if panel.equal:
-        return []
-    right, bottom, parts = WIDTH - RIGHT, frame.bottom, []
+    left, right, top, bottom = _box(panel)
     if panel.span:
         low, high, name = panel.span
-        top = float(_down(frame, high))
-        shape = 'class="span" x="{}" y="{:.1f}" width="{:.1f}" height="{:.1f}"'
-        shape = shape.format(LEFT, top, right - LEFT, float(_down(frame, low)) - top)
-        parts.append(Markup("<rect {}><title>{}</title></rect>").format(Markup(shape), name))
+        upper, lower = float(_down(panel, high)), float(_down(panel, low))
+        size = {"width": f"{right - left:.1f}", "height": f"{lower - upper:.1f}"}
+        _add(svg, "rect", "span", title=name, x=f"{left}", y=f"{upper:.1f}", **size)
     for value, text in panel.y.ticks:
-        y = float(_down(frame, value))
-        parts.append(Markup(f'<path class="grid" d="M{LEFT:g} {y:.1f}H{right:g}"/>'))
-        parts.append(_text(text, LEFT - 6, y + 4, "end"))
+        y = float(_down(panel, value))
+        _add(svg, "path", "grid", d=f"M{left:g} {y:.1f}H{right:g}")
+        _write(svg, text, left - 6, y + 4, "end")
     for value, text in panel.x.ticks:
-        x = float(_across(frame, value))
-        parts.append(Markup(f'<path class="grid" d="M{x:.1f} {TOP:g}V{bottom:g}"/>'))
+        x = float(_across(panel, value))
+        _add(svg, "path", "grid", d=f"M{x:.1f} {top:g}V{bottom:g}")
         if panel.x.slanted:
-            place = f"translate({x + 4.0:.1f} {bottom + 14.0:.1f}) rotate(-35)"
-            words = Markup('<text text-anchor="end" transform="{}">{}</text>')
-            parts.append(words.format(place, text))
+            turn = f"translate({x + 4.0:.1f} {bottom + 14.0:.1f}) rotate(-35)"
+            _add(svg, "text", text=text, text_anchor="end", transform=turn)
         else:
-            parts.append(_text(text, x, bottom + 16, "middle"))
+            _write(svg, text, x, bottom + 16, "middle")
     for value in panel.rules:
-        y = float(_down(frame, value))
-        parts.append(Markup(f'<path class="rule" d="M{LEFT:g} {y:.1f}H{right:g}"/>'))
+        _add(svg, "path", "rule", d=f"M{left:g} {float(_down(panel, value)):.1f}H{right:g}")
     for value in panel.posts:
-        x = float(_across(frame, value))
-        parts.append(Markup(f'<path class="post" d="M{x:.1f} {TOP:g}V{bottom:g}"/>'))
-    parts.append(_text(panel.x.label, (LEFT + right) / 2.0, HEIGHT - 6, "middle"))
-    middle = (TOP + bottom) / 2.0
-    parts.append(
-        Markup('<text class="label" text-anchor="middle" transform="translate(12 {:.1f}) '
-               'rotate(-90)">{}</text>').format(middle, panel.y.label)
-    )  # fmt: skip
-    return parts
+        _add(svg, "path", "post", d=f"M{float(_across(panel, value)):.1f} {top:g}V{bottom:g}")
+    _write(svg, panel.x.label, (left + right) / 2.0, HEIGHT - 6, "middle")
+    turn = f"translate(12 {(top + bottom) / 2.0:.1f}) rotate(-90)"
+    _add(svg, "text", "label", text=panel.y.label, text_anchor="middle", transform=turn)
 
 
-def _series(series: Series, frame: _Frame) -> list[Markup]:
+def _write(svg: Element, text: str, x: float, y: float, anchor: str) -> None:
+    """Write a text at a position."""
+    _add(svg, "text", text=text, x=f"{x:.1f}", y=f"{y:.1f}", text_anchor=anchor)
+
+
+def _draw_series(svg: Element, series: Series, panel: Panel) -> None:
     """Draw a series by its mark, without its band."""
     mark = MARKS[series.style]
-    x, y = _across(frame, series.x), _down(frame, series.y)
+    x, y = _across(panel, series.x), _down(panel, series.y)
     known = np.flatnonzero(np.isfinite(x) & np.isfinite(y)).tolist()
+    points = list(zip(x.tolist(), y.tolist(), strict=True))
     if mark.written:
-        return [_text(series.tips[i], x[i], y[i] + 4.0, "middle") for i in known]
-    if mark.pinned and not series.tips:
-        return _pinned(series, x, y, frame.panel.y.limits[1])
-    parts = _spread(series, frame) if mark.spread == "bars" else []
+        for i in known:
+            _write(svg, series.tips[i], x[i], y[i] + 4.0, "middle")
+        return
+    if mark.pinned and not series.tips:  # single worlds, or triangles if beyond the panel
+        beyond = series.y > panel.y.limits[1]
+        dots = "".join(f"M{points[i][0]:.1f} {points[i][1]:.1f}h0" for i in np.flatnonzero(~beyond))
+        tops = "".join(
+            f"M{points[i][0]:.1f} {points[i][1] + 1.0:.1f}l2.6 5h-5.2z"
+            for i in np.flatnonzero(beyond)
+        )
+        _stroke(svg, "marks", series, dots)
+        _stroke(svg, "tops", series, tops)
+        return
+    if mark.spread == "bars":
+        _draw_spread(svg, series, panel)
     if mark.joined:
-        parts.append(_stroke("line dashed" if series.dashed else "line", series, _path(x, y)))
-    if mark.symbol:
-        parts += [_point(series, i, float(x[i]), float(y[i])) for i in known]
-    return parts
+        gaps = np.diff(known, prepend=-2) > 1  # where a number is not finite
+        line = (
+            f"{'LM'[int(gap)]}{x[i]:.1f} {y[i]:.1f}" for gap, i in zip(gaps, known, strict=True)
+        )
+        _stroke(svg, "line" + " dashed" * series.dashed, series, "".join(line))
+    for i in known if mark.symbol else ():
+        filled = series.filled is None or bool(series.filled[i])
+        kind = f"dot c-{series.role}" + " hollow" * (not filled)
+        look = {"kind": f"tip {kind}" if series.tips else kind}
+        look |= {"title": series.tips[i]} if series.tips else {}
+        if mark.corners:
+            corners = (f"{x[i] + right:.1f} {y[i] + down:.1f}" for right, down in mark.corners)
+            _add(svg, "path", **look, d=f"M{'L'.join(corners)}z")
+        else:
+            _add(svg, "circle", **look, cx=f"{x[i]:.1f}", cy=f"{y[i]:.1f}", r=f"{mark.radius:g}")
 
 
-def _stroke(kind: str, series: Series, d: str) -> Markup:
-    """Draw a path in a series' colour."""
-    faint = f' style="opacity:{series.strength:.2f}"' if series.strength < 1.0 else ""
-    return Markup('<path class="{} c-{}"{} d="{}"/>').format(kind, series.role, Markup(faint), d)
+def _stroke(svg: Element, kind: str, series: Series, d: str) -> None:
+    """Draw a path in a series' colour, unless it is empty."""
+    faint = {"style": f"opacity:{series.strength:.2f}"} if series.strength < 1.0 else {}
+    if d:
+        _add(svg, "path", f"{kind} c-{series.role}", **faint, d=d)
 
 
-def _pinned(series: Series, x: np.ndarray, y: np.ndarray, top: float) -> list[Markup]:
-    """Draw single worlds as dots, or as triangles at the top if beyond the panel."""
-    above = series.y > top
-    points = list(zip(x.tolist(), y.tolist(), above.tolist(), strict=True))
-    dots = "".join(f"M{a:.1f} {b:.1f}h0" for a, b, over in points if not over)
-    tops = "".join(f"M{a:.1f} {b + 1.0:.1f}l2.6 5h-5.2z" for a, b, over in points if over)
-    return [_stroke(kind, series, d) for kind, d in (("marks", dots), ("tops", tops)) if d]
-
-
-def _spread(series: Series, frame: _Frame) -> list[Markup]:
+def _draw_spread(svg: Element, series: Series, panel: Panel) -> None:
     """Draw the band of a line or the bars of points, if any."""
     if series.low is None or series.high is None:
-        return []
-    x = _across(frame, series.x)
-    low, high = _down(frame, series.low), _down(frame, series.high)
+        return
+    x = _across(panel, series.x)
+    low, high = _down(panel, series.low), _down(panel, series.high)
     both = np.isfinite(low) & np.isfinite(high)
     ends = list(zip(x[both].tolist(), low[both].tolist(), high[both].tolist(), strict=True))
-    if MARKS[series.style].spread == "bars":
-        kind, d = "bars", "".join(f"M{a:.1f} {b:.1f}V{c:.1f}" for a, b, c in ends)
+    kind = MARKS[series.style].spread
+    if kind == "bars":
+        d = "".join(f"M{a:.1f} {b:.1f}V{c:.1f}" for a, b, c in ends)
     else:
         edge = [f"{a:.1f} {c:.1f}" for a, _, c in ends]
         edge += [f"{a:.1f} {b:.1f}" for a, b, _ in reversed(ends)]
-        kind, d = "band", "M" + "L".join(edge) + "z" if edge else ""
-    return [Markup('<path class="{} c-{}" d="{}"/>').format(kind, series.role, d)]
+        d = f"M{'L'.join(edge)}z" if edge else ""
+    if d:
+        _add(svg, "path", f"{kind} c-{series.role}", d=d)
 
 
-def _path(x: np.ndarray, y: np.ndarray) -> str:
-    """Return the path data of a line with gaps at points that are not finite."""
-    text, pen = [], "M"
-    for a, b in zip(x.tolist(), y.tolist(), strict=True):
-        if math.isfinite(a) and math.isfinite(b):
-            text.append(f"{pen}{a:.1f} {b:.1f}")
-            pen = "L"
-        else:
-            pen = "M"
-    return "".join(text)
-
-
-def _point(series: Series, i: int, x: float, y: float) -> Markup:
-    """Draw a symbol, as a tip if the series has texts."""
-    mark = MARKS[series.style]
-    filled = series.filled is None or bool(series.filled[i])
-    kind = f"dot c-{series.role}{'' if filled else ' hollow'}"
-    name, shape = "circle", f'cx="{x:.1f}" cy="{y:.1f}" r="{mark.radius:g}"'
-    if mark.corners:
-        corners = "L".join(f"{x + right:.1f} {y + down:.1f}" for right, down in mark.corners)
-        name, shape = "path", f'd="M{corners}z"'
-    if series.tips:
-        return _tip(name, series.tips[i], shape, kind)
-    return Markup('<{} class="{}" {}/>').format(name, kind, Markup(shape))
-
-
-def _tip(name: str, text: str, shape: str, kind: str = "column") -> Markup:
-    """Return an element with a title that can be read."""
-    return Markup('<{} class="tip {}" {}><title>{}</title></{}>').format(
-        name, kind, Markup(shape), text, name
-    )
-
-
-def _text(text: str, x: float, y: float, anchor: str) -> Markup:
-    return Markup('<text x="{:.1f}" y="{:.1f}" text-anchor="{}">{}</text>').format(
-        x, y, anchor, text
-    )
-
-
-def _columns(panel: Panel, frame: _Frame) -> list[tuple[str, float, float]]:
+def _columns(panel: Panel) -> list[tuple[str, float, float]]:
     """Return text and edges of the columns around the readable positions of a panel."""
     read = readings(panel)
     if not read:
         return []
     unit = "°" if "[°]" in panel.x.label else (" s" if "[s]" in panel.x.label else "")
     unit = "" if panel.x.named else unit
-    at = [float(_across(frame, place)) for place, _, _ in read]
-    edges = [LEFT, *((a + b) / 2.0 for a, b in pairwise(at)), WIDTH - RIGHT]
+    left, right, _, _ = _box(panel)
+    at = [float(_across(panel, place)) for place, _, _ in read]
+    edges = [left, *((a + b) / 2.0 for a, b in pairwise(at)), right]
     texts = [
         "\n".join([f"{name}{unit}", *(f"{series}: {number}" for series, number in rows)])
         for _, name, rows in read

@@ -7,26 +7,11 @@ import numpy as np
 
 from pipistrelle.config import Config
 from pipistrelle.estimation.catalogue import CATALOGUE
-from pipistrelle.evaluation.comparison import Finding
 from pipistrelle.evaluation.consistency import anees, anees_bounds_about
 from pipistrelle.evaluation.scores import shown_in
 from pipistrelle.experiments.studies.plan import RADIUS, find_plan, read_plan
-from pipistrelle.report.claims import (
-    EXCLUDED,
-    TABLE_II,
-    WORLDS,
-    anees_departure,
-    cell_of,
-    row_name,
-)
-from pipistrelle.report.effects import (
-    STRATEGY,
-    Effect,
-    Pairing,
-    direction,
-    measures_of,
-    variable_of,
-)
+from pipistrelle.report import claims as paper
+from pipistrelle.report import effects as changes
 from pipistrelle.report.study import (
     POSITION,
     Selection,
@@ -41,6 +26,7 @@ from pipistrelle.report.study import (
     times_the_bound,
 )
 from pipistrelle.report.variables import (
+    Variable,
     amount,
     interval,
     setting_variable,
@@ -56,7 +42,7 @@ MAX_COMBINATIONS = 6
 
 
 def effect_tables(
-    selection: Selection, effects: Sequence[Effect], otherwise: Sequence[Effect]
+    selection: Selection, effects: Sequence[changes.Effect], otherwise: Sequence[changes.Effect]
 ) -> list[dict[str, Any]]:
     """Return a table of effects for each variable, then for strategies and filters.
 
@@ -65,32 +51,28 @@ def effect_tables(
     `end` is false between a number's ends. A `below` row gives the effect at one combination or
     without diverged cases; it is `contrary` if the position RMSE changes in another direction.
     """
-    study, measures = selection.study, measures_of(selection.study)
+    study, measures = selection.study, changes.measures_of(selection.study)
+    variables = {variable.name: variable for variable in study.variables}
     tables: dict[str, dict[str, Any]] = {}
-    rows: dict[Pairing, list[tuple[Effect, Effect]]] = {}
+    rows: dict[changes.Pairing, list[tuple[changes.Effect, changes.Effect]]] = {}
     for pair in zip(effects, otherwise, strict=True):
         rows.setdefault(pair[0].pairing, []).append(pair)
     for pairing, pairs in rows.items():
+        variable = variables.get(pairing.factor)
+        own = [effect for effect, _ in pairs]
         if pairing.factor not in tables:
-            tables[pairing.factor] = _heading(study, pairs[0][0]) | {
-                "measures": [measure.title for measure in measures],
-                "rows": [],
-            }
-        found = [effect for effect, _ in pairs]
-        cells = [
-            (
-                _label(study, found[0]),
-                {e.measure.score: _cell(e, e.finding, e.untouched) for e in found},
-                False,
-            )
-        ]
-        cells += _apart(found)
-        changed = {
-            less.measure.score: _cell(less, less.finding, less.untouched)
+            heading = _heading(pairing, variable) | {"measures": [m.title for m in measures]}
+            tables[pairing.factor] = heading | {"rows": []}
+        cells = [(_label(study, own[0], variable), _cells(own), False), *_apart(own)]
+        changed = [
+            less
             for effect, less in pairs
-            if not effect.untouched and direction(less.finding) != direction(effect.finding)
-        }
-        cells += [("without diverged cases", changed, POSITION in changed)] if changed else []
+            if not effect.untouched
+            and changes.direction(less.finding) != changes.direction(effect.finding)
+        ]
+        if changed:
+            first = any(less.measure.score == POSITION for less in changed)
+            cells.append(("without diverged cases", _cells(changed), first))
         tables[pairing.factor]["rows"] += [
             {
                 "label": name,
@@ -108,11 +90,10 @@ def effect_tables(
     return list(tables.values())
 
 
-def _heading(study: Study, effect: Effect) -> dict[str, Any]:
-    """Return name, title and meaning of the table of an effect."""
-    pairing, variable = effect.pairing, variable_of(study, effect)
+def _heading(pairing: changes.Pairing, variable: Variable | None) -> dict[str, Any]:
+    """Return name, title and meaning of the table of a pairing."""
     if variable is None:
-        title = "Strategies" if pairing.factor == STRATEGY else "Filters"
+        title = "Strategies" if pairing.factor == changes.STRATEGY else "Filters"
         return {"name": pairing.factor, "title": title, "meaning": "", "varied": False}
     ends = f", {pairing.after} instead of {pairing.before}" * (len(variable.words) == 2)
     if variable.numbers is not None:
@@ -128,24 +109,21 @@ def _heading(study: Study, effect: Effect) -> dict[str, Any]:
     }
 
 
-def _label(study: Study, effect: Effect) -> str:
+def _label(study: Study, effect: changes.Effect, variable: Variable | None) -> str:
     """Return the name of an effect's row."""
-    pairing, variable = effect.pairing, variable_of(study, effect)
-    titles = filter_titles(study)
+    pairing, titles = effect.pairing, filter_titles(study)
+    change = f"{pairing.after} instead of {pairing.before}"
     if variable is None:
-        whose = titles.get(pairing.filter, f"{pairing.strategy} sensing")
-        return f"{whose}: {pairing.after} instead of {pairing.before}"
+        return f"{titles.get(pairing.filter, f'{pairing.strategy} sensing')}: {change}"
     whose = f"{pairing.strategy} {titles[pairing.filter]}"
     if effect.measure.over:
         whose = f"gain of {whose} over {effect.measure.over}"
     if variable.numbers is not None and not two_sided(variable):
         return whose if pairing.end else f"{whose}, to {pairing.after}"
-    if len(variable.words) == 2:
-        return whose
-    return f"{whose}: {pairing.after} instead of {pairing.before}"
+    return whose if len(variable.words) == 2 else f"{whose}: {change}"
 
 
-def _apart(effects: Sequence[Effect]) -> list[tuple[str, dict[str, Any], bool]]:
+def _apart(effects: Sequence[changes.Effect]) -> list[tuple[str, dict[str, Any], bool]]:
     """Return rows of single combinations: all if few, otherwise opposite effects.
 
     `effects`: of one pairing in every measure. Returns: label, cells by score, and whether the
@@ -154,32 +132,40 @@ def _apart(effects: Sequence[Effect]) -> list[tuple[str, dict[str, Any], bool]]:
     rows = []
     for i, name in enumerate(effects[0].pairing.names if effects[0].apart else ()):
         opposite = any(
-            direction(e.apart[i]) and direction(e.apart[i]) != direction(e.finding)
+            changes.direction(e.apart[i]) not in (0, changes.direction(e.finding))
             for e in effects
             if e.measure.score == POSITION
         )
         if len(effects[0].apart) <= MAX_COMBINATIONS or opposite:
-            cells = {e.measure.score: _cell(e, e.apart[i]) for e in effects}
-            rows.append((f"at {name}", cells, opposite))
+            rows.append((f"at {name}", _cells(effects, i), opposite))
     return rows
 
 
-def _cell(effect: Effect, finding: Finding, untouched: bool = False) -> dict[str, Any]:
-    """Return the text and interval of a finding on an effect."""
-    measure = effect.measure
-    cell = {"shown": direction(finding) != 0, "n": finding.n, "interval": ""}
-    if untouched:
-        return cell | {"text": "same"}
-    if finding.n < 2:
-        return cell | {"text": "?"}
-    low, high = finding.family
-    if measure.ratio:
-        mean, low, high = np.exp(np.clip([finding.mean, low, high], -700.0, 700.0)).tolist()
-        text, ends = f"× {three_digits(mean)}", interval((low, high), "")
-    else:
+def _cells(effects: Sequence[changes.Effect], at: int | None = None) -> dict[str, dict[str, Any]]:
+    """Return text and interval of effects by score, on average or at one combination."""
+    cells = {}
+    for effect in effects:
+        measure, finding = effect.measure, effect.finding if at is None else effect.apart[at]
+        low, high = finding.family
         text = "+" * (finding.mean > 0.0) + amount(finding.mean, measure.unit)
         ends = interval((low, high), measure.unit)
-    return cell | {"text": text, "interval": ends if finding.std > 0.0 else "in every world"}
+        if measure.ratio:
+            mean, low, high = np.exp(np.clip([finding.mean, low, high], -700.0, 700.0)).tolist()
+            text, ends = f"× {three_digits(mean)}", interval((low, high), "")
+        if not finding.std > 0.0:
+            ends = "in every world"
+        if effect.untouched and at is None:
+            text, ends = "same", ""
+        elif finding.n < 2:
+            text, ends = "?", ""
+        cell = {
+            "shown": changes.direction(finding) != 0,
+            "n": finding.n,
+            "interval": ends,
+            "text": text,
+        }
+        cells[measure.score] = cell
+    return cells
 
 
 def case_rows(selection: Selection) -> list[dict[str, Any]]:
@@ -198,7 +184,7 @@ def case_rows(selection: Selection) -> list[dict[str, Any]]:
                 "strategy": way[1],
                 "at": case_name(study, way, i),
             }
-            for measure in measures_of(study):
+            for measure in changes.measures_of(study):
                 (sample,) = samples(selection, measure.score, [cell])
                 row["n"] = row.get("n", len(sample))
                 row[measure.score] = _moments(sample, ratio=measure.ratio)
@@ -236,8 +222,8 @@ def exclusion_rows(study: Study) -> list[dict[str, Any]]:
                 "limit": CATALOGUE[name].nees_limit if name in CATALOGUE else None,
                 "worlds": len(study.worlds),
                 "excluded": int(np.sum(lost_worlds(study, name))),
-                "paper": EXCLUDED.get(name),
-                "paper_worlds": WORLDS,
+                "paper": paper.EXCLUDED.get(name),
+                "paper_worlds": paper.WORLDS,
                 "diverged": {way: int(np.sum(t.diverged & ~t.failed)) for way, t in ways.items()},
                 "trials": {way: int(t.failed.size) for way, t in ways.items()},
                 "failed": int(sum(np.sum(t.failed) for t in ways.values())),
@@ -251,10 +237,10 @@ def not_the_papers(study: Study) -> list[dict[str, Any]]:
 
     Returns: name, value here and value of the paper. Seed and number of worlds are ignored.
     """
-    paper = read_plan(find_plan("paper"))
-    theirs = _asked(paper.config, paper.grid) | {
-        "strategies": sorted(paper.strategies),
-        "filters": sorted(paper.filters),
+    plan = read_plan(find_plan("paper"))
+    theirs = _asked(plan.config, plan.grid) | {
+        "strategies": sorted(plan.strategies),
+        "filters": sorted(plan.filters),
     }
     ours = _asked(study.config, study.grid) | {
         "strategies": sorted({strategy for _, strategy in study.trials}),
@@ -268,13 +254,7 @@ def not_the_papers(study: Study) -> list[dict[str, Any]]:
 
 
 def not_the_papers_line(rows: list[dict[str, Any]]) -> str:
-    """Format the rows of `not_the_papers` in a line; empty without rows.
-
-    Examples
-    --------
-    >>> not_the_papers_line([{"setting": "scenario.steps", "here": 200, "paper": 1500}])
-    "Not the paper's study: scenario.steps 200 (paper 1500)"
-    """
+    """Format the rows of `not_the_papers` in a line; empty without rows."""
     parts = [f"{r['setting']} {_worded(r['here'])} (paper {_worded(r['paper'])})" for r in rows]
     return f"Not the paper's study: {', '.join(parts)}" if parts else ""
 
@@ -311,11 +291,11 @@ def table_ii_rows(selection: Selection) -> list[dict[str, Any]]:
     weight and `full_mean` is the weighted mean over the particles.
     """
     rows = []
-    for printed in TABLE_II:
-        cell = cell_of(selection.study, printed)
+    for printed in paper.TABLE_II:
+        cell = paper.cell_of(selection.study, printed)
         row: dict[str, Any] = {
             "filter": printed.filter,
-            "beamwidth": row_name(printed),
+            "beamwidth": paper.row_name(printed),
             "paper_full": list(printed.full),
             "paper_total": list(printed.total),
         }
@@ -361,7 +341,7 @@ def consistency_rows(selection: Selection) -> list[dict[str, Any]]:
                     "bounds": [float(np.mean(low)), float(np.mean(high))],
                     "inside": float(np.mean((mean >= low) & (mean <= high))),
                     "above": float(np.mean(mean > high)),
-                    "departure": float(anees_departure(mean, expected)),
+                    "departure": float(paper.anees_departure(mean, expected)),
                 }
             )
     return rows

@@ -51,14 +51,7 @@ class Variable:
 
 
 def setting_variable(setting: str, values: Sequence[Any]) -> Variable:
-    """Return the variable of a setting and its values in a plan's grid.
-
-    Examples
-    --------
-    >>> level = setting_variable("beacon.level_db", [48.8, 36.8])
-    >>> level.words, level.label
-    (('36.8', '48.8'), 'beacon.level_db [dB]')
-    """
+    """Return the variable of a setting and its values in a plan's grid."""
     field = known_settings().get(tuple(setting.split(".")))
     meaning = " ".join(((field.description if field else None) or "").split())
     numeric = all(isinstance(one, (int, float)) and not isinstance(one, bool) for one in values)
@@ -80,11 +73,6 @@ def beam_variable(setting: str, radii: Sequence[float], degrees: Sequence[float]
     """Return the variable of the beamwidth, narrowest first.
 
     `setting`: of the radius. `radii` [m]. `degrees` [deg]: the half-power beamwidth of each.
-
-    Examples
-    --------
-    >>> beam_variable("emitter.radius", [0.0025, 0.0088], [180.0, 33.28]).words
-    ('33°', '180°')
     """
     order = np.argsort(degrees)
     widths = tuple(float(degrees[i]) for i in order)
@@ -104,13 +92,7 @@ def beam_variable(setting: str, radii: Sequence[float], degrees: Sequence[float]
 
 
 def width_name(beamwidth: float) -> str:
-    """Write a beamwidth [deg] in three digits, or as the paper does if it is one of the paper's.
-
-    Examples
-    --------
-    >>> width_name(11.5), width_name(11.575), width_name(42.123)
-    ('11.5°', '11°', '42.1°')
-    """
+    """Write a beamwidth [deg] in three digits, or as the paper does if it is one of the paper's."""
     short = f"{beamwidth:.3g}"
     if abs(float(short) - beamwidth) > 1e-6 * beamwidth and _papers_beamwidth(beamwidth):
         return beam_name(beamwidth)
@@ -118,13 +100,7 @@ def width_name(beamwidth: float) -> str:
 
 
 def beam_name(beamwidth: float) -> str:
-    """Write a beamwidth [deg] in whole degrees, rounded as in the paper if within 0.2 degrees.
-
-    Examples
-    --------
-    >>> beam_name(11.575), beam_name(12.5)
-    ('11°', '12°')
-    """
+    """Write a beamwidth [deg] in whole degrees, rounded as in the paper if within 0.2 degrees."""
     return f"{_papers_beamwidth(beamwidth) or beamwidth:.0f}°"
 
 
@@ -135,20 +111,7 @@ def _papers_beamwidth(beamwidth: float) -> float | None:
 
 
 def written(values: Sequence[Any]) -> tuple[str, ...]:
-    """Write values in the shortest form that distinguishes all.
-
-    Examples
-    --------
-    >>> written([1.0, 2.5]), written([1.0, 1.0000001]), written([True, "paper", [0.5, 20.0]])
-    (('1', '2.5'), ('1.0', '1.0000001'), ('true', 'paper', '[0.5, 20]'))
-
-    Callers are counted, or named:
-
-    >>> written([[], [{}], [{"course": "walk"}], [{}, {"frequency": 25e3}]])
-    ('nobody', 'beacon', 'walk', '2')
-    >>> written([[{}], [{}, {"frequency": 25e3}], [{}, {"frequency": 25e3, "course": "circle"}]])
-    ('beacon', 'beacon, caller2', 'beacon, caller2 (circle)')
-    """
+    """Write values in the shortest form that distinguishes all; callers are counted or named."""
     for words in (_counted, _calling, _short):
         short = tuple(map(words, values))
         if len(set(short)) == len(short):
@@ -157,39 +120,19 @@ def written(values: Sequence[Any]) -> tuple[str, ...]:
 
 
 def word_of(variable: Variable, value: Any) -> str:
-    """Return the text of one of a variable's values.
-
-    Examples
-    --------
-    >>> word_of(setting_variable("rays.power", [3.0, 1.0]), 3.0)
-    '3'
-    """
+    """Return the text of one of a variable's values."""
     return variable.words[list(map(repr, variable.given)).index(repr(value))]
 
 
 def places(variable: Variable) -> Float[np.ndarray, " k"]:
-    """Return the positions of the values along an axis: the numbers, or 0, 1, 2 of words.
-
-    Examples
-    --------
-    >>> places(setting_variable("rays.weights", ["instantaneous", "aggregated"]))
-    array([0., 1.])
-    """
+    """Return the positions of the values along an axis: the numbers, or 0, 1, 2 of words."""
     if variable.numbers is None:
         return np.arange(len(variable.given), dtype=np.float64)
     return np.array(variable.numbers)
 
 
 def two_sided(variable: Variable) -> bool:
-    """Return whether a variable has values below and above its reference value.
-
-    Examples
-    --------
-    >>> from dataclasses import replace
-    >>> sound = setting_variable("assumed.speed_of_sound", [337.0, 343.0, 349.0])
-    >>> [two_sided(replace(sound, base=base)) for base in range(3)]
-    [False, True, False]
-    """
+    """Return whether a variable has values below and above its reference value."""
     return variable.numbers is not None and 0 < variable.base < len(variable.given) - 1
 
 
@@ -202,11 +145,6 @@ def geometric(numbers: Sequence[float]) -> bool:
     """Return whether rising numbers are nearer to a geometric than to an arithmetic series.
 
     Returns: true of three or more, above 0, whose ratios vary less than their differences.
-
-    Examples
-    --------
-    >>> geometric([100, 300, 1000]), geometric([0.2, 0.5, 0.8]), geometric([1, 100])
-    (True, False, False)
     """
     if len(numbers) < 3 or numbers[0] <= 0.0:
         return False
@@ -254,13 +192,7 @@ def _short(value: Any) -> str:
 
 
 def three_digits(value: float) -> str:
-    """Write a number in three digits.
-
-    Examples
-    --------
-    >>> [three_digits(value) for value in (0.12345, 43.71, -1234.5, float("inf"))]
-    ['0.123', '43.7', '−1234', '∞']
-    """
+    """Write a number in three digits."""
     if not math.isfinite(value):
         return "∞" if value > 0 else ("−∞" if value < 0 else "no number")
     digits = max(0, 2 - math.floor(math.log10(abs(value)))) if value else 0
@@ -270,47 +202,23 @@ def three_digits(value: float) -> str:
 
 
 def amount(value: float, unit: str) -> str:
-    """Write a number with its unit, angles in degrees.
-
-    Examples
-    --------
-    >>> amount(0.34, "m"), amount(0.02, "rad"), amount(3.0, "landmarks")
-    ('0.34 m', '1.15°', '3')
-    """
+    """Write a number with its unit, angles in degrees."""
     factor, sign = UNITS[unit]
     return three_digits(factor * value) + (f" {sign}" if sign not in ("", "°") else sign)
 
 
 def interval(ends: Sequence[float], unit: str) -> str:
-    """Write an interval without its unit.
-
-    Examples
-    --------
-    >>> interval((0.21, 0.47), "m")
-    '[0.21, 0.47]'
-    """
+    """Write an interval without its unit."""
     factor, _ = UNITS[unit]
     return "[" + ", ".join(three_digits(factor * end) for end in ends) + "]"
 
 
 def number_word(count: int) -> str:
-    """Write a count up to twelve as a word.
-
-    Examples
-    --------
-    >>> number_word(0), number_word(8), number_word(30)
-    ('none', 'eight', '30')
-    """
+    """Write a count up to twelve as a word."""
     return NUMBERS[count] if count < len(NUMBERS) else str(count)
 
 
-def listed(words: Sequence[str], last: str = "and") -> str:
-    """Join words with commas, the last two with a conjunction.
-
-    Examples
-    --------
-    >>> listed(["EKF"]), listed(["active", "fused", "passive"])
-    ('EKF', 'active, fused and passive')
-    """
+def listed(words: Sequence[str]) -> str:
+    """Join words with commas, and the last two with "and"."""
     *first, end = words
-    return f"{', '.join(first)} {last} {end}" if first else end
+    return f"{', '.join(first)} and {end}" if first else end
