@@ -25,6 +25,53 @@ def pytest_sessionstart(session: pytest.Session) -> None:
         subprocess.run([sys.executable, "-c", compile_all], check=False)
 
 
+@pytest.fixture(scope="session")
+def gallery(tmp_path_factory):
+    """Folders that are made once per session: `gallery("run")` holds a run, its log, its world."""
+    from reference.gallery import Gallery
+
+    base = tmp_path_factory.getbasetemp()
+    pieces = Gallery(base.parent if "PYTEST_XDIST_WORKER" in os.environ else base)
+    yield pieces
+    pieces.check()
+
+
+@pytest.fixture(scope="session")
+def short_run(gallery):
+    """The result folder of the paper's mission of eight frames by the EKF, three strategies."""
+    return gallery("run") / "run"
+
+
+@pytest.fixture(scope="session")
+def short_log(gallery):
+    """The log of `short_run`."""
+    return gallery("run") / "log"
+
+
+@pytest.fixture(scope="session")
+def short_world(gallery):
+    """The world of `short_run`."""
+    return gallery("run") / "world"
+
+
+@pytest.fixture(scope="session")
+def timed_log(gallery):
+    """The log of a mission with excess paths of three callers."""
+    return gallery("timed") / "log"
+
+
+@pytest.fixture(scope="session")
+def short_tape(gallery):
+    """The recording of a drive of eight frames, by sixteen microphones."""
+    return gallery("tape") / "tape"
+
+
+@pytest.fixture(scope="session")
+def small_study(gallery):
+    """A study of three worlds and thirty trials (`reference.studies.SMALL`)."""
+    return gallery("study") / "study"
+
+
 @pytest.fixture
 def undrawn(monkeypatch):
     """Leave out the picture of missions, by the test's own patch: it is undone in order."""

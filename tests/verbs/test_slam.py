@@ -3,7 +3,6 @@
 import json
 import re
 import shutil
-import sys
 import tomllib
 import warnings
 from pathlib import Path
@@ -13,14 +12,11 @@ import polars as pl
 import pytest
 
 import pipistrelle
-from pipistrelle.__main__ import main
 from pipistrelle.config import Config, InputError
 from pipistrelle.detection.logs.folder import read_log
 from pipistrelle.detection.scans import COLUMNS
 from pipistrelle.estimation.catalogue import CATALOGUE, PAPERS
 from pipistrelle.experiments.runs import replay
-from pipistrelle.experiments.runs import replay as once_more
-from pipistrelle.experiments.runs.replay import motion_of
 from pipistrelle.settings import from_text
 from reference.bags import (
     LABELLED,
@@ -35,8 +31,8 @@ from reference.bags import (
     write_bag,
 )
 from reference.command_line import SHORT, summary, table, track
+from reference.gallery import CHORUS, TIMED
 from reference.odometry import as_motions, poses_file
-from reference.pictures import without_picture
 
 DATA = Path(__file__).parents[1] / "data"
 
@@ -58,11 +54,6 @@ def test_a_run_and_its_log_give_one_track(obey, strategy, estimator, undrawn):
     (again,) = summary("two")["runs"]
     for score in ("position_rmse_m", "heading_rmse_rad", "nees_mean", "gated", "landmarks_full"):
         assert again[score] == pytest.approx(run[score], rel=1e-9)
-
-
-CHORUS = (
-    "[{}, {frequency = 25e3}, {name = 'boat', frequency = 20e3, course = 'circle', radius = 10}]"
-)
 
 
 @pytest.mark.parametrize("noise", ["constant", "measured"])
@@ -90,9 +81,7 @@ def test_a_log_keeps_excess_paths_and_their_callers_bit_for_bit(obey, noise, und
     assert {*solved.measurements["caller"].drop_nulls()} == {"beacon", "caller2", "boat"}
 
 
-def test_slam_uses_excess_paths_of_a_log_by_default(obey, undrawn):
-    words = ("--listening.timing", "true", "--strategy", "fused")
-    obey("run", *SHORT, *words, "--save-log", "log", "-o", "one")
+def test_slam_uses_excess_paths_of_a_log_by_default(obey, timed, undrawn):
     for more, timing in (((), True), (("--listening.timing", "false"), False)):
         obey("slam", "log", *more, "--quiet", "-o", "two", "--overwrite")
         heard = pl.read_parquet("two/measurements.parquet")
@@ -106,19 +95,8 @@ def test_slam_uses_excess_paths_of_a_log_by_default(obey, undrawn):
 def test_a_caller_that_moves_is_followed_in_a_log_without_an_excess_path(obey, undrawn):
     ahead = "[{waypoints = [[5, -6], [5, -5]]}]"
     words = ("--callers", ahead, "--listening.timing", "true", "--strategy", "active")
-    obey(
-        "run",
-        *SHORT,
-        *words,
-        "--filter",
-        "smoother",
-        "--filter.gate",
-        "0.99",
-        "--save-log",
-        "log",
-        "-o",
-        "one",
-    )
+    asked = ("--filter", "smoother", "--filter.gate", "0.99", "--save-log", "log", "-o", "one")
+    obey("run", *SHORT, *words, *asked)
     assert obey("slam", "log", "--filter.gate", "0.99", "--quiet", "-o", "two")[2] == ""
     assert tomllib.loads(Path("two/config.toml").read_text())["listening"]["timing"] is True
     ran, solved = track("one", "active_smoother"), track("two", "fused_smoother")
@@ -129,7 +107,7 @@ def test_a_caller_that_moves_is_followed_in_a_log_without_an_excess_path(obey, u
 def told_by_poses(log, folder):
     """Write a log's drive as poses of a recorder, with what each step's noise comes to."""
     recorded = read_log(log)
-    motions = as_motions(motion_of(recorded), recorded.controls, recorded.dt)
+    motions = as_motions(replay.motion_of(recorded), recorded.controls, recorded.dt)
     shutil.copytree(log, folder)
     text = poses_file((40.0, -7.0, 2.5), motions, recorded.time)
     (folder / "odometry.csv").write_text(text)
@@ -175,21 +153,16 @@ def test_a_restarted_odometry_frame_is_questioned(obey, undrawn):
     ) in said
 
 
-@pytest.fixture(scope="module")
-def saved(tmp_path_factory):
-    """The log of a run."""
-    folder = tmp_path_factory.mktemp("saved")
-    with without_picture() as patch:
-        patch.setattr(sys, "argv", ["pipistrelle"])
-        words = ("--save-log", str(folder / "log"), "--quiet", "-o", str(folder / "one"))
-        assert main(["run", *SHORT, *words]) == 0
-    return folder / "log"
+@pytest.fixture
+def log(short_log):
+    """The log of a run, to be changed."""
+    return shutil.copytree(short_log, Path("log"))
 
 
 @pytest.fixture
-def log(saved):
-    """That log in the test's own folder, to be changed."""
-    return shutil.copytree(saved, Path("log"))
+def timed(timed_log):
+    """The log of a run with excess paths, to be changed."""
+    return shutil.copytree(timed_log, Path("log"))
 
 
 def test_slam_hides_ranges_by_strategy_and_beam(obey, log, undrawn):
@@ -350,9 +323,6 @@ def test_ranges_in_millimetres_are_asked_about(obey, log, undrawn):
     assert "ranges are not within range_bounds (0.5 to 20 m); are ranges in metres?\n" in said
 
 
-EXCESS_PATHS = ("--callers", CHORUS, "--listening.timing", "true", "--strategy", "fused")
-
-
 @pytest.mark.parametrize(
     ("factor", "said"),
     [
@@ -360,27 +330,22 @@ EXCESS_PATHS = ("--callers", CHORUS, "--listening.timing", "true", "--strategy",
         (1000.0, r"excess paths are more than twice the far end of range_bounds \(0.5 to 20 m\)"),
     ],
 )
-def test_excess_paths_in_seconds_or_millimetres_are_asked_about(obey, factor, said, undrawn):
-    obey("run", *SHORT, *EXCESS_PATHS, "--save-log", "log", "-o", "one")
-    column = (
-        Path("log/measurements.csv").read_text().splitlines()[0].split(",").index("excess_path")
-    )
+def test_excess_paths_in_seconds_or_millimetres_are_asked_about(obey, timed, factor, said, undrawn):
+    header, _, _ = (timed / "measurements.csv").read_text().partition("\n")
     assert "metres" not in obey("slam", "log", "-o", "two", "--quiet")[2]
-    scaled(Path("log"), column, factor)
+    scaled(timed, header.split(",").index("excess_path"), factor)
     assert re.search(said, obey("slam", "log", "-o", "three", "--quiet")[2])
 
 
-def test_a_former_name_of_excess_paths_is_reported(obey, undrawn):
-    obey("run", *SHORT, *EXCESS_PATHS, "--save-log", "log", "-o", "one")
-    table = Path("log/measurements.csv")
+def test_a_former_name_of_excess_paths_is_reported(obey, timed, undrawn):
+    table = timed / "measurements.csv"
     table.write_text(table.read_text().replace("excess_path", "detour"))
     words = "slam", "log", "-o", "two", "--quiet"
     assert "log: detour is read as excess_path, as it is called now\n" in obey(*words)[2]
 
 
-def test_a_caller_that_no_row_measures_is_named_unless_its_place_is(obey, undrawn):
-    obey("run", *SHORT, *EXCESS_PATHS, "--save-log", "log", "-o", "one")
-    path = Path("log/log.toml")
+def test_a_caller_that_no_row_measures_is_named_unless_its_place_is(obey, timed, undrawn):
+    path = timed / "log.toml"
     wrong = path.read_text().replace("landmark = 12", "landmark = 99")
     for place, said in (
         ("", "no row measures landmark 99, the caller 'caller2'"),
@@ -392,9 +357,7 @@ def test_a_caller_that_no_row_measures_is_named_unless_its_place_is(obey, undraw
 
 
 def test_a_caller_that_no_row_measures_is_not_missed_where_there_is_no_excess_path(obey, undrawn):
-    obey(
-        "run", *SHORT, *EXCESS_PATHS[:-2], "--strategy", "active", "--save-log", "log", "-o", "one"
-    )
+    obey("run", *SHORT, *TIMED[:-1], "active", "--save-log", "log", "-o", "one")
     assert 'name = "boat"' in Path("log/log.toml").read_text()
     assert obey("slam", "log", "-o", "two", "--quiet")[2] == ""
 
@@ -459,12 +422,11 @@ def test_a_log_with_partial_truth_is_scored_on_that_part(obey, log, undrawn):
     assert run["diverged"] is False
 
 
-def test_partial_truth_is_reported_in_a_line(obey, tmp_path, undrawn):
-    log = tmp_path / "log"
-    shutil.copytree(Path(__file__).parents[1] / "data" / "unicycle_log", log)
+def test_partial_truth_is_reported_in_a_line(obey, undrawn):
+    log = shutil.copytree(DATA / "unicycle_log", Path("log"))
     rows = (log / "truth.csv").read_text().splitlines()
     (log / "truth.csv").write_text("\n".join(rows[:12]))
-    status, _, said = obey("slam", log, "-o", tmp_path / "results")
+    status, _, said = obey("slam", log, "-o", "two")
     assert status == 0
     assert "the truth covers 5 of 20 steps" in said
 
@@ -478,7 +440,7 @@ def test_several_filters_side_by_side_have_each_the_gate_that_suits_it(obey, log
     for name, gate in (("iekf", "0.999"), ("smoother", "1")):
         obey("slam", log, "--filter.robust", "huber", "--filter", name, "--gate", gate, "-o", name)
         np.testing.assert_array_equal(track("both", f"fused_{name}"), track(name, f"fused_{name}"))
-    assert once_more.rerun(Path("both")).difference == ""
+    assert replay.rerun(Path("both")).difference == ""
 
 
 def bagged(path, **more):
@@ -569,7 +531,9 @@ def sonars(path, width=0.3):
     return posts
 
 
-@pytest.mark.parametrize("width", [0.15, 0.3, 0.52])
+@pytest.mark.parametrize(
+    "width", [0.3, *(pytest.param(w, marks=pytest.mark.slow) for w in (0.15, 0.52))]
+)
 def test_a_bag_of_two_sonars_maps_landmarks_however_wide_their_cones_are(obey, undrawn, width):
     posts = sonars(Path("walk.mcap"), width)
     words = ("slam", "walk.mcap", "--association.method", "marginal", "-o")
@@ -623,9 +587,9 @@ def test_log_without_labels_is_scored_by_the_positions_of_its_landmarks(obey, un
 
 
 def test_log_that_is_solved_whole_is_headed_all_rows(obey, undrawn):
-    log = Path(__file__).parents[1] / "data" / "unicycle_log"
-    _, printed, _ = obey("slam", str(log), "--filter", "ekf", "-o", "one")
+    log = DATA / "unicycle_log"
+    _, printed, _ = obey("slam", log, "--filter", "ekf", "-o", "one")
     assert printed.splitlines()[0].strip() == "all rows"
     assert Path("one/track_fused_ekf.tum").exists(), "files keep the strategy's name"
-    _, printed, _ = obey("slam", str(log), "--filter", "ekf", "--strategy", "all", "-o", "two")
+    _, printed, _ = obey("slam", log, "--filter", "ekf", "--strategy", "all", "-o", "two")
     assert printed.splitlines()[0].split() == ["active", "fused", "passive"]
