@@ -1,5 +1,6 @@
 """What every test runs under: kernels where the package keeps them, repeatable examples."""
 
+import gc
 import os
 import subprocess
 import sys
@@ -23,6 +24,13 @@ def pytest_sessionstart(session: pytest.Session) -> None:
     if not any(Path(os.environ["NUMBA_CACHE_DIR"]).rglob("*.nbc")):
         compile_all = "from pipistrelle.experiments.runs.compiling import compile_kernels as c; c()"
         subprocess.run([sys.executable, "-c", compile_all], check=False)
+
+
+def pytest_collection_finish() -> None:
+    """Spare the collector of garbage all that lasts for the session, and run it less often."""
+    gc.collect()
+    gc.freeze()
+    gc.set_threshold(10_000, 20, 20)
 
 
 @pytest.fixture(scope="session")
@@ -70,6 +78,15 @@ def short_tape(gallery):
 def small_study(gallery):
     """A study of three worlds and thirty trials (`reference.studies.SMALL`)."""
     return gallery("study") / "study"
+
+
+@pytest.fixture(scope="module")
+def browser():
+    """A browser; tests that need one are skipped where none is installed."""
+    from reference.pages import chromium
+
+    with chromium() as browser:
+        yield browser
 
 
 @pytest.fixture

@@ -4,7 +4,6 @@ import ast
 import re
 import subprocess
 import sys
-from collections.abc import Iterator
 from importlib import import_module
 from pathlib import Path
 from types import ModuleType
@@ -32,11 +31,12 @@ def tracked() -> list[Path]:
     return [ROOT / name for name in listed.stdout.splitlines() if (ROOT / name).is_file()]
 
 
-def functions(path: Path) -> Iterator[ast.FunctionDef]:
-    """Yield the functions and methods of a module."""
-    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
-        if isinstance(node, ast.FunctionDef):
-            yield node
+@pytest.fixture(scope="module")
+def nodes() -> list[tuple[Path, ast.AST]]:
+    """Functions and calls of all modules, with their files."""
+    trees = ((path, ast.parse(path.read_text(encoding="utf-8"))) for path in SOURCES)
+    wanted = (ast.FunctionDef, ast.Call)
+    return [(path, n) for path, tree in trees for n in ast.walk(tree) if isinstance(n, wanted)]
 
 
 def body_lines(function: ast.FunctionDef) -> int:
@@ -58,17 +58,15 @@ def test_the_readme_lists_the_rooms_with_their_docstrings():
     assert all(doors.values()), "every room says what it is"
 
 
-@pytest.mark.parametrize("room", ROOMS)
-def test_a_room_exports_at_most_eight_names(room):
+def offered(room: str) -> list[str]:
+    """Return the names that a room exports."""
     door = import_module(f"pipistrelle.{room}")
-    offered = [
-        name
-        for name in dir(door)
-        if not name.startswith("_")
-        and name != "import_module"
-        and not isinstance(getattr(door, name), ModuleType)
-    ]
-    assert len(offered) <= 8
+    names = [name for name in dir(door) if not name.startswith("_") and name != "import_module"]
+    return [name for name in names if not isinstance(getattr(door, name), ModuleType)]
+
+
+def test_a_room_exports_at_most_eight_names():
+    assert {room: names for room in ROOMS if len(names := offered(room)) > 8} == {}
 
 
 def most_lines(function: ast.FunctionDef) -> int:
@@ -78,9 +76,10 @@ def most_lines(function: ast.FunctionDef) -> int:
     return 90 if marks & compiled else 60
 
 
-def test_the_body_of_a_function_fits_on_a_screen():
-    all_functions = ((path.name, f) for path in SOURCES for f in functions(path))
-    long = [(name, f.name) for name, f in all_functions if body_lines(f) > most_lines(f)]
+def test_the_body_of_a_function_fits_on_a_screen(nodes):
+    functions = [(path.name, node) for path, node in nodes if isinstance(node, ast.FunctionDef)]
+    long = [(name, f.name) for name, f in functions if body_lines(f) > most_lines(f)]
+    assert functions
     assert long == []
 
 
@@ -113,15 +112,14 @@ AT_THE_DISK = {
 }
 
 
-def test_files_are_read_and_written_through_one_door_but_where_a_reason_is_given():
+def test_files_are_read_and_written_through_one_door_but_where_a_reason_is_given(nodes):
     found: dict[str, set[str]] = {}
-    for path in SOURCES:
-        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
-            if isinstance(node, ast.Call) and isinstance(node.func, (ast.Attribute, ast.Name)):
-                named = isinstance(node.func, ast.Name)
-                name = node.func.id if named else node.func.attr
-                if name in DISK and not (named and name == "read_text"):
-                    found.setdefault(path.relative_to(PACKAGE).as_posix(), set()).add(name)
+    for path, node in nodes:
+        if isinstance(node, ast.Call) and isinstance(node.func, (ast.Attribute, ast.Name)):
+            named = isinstance(node.func, ast.Name)
+            name = node.func.id if named else node.func.attr
+            if name in DISK and not (named and name == "read_text"):
+                found.setdefault(path.relative_to(PACKAGE).as_posix(), set()).add(name)
     assert found == AT_THE_DISK
 
 

@@ -3,6 +3,7 @@
 import re
 import subprocess
 import sys
+from functools import cache
 from pathlib import Path
 from pkgutil import resolve_name
 from types import ModuleType
@@ -24,27 +25,39 @@ def blocks(language: str, page: Path) -> list[str]:
     return re.findall(rf"^```{language}\n(.*?)^```", page.read_text(), re.MULTILINE | re.DOTALL)
 
 
-@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
-def test_names_in_the_pages_exist(page):
-    for name in re.findall(r"{py:\w+}`~?([\w.]+)`", page.read_text()):
+def found_in(pages, pattern):
+    """Yield each match of a pattern in the texts of pages, with its page."""
+    for page in pages:
+        for match in re.findall(pattern, page.read_text()):
+            yield page, match
+
+
+def test_names_in_the_pages_exist():
+    for _, name in found_in(PAGES, r"{py:\w+}`~?([\w.]+)`"):
         resolve_name(name)
 
 
-@pytest.mark.parametrize("page", [*PAGES, *TEXTS], ids=lambda page: page.name)
-def test_links_between_files_lead_somewhere(page):
-    links = re.findall(r"\]\(([^)#]+)(?:#[^)]*)?\)", page.read_text())
-    near = [link for link in links if "://" not in link]
-    assert [link for link in near if not (page.parent / link).exists()] == []
+def test_links_between_files_lead_somewhere():
+    links = found_in([*PAGES, *TEXTS], r"\]\(([^)#]+)(?:#[^)]*)?\)")
+    near = [(page, link) for page, link in links if "://" not in link]
+    assert [link for link in near if not (link[0].parent / link[1]).exists()] == []
 
 
-@pytest.mark.parametrize("page", [*PAGES, *TEXTS], ids=lambda page: page.name)
-def test_links_into_files_lead_to_headings_of_the_sources(page):
-    links = re.findall(r"\]\(([^)#:]*\.md|)#([^)]+)\)", page.read_text())
-    for name, anchor in links:
-        text = (page.parent / name if name else page).read_text()
-        headings = re.findall(r"^#+ (.+)$", text, re.MULTILINE)
-        slugs = {re.sub(r"[^\w -]", "", title.lower()).replace(" ", "-") for title in headings}
-        assert anchor in slugs, f"{name}#{anchor}"
+@cache
+def anchors(page):
+    """Return the anchors of a page's headings."""
+    headings = re.findall(r"^#+ (.+)$", page.read_text(), re.MULTILINE)
+    return {re.sub(r"[^\w -]", "", title.lower()).replace(" ", "-") for title in headings}
+
+
+def test_links_into_files_lead_to_headings_of_the_sources():
+    links = found_in([*PAGES, *TEXTS], r"\]\(([^)#:]*\.md|)#([^)]+)\)")
+    lost = [
+        (page.name, name, anchor)
+        for page, (name, anchor) in links
+        if anchor not in anchors(page.parent / name if name else page)
+    ]
+    assert lost == []
 
 
 def test_every_room_has_its_page():
@@ -373,34 +386,23 @@ def test_the_readme_shows_the_output_of_the_command(tmp_path, capsys):
             np.testing.assert_allclose(*np.array(numbers, dtype=float), rtol=0.1)
 
 
-CHROMIUM = Path("/usr/bin/chromium")
-
-
 @pytest.mark.slow
-def test_the_built_pages_are_read_without_a_network_and_without_a_word(tmp_path):
+def test_the_built_pages_are_read_without_a_network_and_without_a_word(browser, tmp_path):
     """The examples are left out: they are run by tests of their own."""
-    driver = pytest.importorskip(
-        "playwright.sync_api", reason="playwright is not installed (./dev test installs it)"
-    )
-    if not CHROMIUM.exists():
-        pytest.skip(f"no browser: {CHROMIUM} is missing (Debian's package chromium)")
     build = [sys.executable, "-m", "sphinx", "-q", "-D", "plot_gallery=0", DOCS, tmp_path]
     subprocess.run(build, cwd=ROOT, check=True)
     pages, asked, noise, fonts = sorted(tmp_path.rglob("*.html")), set(), [], set()
-    with driver.sync_playwright() as playwright:
-        browser = playwright.chromium.launch(executable_path=str(CHROMIUM), args=["--no-sandbox"])
-        page = browser.new_page()
-        page.on("request", lambda request: asked.add(request.url))
-        page.on("console", lambda message: noise.append(message.text))
-        page.on("pageerror", lambda error: noise.append(str(error)))
-        for path in pages:
-            page.goto(path.as_uri())
-            faces = "document.fonts.ready.then(f => [...f].map(x => x.family + ' ' + x.status))"
-            if page.locator("math").count():
-                fonts.add(tuple(page.evaluate(faces)))
-        words, other = ("ray", "caller", "bound"), browser.new_page()  # whose summaries are fetched
-        first = [_first_found(other, tmp_path, word) for word in words]
-        browser.close()
+    page = browser.new_page()
+    page.on("request", lambda request: asked.add(request.url))
+    page.on("console", lambda message: noise.append(message.text))
+    page.on("pageerror", lambda error: noise.append(str(error)))
+    for path in pages:
+        page.goto(path.as_uri())
+        faces = "document.fonts.ready.then(f => [...f].map(x => x.family + ' ' + x.status))"
+        if page.locator("math").count():
+            fonts.add(tuple(page.evaluate(faces)))
+    words, other = ("ray", "caller", "bound"), browser.new_page()  # whose summaries are fetched
+    first = [_first_found(other, tmp_path, word) for word in words]
     assert first == [f"glossary.html#term-{word}" for word in words]
     assert {"index", "equations", "estimation", "search"} <= {path.stem for path in pages}
     assert [url for url in asked if not url.startswith((tmp_path.as_uri(), "data:"))] == []
@@ -424,14 +426,14 @@ def test_the_glossary_is_sorted_and_defines_each_name_once():
     assert glossary_page.markdown().count("\n  ") == len(entries)
 
 
-@pytest.mark.parametrize("entry", glossary_page.terms(), ids=lambda entry: entry["term"])
-def test_a_term_of_the_glossary_has_a_short_meaning_and_a_page(entry):
-    assert entry.keys() <= {"term", "also", "meaning", "page", "not", "never"}
-    sentences = re.split(r"(?<=\.) (?=[A-Z])", entry["meaning"])
-    assert len(sentences) <= 2
-    assert all(sentence.endswith(".") for sentence in sentences)
-    assert max(len(sentence.split()) for sentence in sentences) <= 25
-    assert glossary_page.title_of(entry["page"])
+def test_a_term_of_the_glossary_has_a_short_meaning_and_a_page():
+    for entry in glossary_page.terms():
+        assert entry.keys() <= {"term", "also", "meaning", "page", "not", "never"}
+        sentences = re.split(r"(?<=\.) (?=[A-Z])", entry["meaning"])
+        assert len(sentences) <= 2, entry
+        assert all(sentence.endswith(".") for sentence in sentences), entry
+        assert max(len(sentence.split()) for sentence in sentences) <= 25, entry
+        assert glossary_page.title_of(entry["page"])
 
 
 def test_a_word_that_the_glossary_replaces_is_no_term_and_replaced_once():

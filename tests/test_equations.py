@@ -1,10 +1,11 @@
 """Every equation of the paper is cited by a docstring, and has its row in the documentation."""
 
-import ast
 import re
 from collections.abc import Iterator
 from pathlib import Path
 from pkgutil import resolve_name
+
+from house import docstrings_of
 
 ROOT = Path(__file__).resolve().parents[1]
 SOURCES = sorted((ROOT / "src").rglob("*.py"))
@@ -23,10 +24,8 @@ ROWS = {
 
 def docstrings(path: Path) -> Iterator[str]:
     """Yield a module's docstrings, each paragraph on one line, other works' equations left out."""
-    kinds = (ast.Module, ast.ClassDef, ast.FunctionDef)
-    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
-        text = ast.get_docstring(node) if isinstance(node, kinds) else None
-        for paragraph in (text or "").split("\n\n"):
+    for text in docstrings_of(path):
+        for paragraph in text.split("\n\n"):
             yield OTHER_WORK.sub("", " ".join(paragraph.split()))
 
 

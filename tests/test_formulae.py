@@ -1,6 +1,5 @@
 """Formulae of the pages: each becomes MathML, of glyphs that the pages' own font has."""
 
-import ast
 import re
 from collections import Counter
 from html import unescape
@@ -12,6 +11,8 @@ import pytest
 from docs.formulae import FORMULA, ROW, formula_of, labelled, laid_out, mathml
 from fontTools.ttLib import TTFont
 
+from house import docstrings_of
+
 ROOT = Path(__file__).resolve().parents[1]
 PAGES = [*sorted((ROOT / "docs").glob("*.md")), ROOT / "papers" / "bradley_abaid" / "README.md"]
 SOURCES = sorted((ROOT / "src").rglob("*.py"))
@@ -21,25 +22,18 @@ INLINE = re.compile(r":math:`([^`]+)`")
 DOLLARS = re.compile(r"(?<![\\$])\$([^$\n]+)\$")
 
 
-def docstrings(path: Path) -> list[str]:
-    """Return the docstrings of a module."""
-    kinds = (ast.Module, ast.ClassDef, ast.FunctionDef)
-    nodes = (node for node in ast.walk(ast.parse(path.read_text())) if isinstance(node, kinds))
-    return [text for node in nodes if (text := ast.get_docstring(node))]
+@pytest.fixture(scope="module")
+def texts():
+    """The docstrings of the package."""
+    return [text for path in SOURCES for text in docstrings_of(path)]
 
 
-def formulae() -> list[tuple[str, bool]]:
-    """Return every formula of the docstrings and the pages, and whether it stands by itself."""
-    found = [(tex, False) for page in PAGES for tex in DOLLARS.findall(page.read_text())]
-    for path in SOURCES:
-        for text in docstrings(path):
-            found += [(tex, True) for _, tex in DISPLAYED.findall(text)]
-            found += [(tex, False) for tex in INLINE.findall(text)]
-    return sorted(set(found))
-
-
-FORMULAE = formulae()
-ROWS = list(ROW.finditer((ROOT / "docs" / "equations.md").read_text()))
+@pytest.fixture(scope="module")
+def formulae(texts):
+    """Every formula of the docstrings and the pages, and whether it is displayed."""
+    found = {(tex, False) for page in PAGES for tex in DOLLARS.findall(page.read_text())}
+    found |= {(tex, True) for text in texts for _, tex in DISPLAYED.findall(text)}
+    return sorted(found | {(tex, False) for text in texts for tex in INLINE.findall(text)})
 
 
 @pytest.fixture(scope="module")
@@ -48,17 +42,15 @@ def glyphs():
     return set(TTFont(ROOT / "docs" / "_static" / "stix-two-math.woff").getBestCmap())
 
 
-def test_the_formulae_are_found():
-    assert len(FORMULAE) > 120
+def test_the_formulae_are_found(texts, formulae):
+    assert len(formulae) > 120
     everywhere = sum(path.read_text().count(".. math::") for path in SOURCES)
-    assert sum(len(DISPLAYED.findall(text)) for path in SOURCES for text in docstrings(path)) == (
-        everywhere
-    )
+    assert sum(len(DISPLAYED.findall(text)) for text in texts) == everywhere
 
 
-def test_a_formula_becomes_mathml_of_glyphs_that_the_font_has(glyphs):
+def test_a_formula_becomes_mathml_of_glyphs_that_the_font_has(formulae, glyphs):
     bare = set()
-    for tex, displayed in FORMULAE:
+    for tex, displayed in formulae:
         written = mathml(tex, displayed=displayed)
         assert written.startswith('<math display="block">' if displayed else "<math>")
         text = unescape(re.sub(r"<[^>]+>", "", written))
@@ -103,8 +95,7 @@ def test_a_label_has_one_or_several_numbers():
     assert labelled(text) == {3: "a = b,\n          c", 26: "e", 27: "e"}
 
 
-def test_every_equation_of_the_paper_is_written_in_one_docstring():
-    texts = [text for path in SOURCES for text in docstrings(path)]
+def test_every_equation_of_the_paper_is_written_in_one_docstring(texts):
     assert Counter(number for text in texts for number in labelled(text)) == dict.fromkeys(
         range(1, 28), 1
     )
@@ -112,13 +103,12 @@ def test_every_equation_of_the_paper_is_written_in_one_docstring():
     assert labels == sum(len(FORMULA.findall(text)) for text in texts)
 
 
-@pytest.mark.parametrize("row", ROWS)
-def test_a_row_of_the_page_shows_its_equation(row):
-    (name,) = re.findall(r"`~([\w.]+)`", row[3])
-    tex = formula_of(int(row[1]), name)
-    shown = laid_out(row)
-    assert f"### ({row[1]}) {row[2][0].upper()}" in shown
-    assert f"```{{math}}\n{tex}\n```" in shown
-    assert f"<{name}>`" in shown
-    assert resolve_name(name)
-    assert all(test in shown for test in re.findall(r"`test_\w+`", row[4]))
+def test_a_row_of_the_page_shows_its_equation():
+    for row in ROW.finditer((ROOT / "docs" / "equations.md").read_text()):
+        (name,) = re.findall(r"`~([\w.]+)`", row[3])
+        shown, tests = laid_out(row), re.findall(r"`test_\w+`", row[4])
+        tex = formula_of(int(row[1]), name)
+        head = f"### ({row[1]}) {row[2][0].upper()}"
+        parts = (head, f"```{{math}}\n{tex}\n```", f"<{name}>`", *tests)
+        assert [part for part in parts if part not in shown] == [], row[0]
+        assert resolve_name(name)

@@ -7,7 +7,7 @@ import pytest
 
 
 @pytest.fixture
-def written(tmp_path, monkeypatch):
+def written(tmp_path, monkeypatch, undrawn):
     """Write a module into the current folder and return its name, a new one each time."""
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(sys, "path", [*sys.path])

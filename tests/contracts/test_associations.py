@@ -1,6 +1,5 @@
 """Associations that are not in the package: a class in the folder labels what nobody labelled."""
 
-import json
 import sys
 from pathlib import Path
 
@@ -20,20 +19,13 @@ from pipistrelle.config import (
 )
 from pipistrelle.experiments.runs.trial import run_mission
 from pipistrelle.experiments.studies.study import load_study
+from reference.command_line import summary
+from reference.pictures import without_picture
 from reference.studies import SMALL
 
 SHORT = (
-    "--settings",
-    "paper",
-    "--duration",
-    "10",
-    "--seed",
-    "7",
-    "--quiet",
-    "--strategy",
-    "fused",
-    "--filter",
-    "iekf",
+    *("--settings", "paper", "--duration", "10", "--seed", "7", "--quiet"),
+    *("--strategy", "fused", "--filter", "iekf"),
 )
 JOINT = '''
 from dataclasses import dataclass, field
@@ -151,10 +143,7 @@ def test_an_association_of_a_class_maps_a_mission_a_study_and_its_log(written, u
     assert main([*words, "-o", "known", "--save-log", "log"]) == 0
     assert main([*words, *method, "-o", "own"]) == 0
     assert main(["slam", "log", "--quiet", "--filter", "iekf", *method, "-o", "again"]) == 0
-    (known,), (own,), (again,) = (
-        json.loads(Path(folder, "summary.json").read_text())["runs"]
-        for folder in ("known", "own", "again")
-    )
+    (known,), (own,), (again,) = (summary(folder)["runs"] for folder in ("known", "own", "again"))
     assert own["position_bound_m"] == known["position_bound_m"]
     assert "associated_right" not in known
     for one in (own, again):
@@ -169,7 +158,7 @@ def test_an_association_of_a_class_maps_a_mission_a_study_and_its_log(written, u
         f'filters = ["iekf"]\nstrategies = ["active", "fused"]\n{small}'
         f'"association.method" = ["known", "{method[1]}"]\n'
     )
-    assert main(("study", "small.toml", "-o", "study", "--quiet")) == 0
+    assert main(("study", "small.toml", "--workers", "1", "-o", "study", "--quiet")) == 0
     trials = load_study(Path("study")).trials.collect()
     assert trials["status"].to_list() == ["done"] * 4
     for strategy in ("active", "fused"):
@@ -250,8 +239,12 @@ def test_callers_that_move_are_refused_with_an_association_of_a_filter_that_foll
     assert main([*asked, "--filter", "iekf"]) == 0
 
 
-def test_a_folder_of_the_packages_own_method_is_done_again_without_being_asked_for_trust(written):
-    assert main(["run", *SHORT, "--association.method", "marginal", "-o", "own"]) == 0
+def test_a_folder_of_the_packages_own_method_is_done_again_without_being_asked_for_trust(
+    tmp_path, monkeypatch
+):
+    monkeypatch.chdir(tmp_path)
+    with without_picture():
+        assert main(["run", *SHORT, "--association.method", "marginal", "-o", "own"]) == 0
     assert main(["view", "own", "--quiet"]) == 0
     assert Path("own/view.html").exists()
     assert pipistrelle.load("own").figure() is not None

@@ -242,17 +242,6 @@ class Mortal(ThreadPoolExecutor):
         return future
 
 
-@pytest.fixture
-def mortal(monkeypatch):
-    monkeypatch.setattr(executors, "_pool", Mortal)
-
-
-def test_a_world_that_kills_its_pool_twice_is_recorded_and_the_others_are_not(mortal):
-    found = executors.in_processes(partial(fatal, {3}), lost, deque(range(6)), 2)
-    names = [(f"world {i}", "lost" if i == 3 else None) for i in range(6)]
-    assert sorted(found) == [[name] for name in names]
-
-
 class Together(Mortal):
     """Ends its worlds as many at a time as it has workers; one that is deadly breaks them all."""
 
@@ -276,33 +265,20 @@ class Together(Mortal):
         return ended[iteration]
 
 
-def test_a_world_that_shares_a_pool_with_a_fatal_world_is_retried(monkeypatch):
-    monkeypatch.setattr(executors, "_pool", Together)
+PROCESSES = pytest.param(executors._pool, marks=pytest.mark.slow, id="processes")
+
+
+@pytest.mark.parametrize("pool", [Mortal, Together, PROCESSES])
+def test_a_world_that_kills_its_pool_twice_is_recorded_and_the_others_are_not(monkeypatch, pool):
+    monkeypatch.setattr(executors, "_pool", pool)
     found = executors.in_processes(partial(fatal, {3}), lost, deque(range(6)), 2)
     names = [(f"world {i}", "lost" if i == 3 else None) for i in range(6)]
     assert sorted(found) == [[name] for name in names]
 
 
-def test_pools_that_finish_no_world_are_an_error(mortal):
-    with pytest.raises(InputError, match="their processes end before a world is done"):
-        list(executors.in_processes(partial(fatal, {0, 1}), lost, deque([0, 1]), 2))
-
-
-@pytest.mark.slow
-def test_a_world_that_kills_its_process_twice_is_recorded_and_the_others_are_not():
-    worlds = deque(range(5))
-    found = executors.in_processes(partial(fatal, {3}), lost, worlds, 2)
-    assert sorted(found) == [
-        [("world 0", None)],
-        [("world 1", None)],
-        [("world 2", None)],
-        [("world 3", "lost")],
-        [("world 4", None)],
-    ]
-
-
-@pytest.mark.slow
-def test_processes_that_finish_no_world_are_an_error():
+@pytest.mark.parametrize("pool", [Mortal, PROCESSES])
+def test_pools_that_finish_no_world_are_an_error(monkeypatch, pool):
+    monkeypatch.setattr(executors, "_pool", pool)
     with pytest.raises(InputError, match="their processes end before a world is done"):
         list(executors.in_processes(partial(fatal, {0, 1}), lost, deque([0, 1]), 2))
 
@@ -315,6 +291,7 @@ def test_an_abandoned_world_counts_as_failed(plan, folder):
     assert standing.first_error == study.KILLED.strip()
 
 
+@pytest.mark.slow  # in the fast suite a signal to a command does so (verbs/test_streams.py)
 def test_an_interrupt_stops_the_workers_and_keeps_finished_worlds(plan, folder):
     def interrupt(standing):
         if standing.done:
@@ -326,12 +303,9 @@ def test_an_interrupt_stops_the_workers_and_keeps_finished_worlds(plan, folder):
     assert done_worlds(folder)
 
 
-@pytest.mark.parametrize(
-    "pool", [ThreadPoolExecutor, pytest.param(None, marks=pytest.mark.slow, id="processes")]
-)
+@pytest.mark.parametrize("pool", [ThreadPoolExecutor, PROCESSES])
 def test_results_that_cannot_be_written_by_a_worker_end_the_study(plan, folder, monkeypatch, pool):
-    if pool:
-        monkeypatch.setattr(executors, "_pool", pool)
+    monkeypatch.setattr(executors, "_pool", pool)
 
     def spoil():
         (folder / "steps").rename(folder / "taken")
@@ -363,12 +337,16 @@ def test_results_written_to_another_disk_are_reported_missing(plan, folder, monk
 
 
 @pytest.fixture(scope="module")
-def cluster(tmp_path_factory):
+def dask():
+    return pytest.importorskip("distributed", reason="Dask is not installed: the extra [cluster]")
+
+
+@pytest.fixture(scope="module")
+def cluster(dask, tmp_path_factory):
     """A scheduler and two workers on the loopback interface, each a process.
 
     The tests of Dask share it, and kill it bit by bit: first a worker, last the scheduler.
     """
-    pytest.importorskip("distributed", reason="Dask is not installed: the extra [cluster]")
     with _cluster(tmp_path_factory.mktemp("cluster")) as found:
         yield found
 
@@ -452,8 +430,7 @@ class TestDaskOnThisMachine(ExecutorContract):
     """In threads, which start at once."""
 
     @pytest.fixture(autouse=True)
-    def threads(self, monkeypatch):
-        dask = pytest.importorskip("distributed", reason="no Dask: the extra [cluster]")
+    def threads(self, dask, monkeypatch):
         monkeypatch.setattr(dask, "LocalCluster", partial(dask.LocalCluster, processes=False))
 
     def run(self, plan, folder):
@@ -463,8 +440,8 @@ class TestDaskOnThisMachine(ExecutorContract):
 @pytest.mark.slow
 class TestDaskInProcessesOfThisMachine(TestDaskOnThisMachine):
     @pytest.fixture(autouse=True)
-    def threads(self):
-        pytest.importorskip("distributed", reason="no Dask: the extra [cluster]")
+    def threads(self, dask):
+        """Leave the processes as they are."""
 
 
 INTRUDER = """\
@@ -487,8 +464,7 @@ for address in sys.argv[1:]:
 
 
 @pytest.mark.slow
-def test_a_local_cluster_refuses_other_users_of_the_machine():
-    pytest.importorskip("distributed", reason="no Dask: the extra [cluster]")
+def test_a_local_cluster_refuses_other_users_of_the_machine(dask):
     with executors._client("local", 1) as client:
         known = client.scheduler_info()
         ((worker, about),) = known["workers"].items()
@@ -506,14 +482,12 @@ def test_a_local_cluster_refuses_other_users_of_the_machine():
 
 @pytest.mark.slow
 @pytest.mark.parametrize("workers", [1, 3])
-def test_a_cluster_that_is_started_here_has_the_workers_that_were_asked_for(workers):
-    pytest.importorskip("distributed", reason="no Dask: the extra [cluster]")
+def test_a_cluster_that_is_started_here_has_the_workers_that_were_asked_for(workers, dask):
     with executors._client("local", workers) as client:
         assert len(client.scheduler_info(n_workers=-1)["workers"]) == workers
 
 
-def test_no_scheduler_at_the_address_is_an_error(plan, folder):
-    pytest.importorskip("distributed", reason="Dask is not installed: the extra [cluster]")
+def test_no_scheduler_at_the_address_is_an_error(plan, folder, dask):
     with pytest.raises(InputError, match="--scheduler: found 'nowhere', but no scheduler answers"):
         run_study(plan, folder, scheduler="nowhere")
 
@@ -525,7 +499,6 @@ def test_a_missing_dask_is_named_with_its_fix(plan, folder, monkeypatch):
 
 
 @pytest.mark.slow
-def test_a_world_that_kills_every_worker_of_a_cluster_is_recorded_and_the_others_are_not():
-    pytest.importorskip("distributed", reason="Dask is not installed: the extra [cluster]")
+def test_a_world_that_kills_every_worker_of_a_cluster_is_recorded_and_the_others_are_not(dask):
     found = executors.on_cluster(partial(fatal, {1}), lost, deque(range(3)), 2, "local")
     assert sorted(found) == [[("world 0", None)], [("world 1", "lost")], [("world 2", None)]]

@@ -17,6 +17,7 @@ from pipistrelle.estimation.catalogue import CATALOGUE, PAPERS, entry, title_of
 from pipistrelle.experiments.runs.trial import run_mission
 from pipistrelle.experiments.studies.plan import find_plan, plan_text, read_plan
 from pipistrelle.experiments.studies.study import load_study, run_study
+from reference.command_line import summary
 from reference.missions import BICYCLE
 from reference.studies import SMALL, assert_same, plan_of, results
 from report.drawing import draw_only
@@ -46,23 +47,19 @@ def site(tmp_path_factory):
 
 
 @pytest.fixture
-def toys(site, monkeypatch, tmp_path):
+def toys(site, monkeypatch, tmp_path, undrawn):
     """The toys installed; the current folder is another."""
     monkeypatch.syspath_prepend(site)
     monkeypatch.chdir(tmp_path)
 
 
-def summary(folder):
-    return json.loads((Path(folder) / "summary.json").read_text())["runs"]
-
-
 def test_an_installed_estimator_runs_a_mission_and_solves_its_log(toys):
     assert main(["run", *SHORT, "--filter", RECKONING, "-o", "one", "--save-log", "log"]) == 0
     assert main(["slam", "log", "--seed", "7", "--quiet", "--filter", RECKONING, "-o", "two"]) == 0
-    assert [(r["strategy"], r["filter"]) for r in summary("one")] == [
+    assert [(r["strategy"], r["filter"]) for r in summary("one")["runs"]] == [
         (strategy, RECKONING) for strategy in ("active", "fused", "passive")
     ]
-    assert "online" not in summary("one")[0]
+    assert "online" not in summary("one")["runs"][0]
     files = Counter(path.name for path in Path("one").glob("*_*.*"))
     assert files == Counter(
         f"{kind}_{strategy}_DeadReckoning.{ending}"
@@ -79,7 +76,7 @@ def test_a_revised_path_is_scored_and_written_next_to_the_online_path(toys):
     words = ("run", *SHORT, "--strategy", "fused")
     for name in (RECKONING, SHIFTED):
         assert main([*words, "--filter", name, "-o", name[15:]]) == 0
-    (plain,), (revised,) = summary("DeadReckoning"), summary("Shifted")
+    (plain,), (revised,) = summary("DeadReckoning")["runs"], summary("Shifted")["runs"]
     scores = ("position_rmse_m", "heading_rmse_rad", "position_rmse_aligned_m")
     assert revised["online"] == {name: plain[name] for name in (*scores, "nees_mean", "nees_max")}
     assert revised["position_rmse_m"] > plain["position_rmse_m"]
@@ -349,7 +346,7 @@ def test_an_estimator_that_fails_midway_is_a_failed_trial_of_a_run(toys, written
     (warning,) = [line for line in printed.err.splitlines() if "warning" in line]
     assert warning.startswith(f"pipistrelle: warning: active {name}:Mine failed: ")
     assert said in warning
-    (run,) = summary("one")
+    (run,) = summary("one")["runs"]
     assert (run["diverged"], run["position_rmse_m"]) == (True, None)
 
 

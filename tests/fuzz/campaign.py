@@ -59,23 +59,7 @@ def campaign(
     seed: int,
     progress: Callable[[int, int, Sequence[Found]], None] = lambda *_: None,
 ) -> tuple[list[Found], Counter[str]]:
-    """Make tries at a target.
-
-    Parameters
-    ----------
-    target : one of `TARGETS`
-    tries : int
-    seed : int
-    progress : callable, optional
-        Told now and then how many tries of all are done, and what was found.
-
-    Returns
-    -------
-    list of Found
-        Those with faults.
-    Counter of str
-        How the last commands of the tries ended.
-    """
+    """Make tries at a target."""
     _get_ready()
     found, ends, due = [], Counter[str](), perf_counter() + EVERY
     with TemporaryDirectory(prefix="fuzz-") as base:

@@ -36,20 +36,7 @@ class Tried:
 def faults_of(
     ending: Ending, names: Iterable[str], statuses: Iterable[int] = (0, 1, 2)
 ) -> list[str]:
-    """Name what no quiet command line may do, whatever it is given.
-
-    Parameters
-    ----------
-    ending : Ending
-    names : iterable of str
-        A refusal must name one of these: files, settings.
-    statuses : iterable of int
-        Those that are known.
-
-    Returns
-    -------
-    list of str
-    """
+    """Name what no quiet command line may do, whatever it is given."""
     verb = ending.words[0] if ending.words else ""
     return [f"{verb}: {fault}" for fault in _faults_of(ending, names, statuses)]
 
@@ -126,18 +113,7 @@ def lost(before: dict[str, Any], after: dict[str, Any], whose: str) -> list[str]
 
 
 def unsound_results(folder: Path, status: Any) -> Iterator[str]:
-    """Name what is wrong with a mission's result folder.
-
-    Parameters
-    ----------
-    folder : Path
-    status : int
-        With which the command ended that should have filled it, or should not.
-
-    Yields
-    ------
-    str
-    """
+    """Name what is wrong with a mission's result folder."""
     if status == 2 and os.path.lexists(folder):
         yield f"refused, and leaves {'an empty' if _is_empty(folder) else 'a filled'} folder behind"
     if status not in (0, 1):

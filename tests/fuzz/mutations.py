@@ -327,21 +327,7 @@ TOML: tuple[Mutation, ...] = (value_odd, value_odd, number_odd, number_odd, numb
 
 
 def spoiled(rng: Generator, name: str, data: bytes) -> Spoiled:
-    """Spoil a file in a way that suits it.
-
-    Parameters
-    ----------
-    rng : Generator
-    name : str
-        Its ending tells what it holds.
-    data : bytes
-
-    Returns
-    -------
-    str
-        What was done, after the file's name.
-    bytes
-    """
+    """Spoil a file in a way that suits it."""
     suits = TOML if name.endswith(".toml") else CELLS
     ways = one_of(rng, [suits, suits, suits, suits, LINES, BYTES])
     told, rest = one_of(rng, ways)(rng, data)

@@ -26,18 +26,7 @@ HUNG = "Timeout (0:"
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Ending:
-    """How an action ended.
-
-    Attributes
-    ----------
-    how : "returned", "raised", "hung" or "died"
-    found : Any
-        What it returned: of a command line, its status.
-    words : tuple of str
-        The command line.
-    printed, said : str
-        Standard output and standard error; of what raised or hung, the traceback too.
-    """
+    """How an action ended."""
 
     how: Literal["returned", "raised", "hung", "died"]
     found: Any
@@ -49,21 +38,7 @@ class Ending:
 def command(
     place: Path, *words: str, before: Callable[[], None] = lambda: None, limit: float = LIMIT
 ) -> Ending:
-    """Obey a command line in a child.
-
-    Parameters
-    ----------
-    place : Path
-        Where it is called.
-    *words : str
-    before : callable, optional
-        Done in the child first.
-    limit : [s]
-
-    Returns
-    -------
-    Ending
-    """
+    """Obey a command line in a child."""
 
     def obey() -> int:
         before()
@@ -75,25 +50,17 @@ def command(
     return end_of(obey, place, words, limit)
 
 
+def made(place: Path, *words: str, limit: float) -> None:
+    """Obey a command line without pictures in a child; it must succeed."""
+    ending = command(place, *words, before=undrawn, limit=limit)
+    if ending.how != "returned" or ending.found != 0:
+        raise RuntimeError(f"{words} ends with {ending}")
+
+
 def end_of(
     action: Callable[[], Any], place: Path, words: Sequence[str] = (), limit: float = LIMIT
 ) -> Ending:
-    """Do something in a child, within limits of time and memory.
-
-    Parameters
-    ----------
-    action : callable
-        What it returns must survive pickling.
-    place : Path
-        Its working folder.
-    words : sequence of str
-        What it is called.
-    limit : [s]
-
-    Returns
-    -------
-    Ending
-    """
+    """Do something in a child, within limits of time and memory."""
     with TemporaryFile() as printed, TemporaryFile() as said, TemporaryFile() as found:
         sys.stdout.flush()
         sys.stderr.flush()

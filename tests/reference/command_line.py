@@ -28,4 +28,5 @@ def table(printed):
 
 
 def contents(folder):
-    return {path.name: path.read_bytes() for path in sorted(Path(folder).iterdir())}
+    paths = (path for path in sorted(Path(folder).iterdir()) if path.is_file())
+    return {path.name: path.read_bytes() for path in paths}

@@ -1,4 +1,12 @@
-"""Measurements of a rendered page in a browser."""
+"""Pages in a browser, and measurements of them."""
+
+from contextlib import contextmanager
+from pathlib import Path
+
+import pytest
+
+CHROMIUM = Path("/usr/bin/chromium")
+WIDTHS = {"phone": 390, "desk": 1280}
 
 _CONTRASTS = """(texts) => {
   const light = ([r, g, b]) => [r, g, b].map((v) => v / 255).map(
@@ -17,6 +25,37 @@ _CONTRASTS = """(texts) => {
       return [(Math.max(a, b) + 0.05) / (Math.min(a, b) + 0.05), e.className || e.tagName];
     }).sort((one, other) => one[0] - other[0]);
 }"""
+
+
+@contextmanager
+def chromium():
+    """Start a browser, and close it; skip a test where none is installed."""
+    driver = pytest.importorskip(
+        "playwright.sync_api", reason="playwright is not installed (./dev test installs it)"
+    )
+    if not CHROMIUM.exists():
+        pytest.skip(f"no browser: {CHROMIUM} is missing (Debian's package chromium)")
+    with driver.sync_playwright() as playwright:
+        browser = playwright.chromium.launch(
+            executable_path=str(CHROMIUM), args=["--no-sandbox", "--disable-gpu"]
+        )
+        yield browser
+        browser.close()
+
+
+def shown(browser, path, screen="desk", scheme="light"):
+    """Open a page; return it with a list of its complaints and requests."""
+    context = browser.new_context(
+        viewport={"width": WIDTHS[screen], "height": 900},
+        color_scheme=scheme,
+        has_touch=screen == "phone",
+    )
+    page, noise = context.new_page(), []
+    page.on("console", lambda message: noise.append(message.text))
+    page.on("pageerror", lambda error: noise.append(str(error)))
+    page.on("request", lambda request: noise.append(request.url))
+    page.goto(path.as_uri())
+    return page, noise
 
 
 def contrasts(page, texts):

@@ -1,6 +1,5 @@
 """The report's page in a real browser: quiet, whole, and readable on a phone and on a desk."""
 
-from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -8,32 +7,15 @@ import pytest
 from pipistrelle.report import page as module
 from pipistrelle.report.page import write_report
 from pipistrelle.report.study import read_study
-from reference.pages import contrasts
+from reference.pages import WIDTHS, contrasts, shown
 from report.invented import invent, only
 from report.planted import LEVELS, by_level, write_planted
 
-CHROMIUM = Path("/usr/bin/chromium")
-WIDTHS = {"phone": 390, "desk": 1280}
 FIGURES = (
     "gain", "anees_ekf", "anees_fastslam", "position_rmse",
     "position_rmse_aligned", "heading_rmse", "map_rmse", "map_rmse_aligned",
     "landmarks", "table_ii", "piston", "example_map",
 )  # fmt: skip
-
-
-@pytest.fixture(scope="module")
-def browser() -> Iterator:
-    driver = pytest.importorskip(
-        "playwright.sync_api", reason="playwright is not installed (./dev test installs it)"
-    )
-    if not CHROMIUM.exists():
-        pytest.skip(f"no browser: {CHROMIUM} is missing (Debian's package chromium)")
-    with driver.sync_playwright() as playwright:
-        found = playwright.chromium.launch(
-            executable_path=str(CHROMIUM), args=["--no-sandbox", "--disable-gpu"]
-        )
-        yield found
-        found.close()
 
 
 @pytest.fixture(scope="module")
@@ -61,19 +43,9 @@ SCREENS = [
 @pytest.fixture(scope="module", params=SCREENS)
 def opened(browser, written, request):
     """The page, and everything that it complained about or asked for."""
-    screen, scheme = request.param
-    context = browser.new_context(
-        viewport={"width": WIDTHS[screen], "height": 900},
-        color_scheme=scheme,
-        has_touch=screen == "phone",
-    )
-    page, noise = context.new_page(), []
-    page.on("console", lambda message: noise.append(message.text))
-    page.on("pageerror", lambda error: noise.append(str(error)))
-    page.on("request", lambda request: noise.append(request.url))
-    page.goto(written.as_uri())
+    page, noise = shown(browser, written, *request.param)
     yield page, noise
-    context.close()
+    page.context.close()
 
 
 def test_the_page_loads_without_messages_and_requests_only_itself(opened, written):

@@ -143,7 +143,7 @@ def test_the_share_of_measurements_that_do_not_fit_is_of_bearings_and_excess_pat
     assert "8 of 10 measurements do not fit" in said[1][0]
 
 
-@pytest.mark.parametrize("labels", [True, False])
+@pytest.mark.parametrize("labels", [True, pytest.param(False, marks=pytest.mark.slow)])
 @pytest.mark.parametrize("mistake", SPOILED)
 def test_a_mistake_in_the_columns_is_named_and_no_other(mistake, labels):
     words, fits = misreading(noisy_log(spoil=mistake, labels=labels))
@@ -170,7 +170,7 @@ def test_angular_rates_in_degrees_are_named(labels):
         {"turn_rate": 0.0, "speed": 0.0, "labels": False},
     ],
 )
-@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("seed", [0, *(pytest.param(n, marks=pytest.mark.slow) for n in (1, 2, 3))])
 def test_no_mistake_is_named_in_a_sound_log(conditions, seed):
     assert misreading(noisy_log(**conditions, seed=seed)) == ("", True)
 

@@ -46,17 +46,6 @@ def test_a_reader_that_leaves_early_sees_no_traceback():
     assert process.returncode == 0
 
 
-def test_a_full_disk_is_explained_in_a_line():
-    if not Path("/dev/full").exists():
-        pytest.skip("needs /dev/full")
-    with Path("/dev/full").open("w") as full:
-        command = [sys.executable, "-m", "pipistrelle", "config", "show"]
-        done = subprocess.run(command, stdout=full, stderr=subprocess.PIPE, text=True, check=False)
-    assert done.returncode == 2
-    assert done.stderr.startswith("pipistrelle: error: the output could not be written")
-    assert "Traceback" not in done.stderr
-
-
 HEADS = [["fused", "A", "B"], ["", "ekf", "smoother"]]
 ROWS = [["position RMSE [m]", "0.388", "-"], ["[bold]x", "1", "2"]]
 

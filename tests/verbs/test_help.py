@@ -3,12 +3,17 @@
 import re
 import subprocess
 import sys
+from ast import literal_eval
+from contextlib import redirect_stdout
+from functools import cache
 from inspect import signature
+from io import StringIO
 from math import degrees
 
 import pytest
 
 import pipistrelle
+from pipistrelle.__main__ import main
 from pipistrelle.acoustics.emitter import beamwidth
 from pipistrelle.config import BagConfig, Config
 from pipistrelle.settings import known_settings
@@ -17,51 +22,70 @@ HEAVY = {"numpy", "pydantic", "numba", "matplotlib"}
 VERBS = ["run", "slam", "hear", "study", "view", "report", "compare", "array"]
 
 
-@pytest.mark.parametrize("words", [["--help"], ["--version"], *([v, "--help"] for v in VERBS)])
-def test_help_loads_no_kernels_and_the_list_of_verbs_no_arrays(words):
-    code = "import sys; from pipistrelle.__main__ import main; main(sys.argv[1:]); "
-    called = [sys.executable, "-c", code + f"print({HEAVY} & set(sys.modules))", *words]
-    printed = subprocess.run(called, capture_output=True, text=True, check=True).stdout
-    loaded = printed.splitlines()[-1]
-    assert "numba" not in loaded
-    assert len(words) == 2 or loaded == "set()"
+@pytest.fixture(scope="module")
+def printed():
+    """Return what a command line prints, all sections in one line; each is obeyed once."""
+
+    @cache
+    def printed(*words):
+        text = StringIO()
+        with redirect_stdout(text), pytest.MonkeyPatch.context() as patch:
+            patch.setattr(sys, "argv", ["pipistrelle"])
+            assert main(words) == 0
+        return text.getvalue()
+
+    return printed
 
 
-def test_help_names_the_verbs(obey):
-    status, printed, _ = obey("--help")
-    assert status == 0
-    verbs = [
-        *("array", "compare", "config", "doctor", "hear", "report", "run", "slam", "study", "view")
-    ]
-    assert re.findall(r"^│ (\w+) ", printed, re.M) == verbs
-    assert obey()[1] == printed
+def flowing(text):
+    """Return a help text as one line without frames."""
+    return " ".join(re.sub("[│╭╮╰╯─]", " ", text).split())
+
+
+def test_help_loads_no_kernels_and_the_list_of_verbs_no_arrays():
+    code = (
+        "import sys; from pipistrelle.__main__ import main; loaded = []\n"
+        f"for words in ['--help'], ['--version'], *([v, '--help'] for v in {VERBS}):\n"
+        f"    main(words); loaded.append((words[0], *sorted({HEAVY} & set(sys.modules))))\n"
+        "print(); print(loaded)"
+    )
+    called = [sys.executable, "-c", code]
+    said = subprocess.run(called, capture_output=True, text=True, check=True).stdout
+    loaded = literal_eval(said.splitlines()[-1])
+    assert loaded[:2] == [("--help",), ("--version",)]
+    assert [words[0] for words in loaded[2:]] == VERBS
+    assert not any("numba" in words for words in loaded)
+
+
+def test_help_names_the_verbs(printed):
+    verbs = re.findall(r"^│ (\w+) ", printed("--help"), re.M)
+    assert verbs == sorted([*VERBS, "config", "doctor"])
+    assert printed() == printed("--help")
 
 
 @pytest.mark.parametrize("verb", [("run",), ("config", "show"), ("study",)])
-def test_help_all_lists_every_setting_with_its_default(obey, verb):
-    status, printed, _ = obey(*verb, "--help-all")
-    assert status == 0
+def test_help_all_lists_every_setting_with_its_default(printed, verb):
+    text = printed(*verb, "--help-all")
     known = known_settings()
     flags = {"--" + ".".join(key).replace("_", "-") for key in known}
-    assert flags <= set(re.findall(r"--[a-z0-9.-]+", printed))
+    assert flags <= set(re.findall(r"--[a-z0-9.-]+", text))
     settled = [key for key, field in known.items() if field.default not in (None, ())]
-    assert printed.count("[default:") >= len(settled)
+    assert text.count("[default:") >= len(settled)
 
 
 @pytest.mark.parametrize("verb", VERBS)
-def test_help_lists_at_most_twenty_two_options_without_empty_defaults(obey, verb):
-    status, printed, _ = obey(verb, "--help")
-    assert status == 0
-    flags = re.findall(r"^│ (--[a-z-]+)", printed, re.M)
+def test_help_lists_at_most_twenty_two_options_without_empty_defaults(printed, verb):
+    text = printed(verb, "--help")
+    flags = re.findall(r"^│ (--[a-z-]+)", text, re.M)
     assert 0 < len(flags) <= 22
-    assert not re.search(r"--empty-|default: (none|no|False|\(\))\]", printed)
-    assert "--rays.power" not in printed.partition("╯\n\n")[0]
+    assert not re.search(r"--empty-|default: (none|no|False|\(\))\]", text)
+    assert "--rays.power" not in text.partition("╯\n\n")[0]
 
 
 @pytest.mark.parametrize("verb", ["run", "slam", "hear"])
-def test_parameters_of_python_are_options_with_the_same_words(obey, verb):
+def test_parameters_of_python_are_options_with_the_same_words(printed, verb):
     function = getattr(pipistrelle, verb)
-    words = " ".join(re.sub("[│╭╮╰╯─]", " ", obey(verb, "--help")[1]).split())
+    words = flowing(printed(verb, "--help"))
     named = {"strategies": "strategy", "filters": "filter", "config": "settings"}
     for name in set(signature(function).parameters) - {"progress", "settings", "log", "recording"}:
         assert f"--{named.get(name, name).replace('_', '-')} " in words
@@ -69,8 +93,8 @@ def test_parameters_of_python_are_options_with_the_same_words(obey, verb):
     assert verb == "slam" or (text in words and text in " ".join(function.__doc__.split()))
 
 
-def test_help_all_of_slam_omits_settings_that_a_log_decides(obey):
-    found = set(re.findall(r"--[a-z]+\.[a-z-]+", obey("slam", "--help-all")[1]))
+def test_help_all_of_slam_omits_settings_that_a_log_decides(printed):
+    found = set(re.findall(r"--[a-z]+\.[a-z-]+", printed("slam", "--help-all")))
     rays = ("ratio", "density", "prune", "power", "weights", "likelihood", "spacing")
     rays = (*rays, "merge", "ranged")
     swarm = ("particles", "resample-below", "mixture", "weights", "estimate", "resampled-rays")
@@ -90,8 +114,8 @@ def test_help_all_of_slam_omits_settings_that_a_log_decides(obey):
     }
 
 
-def test_defaults_in_the_help_equal_the_defaults_of_the_settings(obey):
-    words = " ".join(re.sub("[│╭╮╰╯─]", " ", obey("run", "--help")[1]).split())
+def test_defaults_in_the_help_equal_the_defaults_of_the_settings(printed):
+    words = flowing(printed("run", "--help"))
     told = dict(re.findall(r"--([a-z]+) [A-Z]+ (?:(?! --).)*?\[default: ([^]]+)\]", words))
     config = Config()
     width = beamwidth(
@@ -109,8 +133,8 @@ def test_defaults_in_the_help_equal_the_defaults_of_the_settings(obey):
 @pytest.mark.parametrize(
     ("verb", "default"), [("run", "of best the smoother"), ("slam", "else smoother")]
 )
-def test_the_help_lists_the_filters_and_their_default(obey, verb, default):
-    words = " ".join(re.sub("[│╭╮╰╯─]", " ", obey(verb, "--help")[1]).split())
+def test_the_help_lists_the_filters_and_their_default(printed, verb, default):
+    words = flowing(printed(verb, "--help"))
     choices = "[choices: ekf, fastslam, iekf, smoother, both, all]"
     assert f"{choices} [default: that of the settings, {default}]" in words
     assert "--filter --estimator CHOICE Estimators, separated by commas" in words

@@ -1,6 +1,7 @@
 """Closed, full or abandoned streams, and signals to end."""
 
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -13,16 +14,8 @@ from pipistrelle.__main__ import main
 from pipistrelle.experiments.studies.world import done_worlds
 from pipistrelle.verbs.streams import heard_signals
 from reference.command_line import SHORT, summary
+from reference.studies import TINY
 
-TINY = """\
-format = 1
-iterations = 2
-strategies = ["fused"]
-filters = ["ekf"]
-[config.scenario]
-steps = 8
-landmarks = 8
-"""
 PIPISTRELLE = f"'{sys.executable}' -m pipistrelle"
 POSIX = pytest.mark.skipif(os.name != "posix", reason="redirections are those of a POSIX shell")
 FULL = pytest.mark.skipif(not Path("/dev/full").exists(), reason="there is no full device here")
@@ -39,24 +32,22 @@ def shell(line):
 
 LEFT = pytest.param("2>&1 | head -c 1 > first", id="a reader that leaves")
 CLOSED = pytest.param("<&- >&- 2>&-", id="closed")
-UNTOLD = pytest.param("2>/dev/full", id="no room for what is said", marks=FULL)
+UNTOLD = pytest.param("2>/dev/full", id="no room for what is said", marks=(FULL, pytest.mark.slow))
 
 
-def at_night(param):
-    """The same, left out of the fast suite."""
-    return pytest.param(*param.values, id=param.id, marks=[*param.marks, pytest.mark.slow])
-
-
-@pytest.mark.parametrize("streams", [CLOSED, *map(at_night, (LEFT, UNTOLD))])
-def test_a_study_goes_on_whatever_becomes_of_its_words(streams):
+@pytest.mark.parametrize("workers", ["1", pytest.param("2", marks=pytest.mark.slow)])
+@pytest.mark.parametrize("streams", [LEFT, CLOSED, UNTOLD])
+def test_a_study_goes_on_whatever_becomes_of_its_words(streams, workers):
     Path("tiny.toml").write_text(TINY)
-    status, printed = shell(f"{PIPISTRELLE} study tiny.toml -o one {streams}")
+    words = f"study tiny.toml --iterations 2 --workers {workers} -o one"
+    status, printed = shell(f"{PIPISTRELLE} {words} {streams}")
     assert status == 0, printed
     assert done_worlds(Path("one")) == {0, 1}
     assert "Traceback" not in printed
 
 
-@pytest.mark.parametrize("streams", [LEFT, pytest.param("<&- >&- 2>&-", marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("streams", [LEFT, CLOSED])
 def test_a_run_goes_on_whatever_becomes_of_its_words(streams):
     status, printed = shell(f"{PIPISTRELLE} run {' '.join(SHORT)} -o one {streams}")
     assert status == 0, printed
@@ -83,7 +74,7 @@ def test_an_unprintable_result_is_reported_by_the_status():
 
 
 @FULL
-@pytest.mark.parametrize("streams", ["2>/dev/full", "2>&-"])
+@pytest.mark.parametrize("streams", ["2>/dev/full", pytest.param("2>&-", marks=pytest.mark.slow)])
 def test_a_mistake_without_standard_error_keeps_its_status(streams):
     assert shell(f"{PIPISTRELLE} run --bemwidth 3 {streams}") == (2, "")
 
@@ -101,17 +92,17 @@ def test_characters_outside_the_encoding_are_printed_as_numbers():
     assert Path("word").read_bytes() == b"\\u03c3 \xff\n"
 
 
-def test_a_name_that_is_no_text_is_printed_by_its_bytes():
-    log = os.fsdecode(b"log\xff")
-    assert (
-        main(["run", *SHORT, "--strategy", "fused", "--quiet", "--save-log", log, "-o", "1"]) == 0
-    )
-    name = "$'log\\xff'"
-    status, said = shell(f"{PIPISTRELLE} slam {name} -o $'two\\xff' --quiet > folder")
-    assert (status, said) == (0, "")
+def test_a_name_that_is_no_text_is_printed_by_its_bytes(capsys, monkeypatch, short_log, undrawn):
+    log, results = (os.fsdecode(name) for name in (b"log\xff", b"two\xff"))
+    shutil.copytree(short_log, log)
+    with Path("folder").open("w", encoding="utf-8") as folder:
+        words = ["slam", log, "-o", results, "--quiet"]
+        monkeypatch.setattr(sys, "stdout", folder)
+        monkeypatch.setattr(sys, "argv", ["pipistrelle", *words])
+        assert main(words) == 0
+    assert capsys.readouterr().err == ""
     assert Path("folder").read_bytes() == b"two\xff\n"
-    readme = (Path(os.fsdecode(b"two\xff")) / "README.md").read_text()
-    assert r"slam 'log\xff' -o 'two\xff'" in readme
+    assert r"slam 'log\xff' -o 'two\xff'" in Path(results, "README.md").read_text()
 
 
 PLAN = """\
@@ -125,10 +116,12 @@ landmarks = 8
 """
 
 
-@pytest.mark.skipif(os.name != "posix", reason="signals are those of POSIX")
-@pytest.mark.parametrize(
+SIGNALS = pytest.mark.parametrize(
     "ending", [pytest.param(signal.SIGTERM, marks=pytest.mark.slow), signal.SIGINT]
 )
+
+
+@SIGNALS
 def test_a_study_that_is_asked_to_end_ends_in_order(ending):
     Path("long.toml").write_text(PLAN)
     words = ["study", "long.toml", "--workers", "2", "-o", "one"]
@@ -170,8 +163,7 @@ def test_signal_handlers_are_restored():
     assert [signal.getsignal(ending) for ending in (signal.SIGINT, signal.SIGTERM)] == before
 
 
-@pytest.mark.skipif(os.name != "posix", reason="signals are those of POSIX")
-@pytest.mark.parametrize("ending", [signal.SIGTERM, signal.SIGINT])
+@SIGNALS
 def test_a_signal_after_the_work_keeps_the_status(ending):
     """It is sent when Python takes itself down, in a function that is called at the end."""
     code = (

@@ -2,7 +2,6 @@
 
 import json
 import shutil
-import sys
 import tomllib
 from hashlib import sha256
 from pathlib import Path
@@ -10,27 +9,16 @@ from pathlib import Path
 import pytest
 
 import pipistrelle
-from pipistrelle.__main__ import main
 from pipistrelle.config import InputError
 from pipistrelle.files import REPORT, OwnFiles
-from reference.command_line import SHORT
-from reference.pictures import without_picture
-
-
-@pytest.fixture(scope="module")
-def made(tmp_path_factory):
-    """A run's folder."""
-    folder = tmp_path_factory.mktemp("made") / "one"
-    with without_picture() as patch:
-        patch.setattr(sys, "argv", ["pipistrelle"])
-        assert main(["run", *SHORT, "--quiet", "-o", str(folder)]) == 0
-    return folder
+from reference.command_line import SHORT, summary
+from reference.studies import TINY
 
 
 @pytest.fixture
-def folder(made):
-    """The same in the test's own folder, to be changed."""
-    return shutil.copytree(made, Path("one"))
+def folder(short_run):
+    """A run's folder, to be changed."""
+    return shutil.copytree(short_run, Path("one"))
 
 
 def sums(folder):
@@ -57,7 +45,7 @@ def test_the_page_is_added_to_the_result_folder(obey, folder):
 
 
 def test_a_new_mission_in_the_folder_takes_the_old_page_away(obey, folder, undrawn):
-    obey("view", folder, "--quiet")
+    assert obey("view", folder, "--quiet")[0] == 0
     assert obey("run", *SHORT, "--quiet", "--overwrite", "-o", folder)[0] == 0
     assert not (folder / "view.html").exists()
 
@@ -158,10 +146,10 @@ def test_a_page_that_appeared_meanwhile_is_not_replaced(obey, folder, refused, m
 
 
 def test_code_that_a_folder_names_is_not_run_unless_the_user_names_it(folder, refused, monkeypatch):
-    summary = json.loads((folder / "summary.json").read_text())
-    for run in summary["runs"]:
+    told = summary(folder)
+    for run in told["runs"]:
         run["filter"] = "evil:X"
-    (folder / "summary.json").write_text(json.dumps(summary))
+    (folder / "summary.json").write_text(json.dumps(told))
     (folder / "evil.py").write_text("open('ran', 'w').close()\nclass X: pass\n")
     monkeypatch.chdir(folder)
     said = refused("view", ".")
@@ -212,13 +200,13 @@ def test_view_rejects_folders_without_results(refused, make, said):
 
 
 def test_a_study_is_refused_with_what_to_do_instead(obey, refused, undrawn):
-    obey("study", "paper", "--iterations", "1", "--quiet", "--scenario.steps", "8",
-         "--scenario.landmarks", "2", "-o", "study")  # fmt: skip
+    Path("tiny.toml").write_text(TINY)
+    assert obey("study", "tiny.toml", "--quiet", "-o", "study")[0] == 0
     said = refused("view", "study")
     assert said.startswith("study: found a study, which keeps many worlds and the frames of none")
     assert "`pipistrelle report` puts it on a page; `pipistrelle run --settings study/con" in said
-    assert main(["run", "--settings", "study/config.toml", "--quiet", "-o", "one"]) == 0
-    assert main(["view", "one", "--quiet"]) == 0
+    assert obey("run", "--settings", "study/config.toml", "--quiet", "-o", "one")[0] == 0
+    assert obey("view", "one", "--quiet")[0] == 0
 
 
 def test_different_tracks_are_reported_and_the_page_is_written(obey, folder):
@@ -232,10 +220,12 @@ def test_different_tracks_are_reported_and_the_page_is_written(obey, folder):
     assert is_page(folder / "view.html")
 
 
-def test_a_log_that_was_solved_is_played_too_and_may_be_moved(obey, refused, undrawn):
-    obey("run", *SHORT, "--quiet", "--save-log", "log", "-o", "one")
+def test_a_log_that_was_solved_is_played_too_and_may_be_moved(
+    obey, refused, folder, short_log, undrawn
+):
+    shutil.copytree(short_log, "log")
     obey("slam", "log", "--beamwidth", "60", "--quiet", "-o", "two")
-    entry = json.loads(Path("two/summary.json").read_text())["log"]
+    entry = summary("two")["log"]
     assert entry["path"] == str(Path("log").resolve())
     assert entry["robot"] is None
     assert sorted(entry["files"]) == [
@@ -287,7 +277,7 @@ def test_every_bearing_of_a_line_array_is_ambiguous(obey):
     assert "% of the bearings have a double" in printed
 
 
-def test_the_picture_is_written_where_it_is_asked_for_and_nothing_is_replaced(obey):
+def test_the_picture_is_written_where_it_is_asked_for_and_nothing_is_replaced(obey, refused):
     assert obey("array", "square", "-o", "new/square.png", "--quiet") == (
         0,
         "new/square.png\n",
@@ -295,9 +285,7 @@ def test_the_picture_is_written_where_it_is_asked_for_and_nothing_is_replaced(ob
     )
     picture = Path("new/square.png").read_bytes()
     assert picture.startswith(b"\x89PNG")
-    status, _, said = obey("array", str(CIRCLE), "-o", "new/square.png")
-    assert status == 2
-    assert "is there already" in said
+    assert "is there already" in refused("array", CIRCLE, "-o", "new/square.png")
     assert obey("array", str(CIRCLE), "-o", "new/square.png", "--overwrite", "--quiet")[0] == 0
     assert Path("new/square.png").read_bytes() != picture
 

@@ -1,6 +1,5 @@
 """The page in a real browser: it plays, it answers to keys and fingers, and it is quiet."""
 
-from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 
@@ -11,25 +10,7 @@ from pipistrelle.estimation.beliefs import placed
 from pipistrelle.experiments.drives import NO_TRUTH
 from pipistrelle.figures.player.playback import Rows, playback
 from pipistrelle.figures.player.playback import page as written_page
-from reference.pages import contrasts
-
-CHROMIUM = Path("/usr/bin/chromium")
-WIDTHS = {"phone": 390, "desk": 1280}
-
-
-@pytest.fixture(scope="module")
-def browser() -> Iterator:
-    driver = pytest.importorskip(
-        "playwright.sync_api", reason="playwright is not installed (./dev test installs it)"
-    )
-    if not CHROMIUM.exists():
-        pytest.skip(f"no browser: {CHROMIUM} is missing (Debian's package chromium)")
-    with driver.sync_playwright() as playwright:
-        found = playwright.chromium.launch(
-            executable_path=str(CHROMIUM), args=["--no-sandbox", "--disable-gpu"]
-        )
-        yield found
-        found.close()
+from reference.pages import contrasts, shown
 
 
 @pytest.fixture(scope="module")
@@ -37,21 +18,6 @@ def written(played, tmp_path_factory) -> Path:
     path = tmp_path_factory.mktemp("page") / "view.html"
     path.write_text(written_page(played), encoding="utf-8")
     return path
-
-
-def shown(browser, path, screen="desk", scheme="light"):
-    """Open a page; what it complains about or asks for is noted."""
-    context = browser.new_context(
-        viewport={"width": WIDTHS[screen], "height": 900},
-        color_scheme=scheme,
-        has_touch=screen == "phone",
-    )
-    page, noise = context.new_page(), []
-    page.on("console", lambda message: noise.append(message.text))
-    page.on("pageerror", lambda error: noise.append(str(error)))
-    page.on("request", lambda request: noise.append(request.url))
-    page.goto(path.as_uri())
-    return page, noise
 
 
 @pytest.fixture(
