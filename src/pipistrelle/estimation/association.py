@@ -7,16 +7,17 @@ measurements are discarded (`pipistrelle.detection.scans.labelled`) before the u
 predicts measurements from the joint Gaussian of the belief, as they share the error of the pose.
 """
 
+from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any, Protocol, TypeVar
+from typing import Any, Generic, TypeVar
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from pipistrelle.config import InputError
 from pipistrelle.detection.scans import NO_CALLERS, Scan
-from pipistrelle.estimation.beliefs import B, Belief, JointGaussian
+from pipistrelle.estimation.beliefs import Belief, JointGaussian, Landmarks
 from pipistrelle.estimation.measurement import excess_path_slopes, observe
 from pipistrelle.geometry import wrap_angle
 from pipistrelle.jit import kernel
@@ -49,22 +50,36 @@ class Assignment:
     all later scans, before the update."""
 
 
-class Association(Protocol[M]):
+class Association(ABC, Generic[M]):
     """A method of data association, which assigns each measurement of a scan to a landmark.
 
-    Three methods are optional: ``informed(memory, news)`` adds information to an earlier memory
-    (`Assignment.again`), ``knowing(memory, known, callers)`` adds the known landmarks and callers
-    of the initial map to the first memory, and ``tentative(memory)`` returns the labels of
-    landmarks to leave out of the reported map.
+    A class that does not inherit from it works as well (`beliefs.completed`).
     """
 
+    __slots__ = ()
+
+    @abstractmethod
     def start(self) -> M:
         """Return the memory before the first scan."""
-        ...
 
+    @abstractmethod
     def associate(self, memory: M, belief: Belief, scan: Scan) -> tuple[M, Assignment]:
         """Return the memory after a scan, and the assignment, leaving all arguments unchanged."""
-        ...
+
+    def informed(self, memory: M, news: Any) -> M:
+        """Return an earlier memory with information from a later scan (`Assignment.again`)."""
+        raise InputError(
+            f"association: found scans to be associated again, but a {type(self).__name__} has no "
+            "informed(memory, news)"
+        )
+
+    def knowing(self, memory: M, known: Landmarks, callers: Int[np.ndarray, " c"]) -> M:
+        """Return the first memory with the landmarks and callers of the initial map."""
+        return memory
+
+    def tentative(self, memory: M) -> Sequence[int]:
+        """Return the labels of landmarks to leave out of the reported map."""
+        return ()
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -163,24 +178,3 @@ def is_among(label: Int[np.ndarray, " m"], labels: Int[np.ndarray, " n"]) -> Boo
         for other in labels:
             among[m] |= label[m] == other
     return among
-
-
-@kernel
-def how_many_among(label: Int[np.ndarray, " m"], labels: Int[np.ndarray, " n"]) -> int:
-    """Count the labels that are in a set of labels."""
-    return int(np.count_nonzero(is_among(label, labels)))
-
-
-def edited(belief: B, remove: Sequence[int] = (), merge: Sequence[tuple[int, int]] = ()) -> B:
-    """Remove landmarks from a belief and merge pairs of duplicates.
-
-    Raises InputError for a belief that has no ``edited``.
-    """
-    if not (remove or merge):
-        return belief
-    if not hasattr(belief, "edited"):
-        raise InputError(
-            f"association: found landmarks to remove or to merge, but a {type(belief).__name__} "
-            "cannot; expected a belief with edited(remove, merge) and labels(), as the EKFs' have"
-        )
-    return belief.edited(remove, merge)

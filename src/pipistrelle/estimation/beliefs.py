@@ -1,13 +1,18 @@
-"""Records of estimation results, and the protocols of estimators and beliefs."""
+"""Records of estimation results, the base class of beliefs, and the protocol of estimators."""
 
-from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
-from typing import Any, NamedTuple, Protocol, TypeVar, runtime_checkable
+from abc import ABC, abstractmethod
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, fields, replace
+from types import MethodType
+from typing import Any, NamedTuple, Protocol, Self, TypeVar, cast, runtime_checkable
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from pipistrelle.config import InputError
 from pipistrelle.detection.scans import Scan
+
+T = TypeVar("T")
 
 MAX_CALLER_STD = 2.0
 """Largest standard deviation [m] of the position of a moving caller that counts as located."""
@@ -57,20 +62,15 @@ def no_landmarks() -> Landmarks:
 def some_of(landmarks: Landmarks, rows: Bool[np.ndarray, " h"]) -> Landmarks:
     """Select rows of a map by a mask."""
     return Landmarks(
-        landmark=landmarks.landmark[rows],
-        mean=landmarks.mean[rows],
-        covariance=landmarks.covariance[rows],
-        weight=landmarks.weight[rows],
+        **{part.name: getattr(landmarks, part.name)[rows] for part in fields(Landmarks)}
     )
 
 
 def joined(some: Landmarks, others: Landmarks) -> Landmarks:
     """Concatenate the rows of two maps."""
+    names = [part.name for part in fields(Landmarks)]
     return Landmarks(
-        landmark=np.concatenate((some.landmark, others.landmark)),
-        mean=np.concatenate((some.mean, others.mean)),
-        covariance=np.concatenate((some.covariance, others.covariance)),
-        weight=np.concatenate((some.weight, others.weight)),
+        **{name: np.concatenate((getattr(some, name), getattr(others, name))) for name in names}
     )
 
 
@@ -174,37 +174,84 @@ def at_steps(track: Track, steps: Int[np.ndarray, " k"]) -> Track:
     )
 
 
-@runtime_checkable
-class Belief(Protocol):
-    """State of an estimator; immutable.
+@dataclass(frozen=True, kw_only=True)
+class Belief(ABC):
+    """State of an estimator; immutable. All but its pose, its map and `gated` is optional.
 
-    Optional methods (`answer`): ``moving()`` returns moving callers as Landmarks, ``path()`` a
-    smoother's trajectory, (k + 1, 3) and (k + 1, 3, 3), ``tracks()`` a Gaussian (k + 1, 2) and (k +
-    1, 2, 2) for each caller by label (NaN if unknown), ``calibration()`` value and standard
-    deviation of calibration parameters by name, and ``cloud()`` the particles' poses (p, 3), with
-    the attribute ``full``, the weighted mean number of fully initialised landmarks. Data
-    association requires ``joint()``, a `JointGaussian`, ``labels()`` of all landmarks and callers,
-    and ``edited(remove, merge)``, the belief without the labels ``remove``, and with the second of
-    each pair ``merge`` merged into the first.
+    A class that does not inherit from it works as well: `completed` adds the defaults.
     """
 
-    @property
-    def gated(self) -> int:
-        """Number of gated measurements so far."""
-        ...
+    gated: int = 0
+    """Number of gated measurements so far."""
+    innovations: Innovations = NO_INNOVATIONS
+    full: float | None = None
+    """Weighted mean number of fully initialised landmarks over particles."""
 
+    @abstractmethod
     def pose(self) -> Gaussian:
         """Return the vehicle's pose, (3) and (3, 3)."""
-        ...
 
+    @abstractmethod
     def landmarks(self) -> Landmarks:
         """Return the map."""
-        ...
+
+    def moving(self) -> Landmarks:
+        """Return the moving callers."""
+        return no_landmarks()
+
+    def path(self) -> Gaussian | None:
+        """Return a smoother's trajectory, (k + 1, 3) and (k + 1, 3, 3)."""
+        return None
+
+    def tracks(self) -> Mapping[int, Gaussian] | None:
+        """Return a smoother's past positions of callers by label; (k + 1, 2), NaN if unknown."""
+        return None
+
+    def calibration(self) -> Mapping[str, tuple[float, float]]:
+        """Return value and standard deviation of calibration parameters, by name."""
+        return {}
+
+    def cloud(self) -> Float[np.ndarray, "p 3"] | None:
+        """Return the poses of particles [m, m, rad]."""
+        return None
+
+    def joint(self) -> JointGaussian:
+        """Return the joint Gaussian of pose and map, for data association."""
+        raise InputError(f"association: found a {type(self).__name__}, expected one with joint()")
+
+    def labels(self) -> Sequence[int] | None:
+        """Return the labels of all landmarks and callers, for data association."""
+        return None
+
+    def edited(self, remove: Sequence[int], merge: Sequence[tuple[int, int]]) -> Self:
+        """Return the belief without some labels, and with the second of each pair merged."""
+        raise InputError(
+            f"association: found landmarks to remove or to merge, but a {type(self).__name__} "
+            "cannot; expected a belief with edited(remove, merge) and labels(), as the EKFs' have"
+        )
 
 
-def answer(belief: Belief, question: str) -> Any:
-    """Call an optional method of a belief (`Belief`); None if it has no such method."""
-    return getattr(belief, question)() if hasattr(belief, question) else None
+def revises_path(belief: Belief) -> bool:
+    """Return whether a belief has a `Belief.path` of its estimator."""
+    return getattr(type(belief), "path", Belief.path) is not Belief.path
+
+
+class Completed:
+    """An object of an outside class, with the defaults of a base class."""
+
+    def __init__(self, part: Any, base: type) -> None:
+        self.part, self.base = part, base
+
+    def __getattr__(self, name: str) -> Any:
+        if hasattr(self.part, name):
+            return getattr(self.part, name)
+        default = getattr(self.base, name)
+        return MethodType(default, self.part) if callable(default) else default
+
+
+def completed(part: Any, base: type[T]) -> T:
+    """Return an object with a base class's defaults for the methods that its own class lacks."""
+    return part if isinstance(part, base) else cast(T, Completed(part, base))
 
 
 B = TypeVar("B", bound=Belief)

@@ -1,13 +1,13 @@
 """The measurement model with Jacobians: range, bearing and excess path of a point.
 
-`Measurements` and `ExcessPaths` hold a scan's measurements as the estimators' kernels take them.
+`Row` and `ExcessPaths` hold a scan's measurements as the estimators' kernels take them.
 """
 
 import math
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 
 from pipistrelle.detection.scans import (
     BEARING,
@@ -20,7 +20,7 @@ from pipistrelle.detection.scans import (
     Scan,
 )
 from pipistrelle.geometry import wrap_angle
-from pipistrelle.jit import Whole, kernel, no_alloc
+from pipistrelle.jit import Flag, Whole, kernel, no_alloc
 
 NEAREST = 1e-3
 """Distance [m] below which a measurement is not linearised."""
@@ -31,14 +31,14 @@ HUBER_K = 2.0
 """Standard deviations above which Huber's rule down-weights a measurement."""
 
 
-class Measurements(NamedTuple):
-    """Bearings and ranges of a scan, of distinct landmarks, as kernels take them."""
+class Row(NamedTuple):
+    """A bearing and a range of a scan as scalars."""
 
-    landmark: Int[np.ndarray, " m"]
-    bearing: Float[np.ndarray, " m"]  # [rad]
-    range: Float[np.ndarray, " m"]  # [m], NaN if passive
-    bearing_variance: Float[np.ndarray, " m"]  # [rad^2]
-    range_variance: Float[np.ndarray, " m"]  # [m^2]
+    landmark: Whole
+    bearing: float  # [rad]
+    range: float  # [m], NaN if passive
+    bearing_variance: float  # [rad^2]
+    range_variance: float  # [m^2]
 
 
 class ExcessPaths(NamedTuple):
@@ -49,6 +49,7 @@ class ExcessPaths(NamedTuple):
     excess_path: Float[np.ndarray, " d"]  # [m]
     variance: Float[np.ndarray, " d"]  # [m^2]
     row: Int[np.ndarray, " d"]  # index in the scan
+    used: Bool[np.ndarray, " d"]  # whether it has initialised a landmark or caller
 
 
 Columns = tuple[Int[np.ndarray, " m"], Float[np.ndarray, "8 m"]]
@@ -72,24 +73,21 @@ def timings_of(scan: Scan) -> Timings | None:
     return scan.caller, scan.callers, scan.moving
 
 
-@kernel
-def measurements(columns: Columns) -> Measurements:
-    """Return the bearings and ranges of a scan, with variances.
-
-    Measurements with only an excess path, which come last, are left out.
-    """
-    landmark, numbers = columns
-    rows = landmark.size
-    while rows > 0 and math.isnan(numbers[BEARING, rows - 1]):
+@no_alloc
+def rows_with_bearing(columns: Columns) -> Whole:
+    """Count the measurements with a bearing; others, with only an excess path, come last."""
+    rows, bearing = columns[0].size, columns[1][BEARING]
+    while rows > 0 and math.isnan(bearing[rows - 1]):
         rows -= 1
-    bearing_std, range_std = numbers[BEARING_STD, :rows], numbers[RANGE_STD, :rows]
-    return Measurements(
-        landmark[:rows],
-        numbers[BEARING, :rows],
-        numbers[RANGE, :rows],
-        bearing_std * bearing_std,
-        range_std * range_std,
-    )
+    return rows
+
+
+@no_alloc
+def row_of(columns: Columns, m: Whole) -> Row:
+    """Return measurement m as scalars."""
+    landmark, numbers = columns
+    across, along = numbers[BEARING_STD, m], numbers[RANGE_STD, m]
+    return Row(landmark[m], numbers[BEARING, m], numbers[RANGE, m], across * across, along * along)
 
 
 @kernel
@@ -114,31 +112,18 @@ def excess_paths(columns: Columns, timings: Timings) -> ExcessPaths:
         if label != UNLABELLED and label != landmark[m]:
             rows[count], whose[count] = m, label
             count += 1
-    kept = rows[:count]
-    std = numbers[EXCESS_PATH_STD][kept]
-    return ExcessPaths(landmark[kept], whose[:count], numbers[EXCESS_PATH][kept], std * std, kept)
+    kept, used = rows[:count], np.zeros(count, np.bool_)
+    path, std = numbers[EXCESS_PATH][kept], numbers[EXCESS_PATH_STD][kept]
+    return ExcessPaths(landmark[kept], whose[:count], path, std * std, kept, used)
 
 
-class Row(NamedTuple):
-    """A bearing and range of `Measurements` as scalars, faster to pass to kernels than arrays."""
-
-    landmark: Whole
-    bearing: float
-    range: float
-    bearing_variance: float
-    range_variance: float
-
-
-@no_alloc
-def row_of(heard: Measurements, m: Whole) -> Row:
-    """Return measurement m as scalars."""
-    return Row(
-        heard.landmark[m],
-        heard.bearing[m],
-        heard.range[m],
-        heard.bearing_variance[m],
-        heard.range_variance[m],
-    )
+def caller_labels(scan: Scan) -> Int[np.ndarray, " m"]:
+    """Return the label of the caller of each row's excess path; UNLABELLED without one."""
+    labels, timings = np.full(scan.landmark.size, UNLABELLED), timings_of(scan)
+    if timings is not None:
+        found = excess_paths(columns_of(scan), timings)
+        labels[found.row] = found.caller
+    return labels
 
 
 @kernel
@@ -209,34 +194,20 @@ def _away(x: float, y: float, px: float, py: float) -> tuple[float, float, float
 
 
 @kernel
-def range_by_excess_path(excess_path: float, dx: float, dy: float, c: float, s: float) -> float:
-    """Return the range of a point in direction (c, s) from the vehicle, for a caller at (dx, dy).
-
-    It is infinite or negative if no point in this direction has the excess path (`landmark_range`).
-    """
-    if excess_path <= 0.0:
-        return math.inf
-    straight = math.sqrt(dx * dx + dy * dy)
-    return (
-        0.5
-        * excess_path
-        * (2.0 * straight + excess_path)
-        / (straight + excess_path - c * dx - s * dy)
-    )
-
-
-@kernel
-def caller_range_by_excess_path(
-    excess_path: float, dx: float, dy: float, c: float, s: float
+def range_by_excess_path(
+    path: float, dx: float, dy: float, c: float, s: float, of_caller: Flag
 ) -> float:
-    """Return the range of a caller in direction (c, s) from the vehicle, for a point at (dx, dy).
+    """Return the range of a point in direction (c, s), for a caller at (dx, dy) from the vehicle.
 
-    It is infinite or negative if no caller in this direction causes the excess path.
+    ``of_caller`` selects the range of a caller, for a point at (dx, dy). It is infinite or negative
+    if nothing in this direction has the excess path (`landmark_range`).
     """
-    if excess_path <= 0.0:
+    if path <= 0.0:
         return math.inf
-    near = math.sqrt(dx * dx + dy * dy)
-    return 0.5 * excess_path * (2.0 * near - excess_path) / (c * dx + s * dy + excess_path - near)
+    away = math.sqrt(dx * dx + dy * dy)
+    if of_caller:
+        return 0.5 * path * (2.0 * away - path) / (c * dx + s * dy + path - away)
+    return 0.5 * path * (2.0 * away + path) / (away + path - c * dx - s * dy)
 
 
 def excess_path_of(
@@ -284,4 +255,4 @@ def landmark_range(excess_path: float, caller: Float[np.ndarray, "2"], bearing: 
     5.0
     """
     dx, dy = caller
-    return range_by_excess_path(excess_path, dx, dy, math.cos(bearing), math.sin(bearing))
+    return range_by_excess_path(excess_path, dx, dy, math.cos(bearing), math.sin(bearing), False)

@@ -27,10 +27,11 @@ Page, Biometrika 41 (1954); Yang, Antonante, Tzoumas & Carlone, IEEE Robotics an
 """
 
 import math
+from abc import abstractmethod
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import cache
-from typing import Any, Protocol, Self, TypeVar
+from typing import Any, Self, TypeVar
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -52,8 +53,6 @@ from pipistrelle.estimation.measurement import excess_path_slopes, observe
 from pipistrelle.geometry import wrap_angle
 from pipistrelle.jit import Whole, kernel, no_alloc
 
-DEGREES = 3
-"""Degrees of freedom of a pose."""
 FASTER = 1.4
 """Factor of the convexity parameter per pass (Yang et al.)."""
 UNTOLD = 1e-6
@@ -62,21 +61,20 @@ SINGULAR = 1e-12
 """Least variance of a predicted pose [m^2, rad^2]."""
 
 
-class Recoverable(Belief, Protocol):
+@dataclass(frozen=True, kw_only=True)
+class Recoverable(Belief):
     """A belief that supports recovery from odometry failures."""
 
-    @property
-    def doubt(self) -> float:
-        """Cumulative gain of discarding the odometry in the last scans."""
-        ...
+    doubt: float = 0.0
+    """Cumulative gain of discarding the odometry in the last scans."""
 
+    @abstractmethod
     def joint(self, among: Int[np.ndarray, " n"] | None = None) -> JointGaussian:
         """Return the joint Gaussian of pose and landmarks, optionally only of given labels."""
-        ...
 
+    @abstractmethod
     def freed(self, pose: Float[np.ndarray, "3"], stds: Float[np.ndarray, "3"]) -> Self:
         """Move the vehicle to a pose, with an independent error added."""
-        ...
 
 
 B = TypeVar("B", bound=Recoverable)
@@ -93,10 +91,10 @@ def odometry_bound(gate: float) -> float:
     """
     from scipy.special import gammaincinv
 
-    return float(2.0 * gammaincinv(0.5 * DEGREES, gate))
+    return float(2.0 * gammaincinv(1.5, gate))
 
 
-def corrected(
+def recovering(
     correct: Callable[[B, Scan], B], belief: B, scan: Scan, gate: float, reach: float
 ) -> B:
     """Update a belief with a scan, discarding the previous odometry if it failed (`recovered`)."""

@@ -15,20 +15,16 @@ from jaxtyping import Float, Int
 from pipistrelle.config import InputError
 from pipistrelle.detection.noise import ConstantNoise
 from pipistrelle.detection.scans import NO_CALLERS, UNLABELLED, Scan, labelled
-from pipistrelle.estimation.association import (
-    Assignment,
-    Association,
-    edited,
-    how_many_among,
-    is_among,
-)
+from pipistrelle.estimation.association import Assignment, Association, is_among
 from pipistrelle.estimation.beliefs import (
     AcceptsMap,
     B,
     Belief,
+    Completed,
     Estimator,
     Gaussian,
     Landmarks,
+    completed,
     some_of,
 )
 from pipistrelle.estimation.checking import usable_scan
@@ -42,8 +38,8 @@ Leg = tuple[Float[np.ndarray, "k c"], Float[np.ndarray, " k"]]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class _Heard:
-    """A scan stored for re-association, with the belief before it."""
+class StoredScan:
+    """A scan that data association may revise, with the belief before it."""
 
     number: int
     legs: Sequence[Leg]
@@ -52,7 +48,7 @@ class _Heard:
     """Belief before the scan, after these steps."""
     memory: Any
     """The association's memory before the scan."""
-    came: Scan
+    original: Scan
     scan: Scan
     """The scan as changed by the association (`Assignment.scan`)."""
     label: Int[np.ndarray, " m"]
@@ -67,7 +63,7 @@ class SessionState(NamedTuple):
     """State of the random generator."""
     memory: Any
     """Memory of the association."""
-    past: Sequence[_Heard]
+    past: Sequence[StoredScan]
     legs: Sequence[Leg]
     open: Any
     """Belief and random state before the last control steps, if further steps may join them."""
@@ -134,9 +130,9 @@ class Session(Generic[B]):
         live: bool = False,
     ) -> None:
         self._estimator, self._rng = estimator, rng
-        self._association, self._noise = association, noise
-        self._memory = association.start() if association else None
-        self._past: deque[_Heard] = deque(maxlen=REMEMBERED)
+        self._association = completed(association, Association) if association else None
+        self._memory, self._noise = association.start() if association else None, noise
+        self._past: deque[StoredScan] = deque(maxlen=REMEMBERED)
         self._legs: list[Leg] = []
         self._dropped: set[int] = set()
         self.labels: list[Int[np.ndarray, " m"]] = []
@@ -145,8 +141,8 @@ class Session(Generic[B]):
         self.belief = estimator.init(start)
         if known is not None and known.landmark.size and isinstance(estimator, AcceptsMap):
             self.belief = estimator.knowing(self.belief, known)
-            if hasattr(association, "knowing"):
-                self._memory = association.knowing(self._memory, known, callers)
+            if self._association:
+                self._memory = self._association.knowing(self._memory, known, callers)
 
     def move(self, controls: Float[np.ndarray, "k c"], dt: Float[np.ndarray, " k"]) -> Gaussian:
         """Predict through control steps; return the pose after each, (k, 3) and (k, 3, 3)."""
@@ -157,26 +153,30 @@ class Session(Generic[B]):
         poses, done = [], 0
         while done < len(dt):
             size = MOST_STEPS - (len(self._legs[-1][1]) if self._open else 0)
-            poses.append(self._go_on(controls[done : done + size], dt[done : done + size]))
+            poses.append(self._extend(controls[done : done + size], dt[done : done + size]))
             done += size
-        return joined_poses(poses)
+        mean, covariance = (
+            np.concatenate([getattr(part, name) for part in poses])
+            for name in ("mean", "covariance")
+        )
+        return replace(poses[0], mean=mean, covariance=covariance)
 
     def hear(self, scan: Scan) -> Scan:
         """Associate a scan and update the belief with it; return the scan as used."""
         self._open = None
         if self._association is None:
             self._legs = []
-            return self._correct(scan)
+            return self._update(scan)
         memory, assignment = self._associate(scan)
         if assignment.again is not None and self._past:
-            self._hear_again(assignment.again)
+            self._associate_again(self._association, assignment.again)
             memory, assignment = self._associate(scan)
-        return self._hear(scan, memory, assignment)
+        return self._store(scan, memory, assignment)
 
     def landmarks(self) -> Landmarks:
         """Return the map, without the association's tentative landmarks."""
-        landmarks = self.belief.landmarks()
-        if not hasattr(self._association, "tentative"):
+        landmarks: Landmarks = completed(self.belief, Belief).landmarks()
+        if self._association is None:
             return landmarks
         tentative = np.array([*self._association.tentative(self._memory)], np.int64)
         return some_of(landmarks, ~is_among(landmarks.landmark, tentative))
@@ -213,12 +213,14 @@ class Session(Generic[B]):
         check_poses("predict", poses, len(dt))
         return poses
 
-    def _go_on(self, controls: Float[np.ndarray, "k c"], dt: Float[np.ndarray, " k"]) -> Gaussian:
+    def _extend(self, controls: Float[np.ndarray, "k c"], dt: Float[np.ndarray, " k"]) -> Gaussian:
         """Predict again through the last, extended control steps; return the new steps' poses."""
         if self._open:
             self.belief, self._rng.bit_generator.state = self._open
             before, took = self._legs.pop()
-            self._legs.append((_joined_steps(before, controls), np.concatenate((took, dt))))
+            width = max(before.shape[1], controls.shape[1])
+            steps = [_with_columns(part, width) for part in (before, controls)]
+            self._legs.append((np.concatenate(steps), np.concatenate((took, dt))))
         else:
             self._open = self.belief, self._rng.bit_generator.state
             self._legs.append((controls, dt))
@@ -227,8 +229,8 @@ class Session(Generic[B]):
             self._open = None
         return replace(poses, mean=poses.mean[new], covariance=poses.covariance[new])
 
-    def _correct(self, scan: Scan) -> Scan:
-        """Update the belief with a labelled scan."""
+    def _update(self, scan: Scan) -> Scan:
+        """Update the belief with a labelled scan; return the scan as used."""
         used = usable_scan(scan)
         belief = self._estimator.update(self.belief, used, self._rng)
         if not hasattr(belief, "pose"):
@@ -240,166 +242,138 @@ class Session(Generic[B]):
         """Return the association's memory after a scan, and its assignment."""
         assert self._association is not None, "hear asks only where there is one"
         stated = self._noise(scan) if self._noise else scan
-        answer = self._association.associate(self._memory, self.belief, stated)
-        if not (isinstance(answer, tuple) and len(answer) == 2 and type(answer[1]) is Assignment):
+        found = self._association.associate(self._memory, self.belief, stated)
+        if not (isinstance(found, tuple) and len(found) == 2 and type(found[1]) is Assignment):
             raise _wrong_return(
-                self._association, "associate", answer, "the memory and an Assignment"
+                self._association, "associate", found, "the memory and an Assignment"
             )
-        return answer
+        return found
 
-    def _hear(self, scan: Scan, memory: Any, assignment: Assignment) -> Scan:
-        """Update the belief with a scan and its assignment."""
+    def _store(self, scan: Scan, memory: Any, assignment: Assignment) -> Scan:
+        """Update the belief with a scan and its assignment, and store the scan."""
         if assignment.remove:
-            self._take_back(assignment.remove)
-        if assignment.earlier:
-            self._state_again(assignment.earlier)
-        heard = _Heard(
+            self._remove(assignment.remove)
+        past = [*self._past]
+        if changed := [n for n, one in enumerate(past) if one.number in assignment.earlier]:
+            for n in changed:
+                stated, label = assignment.earlier[past[n].number], past[n].label
+                label = np.where(label == UNLABELLED, stated.landmark, label)
+                past[n] = replace(past[n], scan=stated, label=label)
+            self._repeat(past, changed[0])
+        stored = StoredScan(
             number=self._first + len(self.labels),
             legs=self._legs,
             belief=self.belief,
             memory=self._memory,
-            came=scan,
+            original=scan,
             scan=assignment.scan or scan,
             label=assignment.label,
             merge=assignment.merge,
         )
-        self._past.append(heard)
+        self._past.append(stored)
         self._memory, self._legs = memory, []
-        used = self._use(heard)
+        used = self._use(stored)
         if self._live and (old := len(self.labels) - REMEMBERED) > 0:
             del self.labels[:old]
             self._first += old
         return used
 
-    def _use(self, heard: _Heard, since: int = 0) -> Scan:
+    def _use(self, stored: StoredScan, since: int = 0) -> Scan:
         """Update the belief with a stored scan; merges change labels from scan ``since`` on."""
-        self.labels[heard.number - self._first :] = [heard.label]
-        for kept, gone in heard.merge:
+        self.labels[stored.number - self._first :] = [stored.label]
+        for kept, gone in stored.merge:
             labels = self.labels[since:]
             self.labels[since:] = [np.where(label == gone, kept, label) for label in labels]
-        self.belief = edited(self.belief, merge=heard.merge)
-        scan = self._noise.hidden(heard.came, heard.scan) if self._noise else heard.scan
-        merged = labelled(scan, heard.label)
-        return self._correct(self._noise(merged) if self._noise else merged)
+        self.belief = _edited(self.belief, merge=stored.merge)
+        scan = self._noise.hidden(stored.original, stored.scan) if self._noise else stored.scan
+        merged = labelled(scan, stored.label)
+        return self._update(self._noise(merged) if self._noise else merged)
 
-    def _take_back(self, labels: tuple[int, ...]) -> None:
+    def _remove(self, labels: tuple[int, ...]) -> None:
         """Remove landmarks, with all of their measurements in memory."""
         past = [*self._past]
         labels = (*labels, *(gone for one in past for kept, gone in one.merge if kept in labels))
         named = np.array(labels)
-        rows = [how_many_among(one.label, named) for one in past]
-        callers = [how_many_among(one.scan.callers, named) for one in past]
-        heard = [n for n in range(len(past)) if rows[n] or callers[n]]
+        rows = [int(is_among(one.label, named).sum()) for one in past]
+        heard = [
+            n for n, one in enumerate(past) if rows[n] or is_among(one.scan.callers, named).any()
+        ]
         self._dropped.update(labels)
         for n in heard:
-            past[n] = _without(past[n], named)
+            label, callers = (
+                np.where(is_among(of, named), UNLABELLED, of)
+                for of in (past[n].label, past[n].scan.callers)
+            )
+            past[n] = replace(past[n], label=label, scan=replace(past[n].scan, callers=callers))
         once = sum(rows) == len(labels) and len(heard) == 1
-        if heard and not (once and not _held(past[heard[0]].belief, labels)):
-            self._go_again(past, heard[0])
-        else:  # An object measured only once has not affected anything else.
-            self.belief = edited(self.belief, remove=_held(self.belief, labels))
-            for n in heard:
-                self.labels[past[n].number - self._first] = past[n].label
-        self._past = deque(past, maxlen=REMEMBERED)
-
-    def _state_again(self, earlier: Mapping[int, Scan]) -> None:
-        """Repeat stored scans with the association's changes to them."""
-        past = [*self._past]
-        changed = [n for n, one in enumerate(past) if one.number in earlier]
-        if not changed:
+        if heard and not (once and not _present(past[heard[0]].belief, labels)):
+            self._repeat(past, heard[0])
             return
-        for n in changed:
-            scan, label = earlier[past[n].number], past[n].label
-            label = np.where(label == UNLABELLED, scan.landmark, label)
-            past[n] = replace(past[n], scan=scan, label=label)
-        self._go_again(past, changed[0])
+        # An object measured only once has not affected anything else.
+        self.belief = _without(self.belief, labels)
+        for n in heard:
+            self.labels[past[n].number - self._first] = past[n].label
         self._past = deque(past, maxlen=REMEMBERED)
 
-    def _go_again(self, past: list[_Heard], first: int) -> None:
-        """Return to the belief before a stored scan, and repeat all scans since."""
-        before = past[first].belief
-        self.belief = edited(before, remove=_held(before, [*self._dropped]))
+    def _repeat(self, past: list[StoredScan], first: int) -> None:
+        """Return to the belief before a stored scan, and repeat all scans since, as changed."""
+        self.belief = _without(past[first].belief, [*self._dropped])
         since = past[first].number - self._first
         for n in range(first, len(past)):
             if n > first:
-                self._go(past[n].legs)
-            past[n] = self._as_held(past[n])
+                self._move_again(past[n].legs)
+            merge = past[n].merge  # without absent landmarks
+            if merge:
+                held = {*_present(self.belief, [label for pair in merge for label in pair])}
+                merge = tuple(pair for pair in merge if {*pair} <= held)
+            past[n] = replace(past[n], belief=self.belief, merge=merge)
             self._use(past[n], since)
-        self._go(self._legs)
+        self._move_again(self._legs)
+        self._past = deque(past, maxlen=REMEMBERED)
 
-    def _as_held(self, heard: _Heard) -> _Heard:
-        """Return a stored scan for the current belief, without merges of absent landmarks."""
-        merge = heard.merge
-        if merge:
-            held = _held(self.belief, [label for pair in merge for label in pair])
-            merge = tuple(pair for pair in merge if {*pair} <= {*held})
-        return replace(heard, belief=self.belief, merge=merge)
-
-    def _hear_again(self, news: Any) -> None:
+    def _associate_again(self, association: Association[Any], news: Any) -> None:
         """Associate all stored scans again, with new information."""
-        informed = getattr(self._association, "informed", None)
-        if informed is None:
-            raise InputError(
-                f"association: found scans to be associated again, but a "
-                f"{type(self._association).__name__} has no informed(memory, news)"
-            )
         past, legs = list(self._past), self._legs
+        memory = association.informed(past[0].memory, news)
         self._past.clear()
         del self.labels[past[0].number - self._first :]
-        dropped = _held(past[0].belief, [*self._dropped])
-        self.belief = edited(past[0].belief, remove=dropped)
-        self._dropped = set()  # labels may be reused
-        self._memory = informed(past[0].memory, news)
+        self.belief = _without(past[0].belief, [*self._dropped])
+        self._dropped, self._memory = set(), memory  # labels may be reused
         for one in past:
             if one is not past[0]:
-                self._go(one.legs)
+                self._move_again(one.legs)
             self._legs = list(one.legs)
-            self._hear(one.came, *self._associate(one.came))
-        self._go(legs)
+            self._store(one.original, *self._associate(one.original))
+        self._move_again(legs)
         self._legs = legs
 
-    def _go(self, legs: Sequence[Leg]) -> None:
+    def _move_again(self, legs: Sequence[Leg]) -> None:
         """Predict through earlier control steps again."""
         for controls, dt in legs:
             self._move(controls, dt)
 
 
-def _joined_steps(
-    one: Float[np.ndarray, "k c"], other: Float[np.ndarray, "n d"]
-) -> Float[np.ndarray, "k+n e"]:
-    """Concatenate control steps; missing covariances become NaN."""
-    width = max(one.shape[1], other.shape[1])
-    parts = [
-        np.pad(part, ((0, 0), (0, width - part.shape[1])), constant_values=np.nan)
-        if part.shape[1] < width
-        else part
-        for part in (one, other)
-    ]
-    return np.concatenate(parts)
+def _with_columns(controls: Float[np.ndarray, "k c"], width: int) -> Float[np.ndarray, "k w"]:
+    """Return control steps with NaN for the covariance that they lack."""
+    missing = np.full((len(controls), width - controls.shape[1]), np.nan)
+    return np.hstack((controls, missing))
 
 
-def joined_poses(parts: Sequence[Gaussian]) -> Gaussian:
-    """Concatenate poses."""
-    if len(parts) == 1:
-        return parts[0]
-    mean = np.concatenate([poses.mean for poses in parts])
-    return replace(
-        parts[0], mean=mean, covariance=np.concatenate([poses.covariance for poses in parts])
-    )
+def _present(belief: Any, labels: Sequence[int]) -> list[int]:
+    """Return the given labels that a belief contains; all, if it does not list them."""
+    held = completed(belief, Belief).labels()
+    return [label for label in labels if held is None or label in held]
 
 
-def _held(belief: Belief, labels: Sequence[int]) -> list[int]:
-    """Return the given labels that a belief contains; all, if it has no ``labels``."""
-    held = {*belief.labels()} if hasattr(belief, "labels") else {*labels}
-    return [label for label in labels if label in held]
+def _without(belief: B, labels: Sequence[int]) -> B:
+    """Remove those of some labels that a belief contains."""
+    return _edited(belief, remove=_present(belief, labels))
 
 
-def _without(heard: _Heard, labels: Int[np.ndarray, " n"]) -> _Heard:
-    """Remove labels from a stored scan's measurements and callers."""
-    label, callers = (
-        np.where(is_among(of, labels), UNLABELLED, of) for of in (heard.label, heard.scan.callers)
-    )
-    return replace(heard, label=label, scan=replace(heard.scan, callers=callers))
+def _edited(belief: B, remove: Sequence[int] = (), merge: Sequence[tuple[int, int]] = ()) -> B:
+    """Remove landmarks from a belief and merge pairs of duplicates."""
+    editable: Any = completed(belief, Belief)
+    return editable.edited(remove, merge) if remove or merge else belief
 
 
 def check_poses(method: str, poses: Gaussian, size: int) -> None:
@@ -416,6 +390,7 @@ def check_poses(method: str, poses: Gaussian, size: int) -> None:
 
 def _wrong_return(part: object, method: str, found: object, expected: str) -> InputError:
     """Return an InputError for a wrong return value of an external method."""
-    name = f"{type(part).__module__}.{type(part).__qualname__}.{method}"
+    kind = type(part.part if isinstance(part, Completed) else part)
+    name = f"{kind.__module__}.{kind.__qualname__}.{method}"
     fix = "does it lack its return?" if found is None else "correct it"
     return InputError(f"{name}: found {type(found).__name__} returned, expected {expected}; {fix}")

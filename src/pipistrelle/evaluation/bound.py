@@ -19,7 +19,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from pipistrelle.detection.scans import NUMBERS, UNLABELLED, Scan
-from pipistrelle.estimation.measurement import columns_of, excess_paths, timings_of
+from pipistrelle.estimation.measurement import caller_labels
 from pipistrelle.estimation.motion import (
     Motion,
     MotionNumbers,
@@ -107,7 +107,7 @@ def pose_bound(
     label = np.concatenate([np.empty(0, np.int64), *(scan.landmark for scan in scans)])
     numbers = np.concatenate([np.empty((NUMBERS, 0)), *(scan.numbers for scan in scans)], axis=1)
     known = np.isin(label, labels)
-    caller = np.concatenate([np.empty(0, np.int64), *map(_whose, scans)])[known]
+    caller = np.concatenate([np.empty(0, np.int64), *map(caller_labels, scans)])[known]
     caller[~np.isin(caller, labels)] = UNLABELLED
     met = np.column_stack([label[known], np.where(caller == UNLABELLED, label[known], caller)])
     heard, first = np.unique(met, return_index=True)
@@ -161,15 +161,6 @@ def true_controls(
         return controls
     commanded = controls.any(axis=1, keepdims=True)
     return np.where(commanded, controls_between(path, np.diff(time), motion), controls)
-
-
-def _whose(scan: Scan) -> Int[np.ndarray, " m"]:
-    """Return the label of the caller of each row's excess path; UNLABELLED without one."""
-    who, timings = np.full(len(scan.landmark), UNLABELLED), timings_of(scan)
-    if timings is not None:
-        heard = excess_paths(columns_of(scan), timings)
-        who[heard.row] = heard.caller
-    return who
 
 
 @no_alloc

@@ -17,11 +17,12 @@ from pipistrelle.estimation.beliefs import (
     Belief,
     Gaussian,
     Landmarks,
-    answer,
+    completed,
     in_sight,
     joined,
     no_landmarks,
     placed,
+    revises_path,
 )
 
 RECENT_FRAMES = 40
@@ -76,21 +77,22 @@ class MissionRecorder:
         """Keep a snapshot."""
         frames = self.snapshots.setdefault((strategy, estimator), [])
         path, landmarks = None, None
-        if self._rest is not None and hasattr(belief, "path"):
+        if self._rest is not None and revises_path(belief):
             asked = self._asked.setdefault((strategy, estimator), [])
             if asked and len(frames) - asked[-1] < max(self._rest, len(frames) // 60):
                 landmarks = frames[-1].landmarks
             else:
-                path = answer(belief, "path").mean[:, :2] if len(asked) % 5 == 0 else None
+                revised = belief.path() if len(asked) % 5 == 0 else None
+                path = None if revised is None else revised.mean[:, :2]
                 asked.append(len(frames))
-        pose, moving = belief.pose(), answer(belief, "moving")
+        pose, belief = belief.pose(), completed(belief, Belief)
         snapshot = Snapshot(
             scan=scan,
             pose=pose.mean,
             covariance=pose.covariance,
             landmarks=belief.landmarks() if landmarks is None else landmarks,
-            moving=no_landmarks() if moving is None else in_sight(moving),
-            cloud=answer(belief, "cloud"),
+            moving=in_sight(belief.moving()),
+            cloud=belief.cloud(),
             path=path,
         )
         frames.append(snapshot)

@@ -25,7 +25,7 @@ from pipistrelle.detection.logs.vehicle import Vehicle as VehicleKeys
 from pipistrelle.detection.noise import noise_of
 from pipistrelle.detection.scans import OWN
 from pipistrelle.estimation.association import KNOWN
-from pipistrelle.estimation.beliefs import Gaussian, Landmarks, answer, no_landmarks
+from pipistrelle.estimation.beliefs import Belief, Gaussian, Landmarks, completed
 from pipistrelle.estimation.catalogue import ASSOCIATION, ESTIMATOR, class_of, entry, names_class
 from pipistrelle.estimation.checking import usable_controls
 from pipistrelle.estimation.data_association.sequential import association_of
@@ -217,7 +217,7 @@ class Slam:
     @property
     def moving(self) -> "pl.DataFrame":
         """Moving callers, with the columns of `map`."""
-        return self._map_table(answer(self._session.belief, "moving") or no_landmarks())
+        return self._map_table(completed(self._session.belief, Belief).moving())
 
     @staticmethod
     def _map_table(landmarks: Landmarks) -> "pl.DataFrame":
@@ -233,7 +233,7 @@ class Slam:
         The smoothed trajectory, if the estimator revises it; else the kept estimates.
         """
         time, online = self._online()
-        revised = answer(self._session.belief, "path")
+        revised = completed(self._session.belief, Belief).path()
         if revised is None:
             return path_table(time, online)
         smoothed, kept = self._at_vehicle(revised), slice(-time.size, None)

@@ -45,11 +45,11 @@ from pipistrelle.estimation.ekf.filter import EkfBelief
 from pipistrelle.estimation.ekf.gaussian import INVARIANT, LINEAR
 from pipistrelle.estimation.fastslam.block import LANES
 from pipistrelle.estimation.fastslam.filter import FastSlamBelief
-from pipistrelle.estimation.session import MOST_STEPS, SessionState, _Heard
+from pipistrelle.estimation.session import MOST_STEPS, SessionState, StoredScan
 from pipistrelle.estimation.smoother.belief import SmootherBelief
 from pipistrelle.estimation.smoother.history import NEVER, STRETCH, History
 from pipistrelle.estimation.smoother.preintegration import Calibration, Odometry
-from pipistrelle.estimation.smoother.records import CALLER, POSE, Stack
+from pipistrelle.estimation.smoother.records import CALLER, POSE, NoiseModel, Stack
 from pipistrelle.estimation.smoother.sweep import Points, Solution, Stretch
 from pipistrelle.files import printable, read_file, read_named, write_whole
 from pipistrelle.refusals import refusal, shown
@@ -84,8 +84,9 @@ RECORDS: dict[str, Any] = {
     kind.__name__: kind
     for kind in (
         Caller, CallerPlace, Calibration, EarlyScan, EkfBelief, FastSlamBelief, Gaussian, History,
-        Innovations, JointGaussian, Known, Landmarks, Memory, Odometry, Points, RayConfig, Scan,
-        ScanRows, SessionState, SmootherBelief, Solution, Stack, Stretch, Tracks, _Heard,
+        Innovations, JointGaussian, Known, Landmarks, Memory, NoiseModel, Odometry, Points,
+        RayConfig, Scan, ScanRows, SessionState, SmootherBelief, Solution, Stack, StoredScan,
+        Stretch, Tracks,
     )
 }  # fmt: skip
 """The records that a file may name."""
@@ -602,7 +603,6 @@ def _smoother(belief: SmootherBelief) -> Any:
         and (points.at.size, points.parameters.size) == (nodes, p)
         and len(points.spots) == len(history.placed)
         and _shapes(points.at, (d,))
-        and len(belief.noise) == 5
         and odometry.slopes.shape[1:] == (3, q)
         and _is_pose(belief.at)
         and _is_pose(belief.ahead)
@@ -674,8 +674,8 @@ LAWS: dict[Any, Callable[[Any], Any]] = {
         len(it.rows) == len(it.poses)
         and all(within(rows[:, 0], 0, len(it.last)) for rows in it.rows)
     ),
-    _Heard: lambda it: (
-        it.label.size == it.came.landmark.size == it.scan.landmark.size and it.number >= 0
+    StoredScan: lambda it: (
+        it.label.size == it.original.landmark.size == it.scan.landmark.size and it.number >= 0
     ),
 }
 """Checks of the numbers of a record against each other."""

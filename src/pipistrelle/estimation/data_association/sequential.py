@@ -108,7 +108,7 @@ class Limits:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Sequential:
+class Sequential(Association[Memory]):
     """Data association that works scan by scan.
 
     Two measurements on an empty map become two landmarks, which the next scans match.
@@ -184,7 +184,7 @@ class _Work:
 
     def __init__(self, stage: Sequential, memory: Memory, belief: Belief, scan: Scan) -> None:
         self.stage, self.memory, self.scan = stage, memory, scan
-        self.joint: JointGaussian = belief.joint()  # pyrefly: ignore[missing-attribute]
+        self.joint: JointGaussian = belief.joint()
         self.pose, limits = self.joint.mean[:3], stage.limits
         self.label = np.full(scan.landmark.size, UNLABELLED)
         self.labels, self.callers = memory.labels, dict(memory.callers)

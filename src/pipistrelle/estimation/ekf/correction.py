@@ -53,20 +53,19 @@ from pipistrelle.estimation.ekf.gaussian import (
     point_rows,
 )
 from pipistrelle.estimation.ekf.tdoa import (
-    FrameExcessPaths,
     added_by_excess_path,
     correct_by_excess_path,
-    frame_excess_paths,
     placed_by_excess_path,
 )
 from pipistrelle.estimation.measurement import (
     Columns,
-    Measurements,
+    ExcessPaths,
     Row,
     Timings,
-    measurements,
+    excess_paths,
     observe,
     row_of,
+    rows_with_bearing,
 )
 from pipistrelle.estimation.rays import (
     ANEW,
@@ -314,34 +313,35 @@ def _add_new(state: State, row: Row, params: UpdateParams, moves: bool) -> None:
 @no_alloc
 def _take_in(
     state: State,
-    heard: Measurements,
+    columns: Columns,
     known: Bool[np.ndarray, " m"],
-    frame: FrameExcessPaths | None,
+    paths: ExcessPaths | None,
+    moving: Int[np.ndarray, " v"] | None,
     params: UpdateParams,
     scratch: Scratch,
 ) -> Whole:
     """Update mapped landmarks, then append new landmarks; return the number of gated rows."""
     gated = 0
-    for m in range(heard.landmark.size):
+    for m in range(known.size):
         if known[m]:
-            row, placed = row_of(heard, m), False
-            if frame is not None:
-                placed = placed_by_excess_path(state, row, frame, params.robust, scratch)
+            row, placed = row_of(columns, m), False
+            if paths is not None:
+                placed = placed_by_excess_path(state, row, paths, params.robust, scratch)
             if not placed:
                 gated += _correct_known(state, row, params, scratch)
     flush(state.joint, 3 + 2 * state.members[0])
-    for m in range(heard.landmark.size):
+    for m in range(known.size):
         if not known[m]:
-            row, placed, moves = row_of(heard, m), False, False
-            if frame is not None:
-                placed = added_by_excess_path(state, row, frame, params.robust)
-                moves = row.landmark in frame.moving
+            row, placed, moves = row_of(columns, m), False, False
+            if paths is not None and moving is not None:
+                placed = added_by_excess_path(state, row, paths, params.robust)
+                moves = row.landmark in moving
             if not placed:
                 _add_new(state, row, params, moves)
-    if frame is not None:
-        for d in range(frame.landmark.size):
-            if not frame.used[d]:
-                gated += correct_by_excess_path(state, frame, d, params, scratch)
+    if paths is not None:
+        for d in range(paths.landmark.size):
+            if not paths.used[d]:
+                gated += correct_by_excess_path(state, paths, d, params, scratch)
         flush(state.joint, 3 + 2 * state.members[0])
     return gated
 
@@ -361,22 +361,23 @@ def corrected(
 
     Returns its arrays, the number of gated measurements, and the numbers of `beliefs.Innovations`.
     """
-    heard = measurements(columns)
-    members, rows = old_landmark.size, heard.landmark.size
-    most, known = members, np.empty(rows, dtype=np.bool_)
-    for m in range(rows):
-        known[m] = members_of(old_landmark, members, heard.landmark[m])[1] > 0
+    members, known = old_landmark.size, np.empty(rows_with_bearing(columns), dtype=np.bool_)
+    most = members
+    for m in range(known.size):
+        row = row_of(columns, m)
+        known[m] = members_of(old_landmark, members, row.landmark)[1] > 0
         if not known[m]:
-            most += max(params.ray_ranges.size, 2) if math.isnan(heard.range[m]) else 1
+            most += max(params.ray_ranges.size, 2) if math.isnan(row.range) else 1
     joint, scratch = joint_of(old_mean, old_covariance, 3 + 2 * most, turns), scratch_for(most)
     landmark, weight = np.empty(most, dtype=np.int64), np.empty(most)
     state = State(joint, landmark, weight, np.full(1, members))
     for member in range(members):
         landmark[member], weight[member] = old_landmark[member], old_weight[member]
     if timings is None:
-        gated = _take_in(state, heard, known, None, params, scratch)
+        gated = _take_in(state, columns, known, None, None, params, scratch)
     else:
-        gated = _take_in(state, heard, known, frame_excess_paths(columns, timings), params, scratch)
+        paths, moving = excess_paths(columns, timings), timings[2]
+        gated = _take_in(state, columns, known, paths, moving, params, scratch)
     joint.mean[2], members = wrap_angle(joint.mean[2]), state.members[0]
     mean, covariance = gaussian_of(joint, 3 + 2 * members)
     squared, degrees = scratch.innovations

@@ -44,14 +44,7 @@ from jaxtyping import Bool, Float, Int
 
 from pipistrelle.config import InputError, RayConfig
 from pipistrelle.detection.scans import UNLABELLED, Scan
-from pipistrelle.estimation import recovery
-from pipistrelle.estimation.beliefs import (
-    NO_INNOVATIONS,
-    Gaussian,
-    Innovations,
-    JointGaussian,
-    Landmarks,
-)
+from pipistrelle.estimation.beliefs import Gaussian, JointGaussian, Landmarks
 from pipistrelle.estimation.checking import (
     check_belief,
     check_gate,
@@ -75,6 +68,7 @@ from pipistrelle.estimation.ekf.gaussian import (
 from pipistrelle.estimation.measurement import columns_of, timings_of
 from pipistrelle.estimation.motion import Motion, motion_numbers
 from pipistrelle.estimation.rays import update_params
+from pipistrelle.estimation.recovery import Recoverable, recovering
 from pipistrelle.jit import Flag, Whole, kernel
 
 _NOBODY, _SUM = UNLABELLED, UNLABELLED - 1
@@ -275,7 +269,7 @@ def _present(landmark: Int[np.ndarray, " h"], label: int) -> int:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class EkfBelief:
+class EkfBelief(Recoverable):
     r"""A joint Gaussian over pose x and landmark hypotheses m (Bradley & Abaid, Eqs. (8) and (9)).
 
     .. math:: P = \begin{bmatrix} P_{xx} & P_{xm} \\ P_{mx} & P_{mm} \end{bmatrix}
@@ -292,13 +286,8 @@ class EkfBelief:
     weight: Float[np.ndarray, " h"]
     """Aggregated likelihood of each hypothesis within its landmark; `WAITING_WEIGHT` for stored
     bearings."""
-    gated: int
-    """Number of gated measurements so far."""
-    innovations: Innovations = NO_INNOVATIONS
     error: float = LINEAR
     """Error definition: `gaussian.LINEAR` or `gaussian.INVARIANT`."""
-    doubt: float = 0.0
-    """Evidence for failed odometry (`estimation.recovery`)."""
     origin: Float[np.ndarray, "2"] = field(default_factory=lambda: np.zeros(2))
     """Start position [m] for the invariant error; (0, 0) for the linear error."""
 
@@ -471,7 +460,6 @@ class EkfSlam:
             covariance=pose.covariance,
             landmark=np.empty(0, dtype=np.int64),
             weight=np.empty(0),
-            gated=0,
             error=self.error,
             origin=origin,
         )
@@ -552,9 +540,7 @@ class EkfSlam:
         scan = usable_scan(scan)
         if scan.landmark.size == 0:
             return belief
-        return recovery.corrected(
-            self._corrected, belief, scan, self.gate, self.rays.range_bounds[1]
-        )
+        return recovering(self._corrected, belief, scan, self.gate, self.rays.range_bounds[1])
 
     def _corrected(self, belief: EkfBelief, scan: Scan) -> EkfBelief:
         """Update the belief with the measurements that pass the gate."""

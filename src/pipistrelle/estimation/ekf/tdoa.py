@@ -24,10 +24,9 @@ Between two rays an excess path is not used, as some pair of hypotheses fits any
 """
 
 import math
-from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float
 
 from pipistrelle.estimation.ekf.delayed_initialization import WAITING_WEIGHT, Scratch, members_of
 from pipistrelle.estimation.ekf.gaussian import (
@@ -47,16 +46,13 @@ from pipistrelle.estimation.measurement import (
     HUBER_K,
     MIN_TDOA_SIGMAS,
     NEAREST,
-    Columns,
+    ExcessPaths,
     Row,
-    Timings,
-    caller_range_by_excess_path,
     excess_path_slopes,
-    excess_paths,
     range_by_excess_path,
 )
 from pipistrelle.estimation.rays import UpdateParams, log_likelihood, survivors, weigh_and_share
-from pipistrelle.jit import Flag, Whole, kernel, no_alloc
+from pipistrelle.jit import Flag, Whole, no_alloc
 
 MAX_RELATIVE_RANGE_STD = 0.1
 """Largest standard deviation of a range from an excess path, relative to the range."""
@@ -181,10 +177,7 @@ def _leverage(
     mean = joint.mean
     c, s = math.cos(direction), math.sin(direction)
     dx, dy = mean[iy] - mean[0], mean[iy + 1] - mean[1]
-    if of_caller:
-        r = caller_range_by_excess_path(excess_path, dx, dy, c, s)
-    else:
-        r = range_by_excess_path(excess_path, dx, dy, c, s)
+    r = range_by_excess_path(excess_path, dx, dy, c, s, of_caller)
     if not NEAREST < r < math.inf:
         return 0.0, 0.0, 0.0, 0.0, 0.0
     x, y = mean[0] + r * c, mean[1] + r * s
@@ -276,27 +269,6 @@ ROBUST_BEARING_FACTOR = 3.0
 displace all later landmarks."""
 
 
-class FrameExcessPaths(NamedTuple):
-    """The excess paths of a scan, and the labels of moving callers."""
-
-    landmark: Int[np.ndarray, " d"]
-    caller: Int[np.ndarray, " d"]
-    excess_path: Float[np.ndarray, " d"]  # [m]
-    variance: Float[np.ndarray, " d"]  # [m^2]
-    used: Bool[np.ndarray, " d"]  # whether it has initialised a landmark or caller
-    moving: Int[np.ndarray, " v"]
-
-
-@kernel
-def frame_excess_paths(columns: Columns, timings: Timings) -> FrameExcessPaths:
-    """Return the excess paths of a scan, all unused."""
-    heard = excess_paths(columns, timings)
-    used = np.zeros(heard.landmark.size, dtype=np.bool_)
-    return FrameExcessPaths(
-        heard.landmark, heard.caller, heard.excess_path, heard.variance, used, timings[2]
-    )
-
-
 @no_alloc
 def _single(state: State, label: Whole) -> Whole:
     """Return the index of a landmark's only hypothesis, or -1 if it has none or several."""
@@ -305,7 +277,7 @@ def _single(state: State, label: Whole) -> Whole:
 
 
 @no_alloc
-def _surest(state: State, row: Row, frame: FrameExcessPaths, robust: bool) -> Whole:
+def _surest(state: State, row: Row, paths: ExcessPaths, robust: bool) -> Whole:
     """Return the excess path that gives the most precise range of a measurement's landmark, or -1.
 
     It is of this landmark with an initialised caller, or via an initialised landmark if this
@@ -316,14 +288,14 @@ def _surest(state: State, row: Row, frame: FrameExcessPaths, robust: bool) -> Wh
     across = row.bearing_variance * (
         ROBUST_BEARING_FACTOR * ROBUST_BEARING_FACTOR if robust else 1.0
     )
-    for d in range(frame.landmark.size):
-        of_caller = frame.caller[d] == row.landmark
-        if frame.used[d] or not (of_caller or frame.landmark[d] == row.landmark):
+    for d in range(paths.landmark.size):
+        of_caller = paths.caller[d] == row.landmark
+        if paths.used[d] or not (of_caller or paths.landmark[d] == row.landmark):
             continue
-        other = _single(state, frame.landmark[d] if of_caller else frame.caller[d])
+        other = _single(state, paths.landmark[d] if of_caller else paths.caller[d])
         if other < 0:
             continue
-        measured = (frame.excess_path[d], frame.variance[d], row.bearing, across)
+        measured = (paths.excess_path[d], paths.variance[d], row.bearing, across)
         share = relative_range_std(state.joint, size, 3 + 2 * other, of_caller, measured)
         if share < least:
             best, least = d, share
@@ -331,66 +303,66 @@ def _surest(state: State, row: Row, frame: FrameExcessPaths, robust: bool) -> Wh
 
 
 @no_alloc
-def _place(state: State, member: Whole, row: Row, frame: FrameExcessPaths, d: Whole) -> None:
+def _place(state: State, member: Whole, row: Row, paths: ExcessPaths, d: Whole) -> None:
     """Initialise a landmark by excess path d and the bearing of its measurement."""
-    of_caller = frame.caller[d] == row.landmark
-    other = _single(state, frame.landmark[d] if of_caller else frame.caller[d])
-    measured = (frame.excess_path[d], frame.variance[d], row.bearing, row.bearing_variance)
+    of_caller = paths.caller[d] == row.landmark
+    other = _single(state, paths.landmark[d] if of_caller else paths.caller[d])
+    measured = (paths.excess_path[d], paths.variance[d], row.bearing, row.bearing_variance)
     size = 3 + 2 * state.members[0]
     place_by_excess_path(state.joint, size, 3 + 2 * member, 3 + 2 * other, of_caller, measured)
-    frame.used[d] = True
+    paths.used[d] = True
 
 
 @no_alloc
 def placed_by_excess_path(
-    state: State, row: Row, frame: FrameExcessPaths, robust: bool, scratch: Scratch
+    state: State, row: Row, paths: ExcessPaths, robust: bool, scratch: Scratch
 ) -> bool:
     """Initialise a ray or a stored bearing by an excess path; return whether this was possible."""
     first, count = members_of(state.landmark, state.members[0], row.landmark)
     if count == 1 or not math.isnan(row.range):
         return False
-    d = _surest(state, row, frame, robust)
+    d = _surest(state, row, paths, robust)
     if d < 0:
         return False
     for j in range(count):
         scratch.keep[j] = j == 0
     drop_members(state, first, count, scratch.keep, scratch.source)
     state.weight[first] = 1.0
-    _place(state, first, row, frame, d)
+    _place(state, first, row, paths, d)
     return True
 
 
 @no_alloc
-def added_by_excess_path(state: State, row: Row, frame: FrameExcessPaths, robust: bool) -> bool:
+def added_by_excess_path(state: State, row: Row, paths: ExcessPaths, robust: bool) -> bool:
     """Append a new landmark by bearing and excess path; return whether this was possible."""
-    d = _surest(state, row, frame, robust) if math.isnan(row.range) else -1
+    d = _surest(state, row, paths, robust) if math.isnan(row.range) else -1
     if d < 0:
         return False
     member = state.members[0]
     state.landmark[member], state.weight[member] = row.landmark, 1.0
     state.members[0] += 1
-    _place(state, member, row, frame, d)
+    _place(state, member, row, paths, d)
     return True
 
 
 @no_alloc
 def _weigh(
     state: State,
-    frame: FrameExcessPaths,
+    paths: ExcessPaths,
     d: Whole,
     of_caller: Flag,
     params: UpdateParams,
     scratch: Scratch,
 ) -> None:
     """Weigh and prune the hypotheses of a ray by excess path d."""
-    label = frame.caller[d] if of_caller else frame.landmark[d]
-    other = _single(state, frame.landmark[d] if of_caller else frame.caller[d])
+    label = paths.caller[d] if of_caller else paths.landmark[d]
+    other = _single(state, paths.landmark[d] if of_caller else paths.caller[d])
     ray = members_of(state.landmark, state.members[0], label)
     first, count = ray
     if state.weight[first] == WAITING_WEIGHT:
         return
     weigh_by_excess_path(
-        state, ray, other, of_caller, frame.excess_path[d], frame.variance[d], scratch.likelihood
+        state, ray, other, of_caller, paths.excess_path[d], paths.variance[d], scratch.likelihood
     )
     weight = state.weight[first:]
     weigh_and_share(
@@ -402,17 +374,17 @@ def _weigh(
 
 @no_alloc
 def correct_by_excess_path(
-    state: State, frame: FrameExcessPaths, d: Whole, params: UpdateParams, scratch: Scratch
+    state: State, paths: ExcessPaths, d: Whole, params: UpdateParams, scratch: Scratch
 ) -> Whole:
     """Update landmark, caller and vehicle by excess path d, or weigh a ray; GATED or APPLIED."""
-    member, caller = _single(state, frame.landmark[d]), _single(state, frame.caller[d])
+    member, caller = _single(state, paths.landmark[d]), _single(state, paths.caller[d])
     if member >= 0 and caller >= 0:
         size, i, ib = 3 + 2 * state.members[0], 3 + 2 * member, 3 + 2 * caller
         return correct_excess_path(
-            state.joint, size, i, ib, frame.excess_path[d], frame.variance[d],
+            state.joint, size, i, ib, paths.excess_path[d], paths.variance[d],
             params.passive_bound, params.robust,
         )  # fmt: skip
-    ray = frame.landmark[d] if caller >= 0 else frame.caller[d]
+    ray = paths.landmark[d] if caller >= 0 else paths.caller[d]
     if (member >= 0 or caller >= 0) and members_of(state.landmark, state.members[0], ray)[1]:
-        _weigh(state, frame, d, bool(caller < 0), params, scratch)
+        _weigh(state, paths, d, bool(caller < 0), params, scratch)
     return APPLIED

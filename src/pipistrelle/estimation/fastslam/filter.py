@@ -58,13 +58,7 @@ from jaxtyping import Bool, Float, Int
 
 from pipistrelle.config import FastSlamConfig, InputError, RayConfig
 from pipistrelle.detection.scans import Scan, rows_of
-from pipistrelle.estimation.beliefs import (
-    NO_INNOVATIONS,
-    Gaussian,
-    Innovations,
-    JointGaussian,
-    Landmarks,
-)
+from pipistrelle.estimation.beliefs import Belief, Gaussian, JointGaussian, Landmarks
 from pipistrelle.estimation.checking import (
     check_belief,
     check_gate,
@@ -103,9 +97,10 @@ _PACKED = ([0, 0, 1, 0, 1, 2], [0, 1, 1, 2, 2, 2])
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class FastSlamBelief:
+class FastSlamBelief(Belief):
     """Particles with poses, maps and weights, and their estimate.
 
+    Innovations are of the heaviest particle before each scan.
     Particles are kept in b blocks of L = `block.LANES`: a row of L numbers is a number of each of a
     block's particles. Spare lanes of the last block repeat the last particle.
     """
@@ -124,8 +119,6 @@ class FastSlamBelief:
     best_count: Int[np.ndarray, " n"]  # map of the heaviest particle, before resampling
     best_member: Float[np.ndarray, "c 6"]
     full: float  # weighted mean number of fully initialised landmarks
-    gated: int
-    innovations: Innovations = NO_INNOVATIONS  # of the heaviest particle before each scan
     best: int = 0  # heaviest particle, or its first copy after resampling
     mixed: bool = False  # whether the map combines all particles
     before: "FastSlamBelief | None" = None  # belief before resampling, until the next motion
@@ -203,7 +196,6 @@ class FastSlam:
             best_count=np.empty(0, dtype=np.int64),
             best_member=np.empty((0, 6)),
             full=0.0,
-            gated=0,
             mixed=self.settings.estimate == "mixture",
         )
 

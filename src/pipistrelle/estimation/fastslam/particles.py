@@ -10,6 +10,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from pipistrelle.detection.scans import RANGE
 from pipistrelle.estimation.fastslam.block import (
     LANES,
     LOG_WEIGHT,
@@ -43,7 +44,7 @@ from pipistrelle.estimation.fastslam.block_rays import (
     weigh_by_active,
     weigh_by_bearing,
 )
-from pipistrelle.estimation.measurement import Columns, Measurements, Row, measurements, row_of
+from pipistrelle.estimation.measurement import Columns, Row, row_of, rows_with_bearing
 from pipistrelle.estimation.rays import ANEW, BEARING, CORRECTED, MOVED, OTHERS, RESET, UpdateParams
 from pipistrelle.jit import Whole, kernel, no_alloc, no_alloc_inlined
 
@@ -72,29 +73,22 @@ class Block(NamedTuple):
     member: Float[np.ndarray, "c numbers"]
 
 
-@no_alloc
-def slot_of(landmark: Int[np.ndarray, " n"], label: Whole) -> Whole:
-    """Return the index of a landmark by its label; -1 if the map lacks it."""
-    for n in range(landmark.size):
-        if landmark[n] == label:
-            return n
-    return -1
-
-
 @kernel
-def _slots(landmark: Int[np.ndarray, " n"], labels: Int[np.ndarray, " m"]) -> Int[np.ndarray, " m"]:
-    """Return the index of each label among the landmarks; -1 if new."""
-    slot = np.empty(labels.size, dtype=np.int64)
-    for m in range(labels.size):
-        slot[m] = slot_of(landmark, labels[m])
+def _slots(landmark: Int[np.ndarray, " n"], columns: Columns) -> Int[np.ndarray, " m"]:
+    """Return the index of each measurement's landmark on the map; -1 if new."""
+    slot = np.full(rows_with_bearing(columns), -1)
+    for m in range(slot.size):
+        for n in range(landmark.size):
+            if landmark[n] == columns[0][m]:
+                slot[m] = n
     return slot
 
 
 @kernel
 def gated_by_all(arrays: Arrays, columns: Columns, params: UpdateParams) -> Bool[np.ndarray, " m"]:
     """Return a mask of the measurements that are outside the gate of every particle."""
-    particles, heard = Particles(*arrays), measurements(columns)
-    slot = _slots(particles.landmark, heard.landmark)
+    particles = Particles(*arrays)
+    slot = _slots(particles.landmark, columns)
     gated, blocks = np.zeros(columns[0].size, dtype=np.bool_), particles.pose.shape[0]
     for m in range(slot.size):
         n = slot[m]
@@ -102,14 +96,14 @@ def gated_by_all(arrays: Arrays, columns: Columns, params: UpdateParams) -> Bool
         for b in range(blocks if n >= 0 else 0):
             pose, count = particles.pose[b], particles.count[b, n]
             rows = particles.member[b, particles.first[n] : particles.first[n + 1]]
-            if not math.isnan(heard.range[m]):
+            if not math.isnan(columns[1][RANGE, m]):
                 gated[m] = gated[m] and active_beyond(
-                    pose, rows[0], row_of(heard, m), count, params.active_bound
+                    pose, rows[0], row_of(columns, m), count, params.active_bound
                 )
                 continue
             for j in range(most_members(count)):
                 gated[m] = gated[m] and bearing_beyond(
-                    pose, rows[j], row_of(heard, m), count, j, params.passive_bound
+                    pose, rows[j], row_of(columns, m), count, j, params.passive_bound
                 )
     return gated
 
@@ -117,18 +111,18 @@ def gated_by_all(arrays: Arrays, columns: Columns, params: UpdateParams) -> Bool
 @kernel
 def innovations_of(arrays: Arrays, columns: Columns, particle: Whole) -> tuple[float, float]:
     """Sum a particle's squared innovations of initialised landmarks and their dimensions."""
-    particles, heard = Particles(*arrays), measurements(columns)
-    slot, b, i = _slots(particles.landmark, heard.landmark), particle // LANES, particle % LANES
+    particles = Particles(*arrays)
+    slot, b, i = _slots(particles.landmark, columns), particle // LANES, particle % LANES
     squared, degrees = 0.0, 0.0
     for m in range(slot.size):
         n = slot[m]
         if n < 0 or particles.count[b, n, i] != 1:
             continue
         member = particles.member[b, particles.first[n]]
-        one = squared_innovation(particles.pose[b], member, row_of(heard, m), i)
+        one = squared_innovation(particles.pose[b], member, row_of(columns, m), i)
         if not math.isnan(one):
             squared += one
-            degrees += 1.0 if math.isnan(heard.range[m]) else 2.0
+            degrees += 1.0 if math.isnan(columns[1][RANGE, m]) else 2.0
     return squared, degrees
 
 
@@ -165,7 +159,7 @@ def _correct_by_range(
 def _refine(
     block: Block,
     slot: Int[np.ndarray, " m"],
-    heard: Measurements,
+    columns: Columns,
     params: UpdateParams,
     scratch: Scratch,
 ) -> None:
@@ -175,34 +169,24 @@ def _refine(
         if n < 0:
             continue
         rows, count = block.member[block.first[n] : block.first[n + 1]], block.count[n]
-        row = row_of(heard, m)
+        row, pose, gained = row_of(columns, m), block.pose, block.gained
         if math.isnan(row.range):
-            whole = scratch.whole
-            refine_by_ray(block.pose, rows, count, row, params, whole, scratch, block.gained)
-        else:
-            if most_members(count) > 1:
-                part_lanes(count, scratch)
-                _refine_by_ranged_ray(block, rows, count, row, params, scratch)
-            refine_by_active(block.pose, rows[0], row, count, block.gained)
-
-
-@no_alloc
-def _refine_by_ranged_ray(
-    block: Block, rows: Rows, count: Counts, row: Row, params: UpdateParams, scratch: Scratch
-) -> None:
-    """Weigh a block's poses by range and bearing of a ray, or refine them by its bearing only."""
-    pose, gained, ray = block.pose, block.gained, scratch.ray
-    if params.ranged >= BEARING:
-        refine_by_ray(pose, rows, count, row, params, ray, scratch, gained)
-        return
-    weigh_by_active(pose, rows, row, count, ray, scratch, gained)
+            refine_by_ray(pose, rows, count, row, params, scratch.whole, scratch, gained)
+            continue
+        if most_members(count) > 1:
+            part_lanes(count, scratch)
+            if params.ranged >= BEARING:
+                refine_by_ray(pose, rows, count, row, params, scratch.ray, scratch, gained)
+            else:
+                weigh_by_active(pose, rows, row, count, scratch.ray, scratch, gained)
+        refine_by_active(pose, rows[0], row, count, gained)
 
 
 @no_alloc
 def _weigh_at_sample(
     block: Block,
     slot: Int[np.ndarray, " m"],
-    heard: Measurements,
+    columns: Columns,
     before: tuple[Poses, Poses],
     params: UpdateParams,
     scratch: Scratch,
@@ -215,7 +199,7 @@ def _weigh_at_sample(
         if n < 0:
             continue
         rows, count = block.member[block.first[n] : block.first[n + 1]], block.count[n]
-        row, pose, gained = row_of(heard, m), block.pose, block.gained
+        row, pose, gained = row_of(columns, m), block.pose, block.gained
         if math.isnan(row.range):
             whole = scratch.whole
             weigh_by_bearing(pose, rows, count, row, whole, scratch, gained)
@@ -227,29 +211,25 @@ def _weigh_at_sample(
             weigh_by_bearing(pose, rows, count, row, scratch.ray, scratch, gained)
 
 
-@no_alloc_inlined
-def _correct_row(block: Block, n: Whole, row: Row, params: UpdateParams, scratch: Scratch) -> None:
-    """Update a block's landmark n with a measurement from the sampled poses, in place."""
-    rows, pose = block.member[block.first[n] : block.first[n + 1]], block.pose
-    count = block.count[n]
-    if math.isnan(row.range):
-        correct_ray(pose, rows, count, row, params, scratch.whole, scratch)
-        return
-    _correct_by_range(pose, rows, count, row, params, scratch)
-
-
 @no_alloc
 def _correct(
     block: Block,
     slot: Int[np.ndarray, " m"],
-    heard: Measurements,
+    columns: Columns,
     params: UpdateParams,
     scratch: Scratch,
 ) -> None:
     """Update a block's measured landmarks from its sampled poses, in place."""
     for m in range(slot.size):
-        if slot[m] >= 0:
-            _correct_row(block, slot[m], row_of(heard, m), params, scratch)
+        n = slot[m]
+        if n < 0:
+            continue
+        rows, count = block.member[block.first[n] : block.first[n + 1]], block.count[n]
+        row = row_of(columns, m)
+        if math.isnan(row.range):
+            correct_ray(block.pose, rows, count, row, params, scratch.whole, scratch)
+        else:
+            _correct_by_range(block.pose, rows, count, row, params, scratch)
 
 
 @no_alloc
@@ -272,7 +252,7 @@ def _place(
     block: Block,
     slot: Int[np.ndarray, " m"],
     known: Whole,
-    heard: Measurements,
+    columns: Columns,
     params: UpdateParams,
 ) -> None:
     """Initialise a block's new landmarks."""
@@ -280,13 +260,13 @@ def _place(
     for m in range(slot.size):
         if slot[m] < 0:
             rows = block.member[block.first[new] : block.first[new + 1]]
-            _add_new(block.pose, rows, block.count[new], row_of(heard, m), params)
+            _add_new(block.pose, rows, block.count[new], row_of(columns, m), params)
             new += 1
 
 
 @kernel
 def _rows(
-    particles: Particles, slot: Int[np.ndarray, " m"], heard: Measurements, rays: Whole
+    particles: Particles, slot: Int[np.ndarray, " m"], columns: Columns, rays: Whole
 ) -> tuple[Int[np.ndarray, " n"], Int[np.ndarray, " n+1"], Whole]:
     """Return all labels, each landmark's first row, and the largest number of rows."""
     known, fresh, widest = particles.landmark.size, 0, 1
@@ -302,8 +282,8 @@ def _rows(
         widest = max(widest, wide)
     for m in range(slot.size):
         if slot[m] < 0:
-            labels[known] = heard.landmark[m]
-            wide = rays if math.isnan(heard.range[m]) else 1
+            labels[known] = columns[0][m]
+            wide = rays if math.isnan(columns[1][RANGE, m]) else 1
             first[known + 1] = first[known] + wide
             widest = max(widest, wide)
             known += 1
@@ -335,10 +315,10 @@ def correct_particles(
 
     With ``sampled``, particles are weighed at the sampled pose.
     """
-    old, heard = Particles(*arrays), measurements(columns)
+    old = Particles(*arrays)
     blocks, known, total = old.pose.shape[0], old.landmark.size, normal.shape[0]
-    slot = _slots(old.landmark, heard.landmark)
-    landmark, first, widest = _rows(old, slot, heard, params.ray_ranges.size)
+    slot = _slots(old.landmark, columns)
+    landmark, first, widest = _rows(old, slot, columns, params.ray_ranges.size)
     pose, gained = old.pose.copy(), np.zeros((blocks, LANES))
     count = np.zeros((blocks, landmark.size, LANES), dtype=np.int64)
     member = np.empty((blocks, first[-1], MEMBER))
@@ -346,15 +326,15 @@ def correct_particles(
     for b in range(blocks):
         block = Block(pose[b], gained[b], first, count[b], member[b])
         _copy_members(old, b, block)
-        _refine(block, slot, heard, params, scratch)
+        _refine(block, slot, columns, params, scratch)
         proposal[:] = block.pose
         for k in range(draw.size):
             draw[k] = normal[min(b * LANES + k % LANES, total - 1), k // LANES]
         sample_pose(block.pose, draw)
         if sampled:
-            _weigh_at_sample(block, slot, heard, (old.pose[b], proposal), params, scratch)
-        _correct(block, slot, heard, params, scratch)
-        _place(block, slot, known, heard, params)
+            _weigh_at_sample(block, slot, columns, (old.pose[b], proposal), params, scratch)
+        _correct(block, slot, columns, params, scratch)
+        _place(block, slot, known, columns, params)
     return (pose, landmark, first, count, member), gained.ravel()[:total]
 
 

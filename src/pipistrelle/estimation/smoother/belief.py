@@ -9,20 +9,14 @@ from jaxtyping import Bool, Float, Int
 
 from pipistrelle.config import InputError, RayConfig
 from pipistrelle.detection.scans import BEARING, BEARING_STD
-from pipistrelle.estimation.beliefs import (
-    NO_INNOVATIONS,
-    Gaussian,
-    Innovations,
-    JointGaussian,
-    Landmarks,
-)
+from pipistrelle.estimation.beliefs import Gaussian, JointGaussian, Landmarks
 from pipistrelle.estimation.rays import ray_members
+from pipistrelle.estimation.recovery import Recoverable
 from pipistrelle.estimation.smoother.history import NEVER, History
 from pipistrelle.estimation.smoother.preintegration import Odometry, placed, poses_between
-from pipistrelle.estimation.smoother.records import CALLER, POSE, Stack
+from pipistrelle.estimation.smoother.records import CALLER, POSE, NoiseModel, Stack
 from pipistrelle.estimation.smoother.solution import joint
 from pipistrelle.estimation.smoother.sweep import (
-    Noise,
     Smoothed,
     Solution,
     converged,
@@ -127,8 +121,12 @@ def _renumbered(history: History, kept: Bool[np.ndarray, " l"]) -> History:
     )
 
 
+MapRow = tuple[int, Float[np.ndarray, "2"], Float[np.ndarray, "2 2"], float]
+"""Label, position, covariance and weight of a hypothesis."""
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
-class SmootherBelief:
+class SmootherBelief(Recoverable):
     """Solution of all measurements up to the last node, and the control steps since."""
 
     at: Gaussian
@@ -139,12 +137,8 @@ class SmootherBelief:
     """Control steps since the last node, with assumed parameters."""
     history: History
     solution: Solution
-    noise: Noise
+    noise: NoiseModel
     rays: RayConfig
-    gated: int = 0
-    innovations: Innovations = NO_INNOVATIONS  # counted only with a gate
-    doubt: float = 0.0
-    """Evidence for failed odometry (`estimation.recovery`)."""
     found: dict[str, Any] = field(init=False, repr=False, default_factory=dict)
     """Cache of the optimum and its covariances."""
 
@@ -200,14 +194,9 @@ class SmootherBelief:
 
     def landmarks(self) -> Landmarks:
         """Return the map: a Gaussian for each initialised landmark, a ray for each other."""
-        known = self.smoothed()
-        points = [
-            (label, Gaussian(mean=place, covariance=about), 1.0)
-            for label, place, about in zip(
-                self.history.placed, known.places, known.place_covariance, strict=True
-            )
-        ]
-        return _rows(points, self._rays(moving=False))
+        known, placed = self.smoothed(), self.history.placed
+        points = zip(placed, known.places, known.place_covariance, [1.0] * len(placed), strict=True)
+        return _map_of([*points, *self._rays(moving=False)])
 
     def calibration(self) -> dict[str, tuple[float, float]]:
         """Return estimate and standard deviation of each calibration parameter, by name."""
@@ -242,7 +231,7 @@ class SmootherBelief:
         roving = [guess[state : state + 2] for _, state in callers]
         covariance = joint(solution.front, solution.factor, n, by_chain, by_border)
         covariance[:3, :3] = self.ahead.covariance
-        strayed = self.noise[3] ** 2 * seconds**3 / 3.0
+        strayed = self.noise.walk_std**2 * seconds**3 / 3.0
         covariance[first:, first:] += strayed * np.eye(size - first)
         labels = [self.history.placed[number] for number in there.tolist()]
         labels += [label for label, _ in callers]
@@ -285,11 +274,14 @@ class SmootherBelief:
 
     def moving(self) -> Landmarks:
         """Estimates of moving callers: Gaussians if tracked, else rays from the last bearings."""
-        points = [
-            (label, _propagated(self.solution, i, self.odometry.seconds, self.noise[3]), 1.0)
-            for label, i in self._callers()
-        ]
-        return _rows(points, self._rays(moving=True))
+        state, C = self.solution.state, self.solution.covariance
+        seconds, points = self.odometry.seconds, []
+        strayed = self.noise.walk_std**2 * seconds**3 / 3.0 * np.eye(2)
+        for label, i in self._callers():
+            b, v = slice(i, i + 2), slice(i + 2, i + 4)
+            spread = C[b, b] + seconds * (C[b, v] + C[v, b]) + seconds**2 * C[v, v] + strayed
+            points.append((label, state[b] + seconds * state[v], spread, 1.0))
+        return _map_of([*points, *self._rays(moving=True)])
 
     def tracks(self) -> dict[int, Gaussian]:
         """Return the past positions of moving callers by label, (2) and (2, 2) for each step."""
@@ -310,8 +302,11 @@ class SmootherBelief:
         """Return label and chain index of each moving caller."""
         return [(label, POSE + CALLER * v) for v, label in enumerate(self.history.callers)]
 
-    def _rays(self, *, moving: bool) -> list[tuple[int, Gaussian, float]]:
-        """Return ray hypotheses of landmarks or moving callers that are not yet initialised."""
+    def _rays(self, *, moving: bool) -> list[MapRow]:
+        """Return ray hypotheses of landmarks or moving callers that are not yet initialised.
+
+        The hypotheses of a ray, at least two, have equal weights.
+        """
         history, rays = self.history, []
         waits = (history.index == 0) & (history.latest >= 0) & (history.moves == moving)
         labels = list(history.slots)
@@ -320,16 +315,20 @@ class SmootherBelief:
             node, numbers = history.rows.arrays[0][row, 2], history.rows.arrays[1][row]
             if moving and node != history.nodes - 1:
                 continue
-            pose = self.at
+            (x, y, heading), C = self.at.mean, self.at.covariance
             if not moving:
                 known = self.smoothed()
-                pose = Gaussian(
-                    mean=known.states[node, :3], covariance=known.covariance[node, :3, :3]
-                )
-            rays += [
-                (labels[slot][0], member, weight)
-                for member, weight in _ray(pose, numbers[BEARING], numbers[BEARING_STD], self.rays)
-            ]
+                (x, y, heading), C = known.states[node, :3], known.covariance[node, :3, :3]
+            ranges, stds = ray_members(self.rays)
+            if len(ranges) == 1:
+                ranges, stds = np.repeat(ranges, 2), np.repeat(stds, 2)
+            angle = heading + numbers[BEARING]
+            along = np.array([np.cos(angle), np.sin(angle)])
+            ahead, across = np.outer(along, along), np.eye(2) - np.outer(along, along)
+            for far, spread in zip(ranges, stds, strict=True):
+                noise = spread**2 * ahead + (far * numbers[BEARING_STD]) ** 2 * across
+                mean = np.array([x, y]) + far * along
+                rays.append((labels[slot][0], mean, noise + C[:2, :2], 1.0 / len(ranges)))
         return rays
 
 
@@ -369,45 +368,11 @@ def _by_parameters(
     return mixed + np.swapaxes(mixed, 1, 2) + np.einsum("mae,ef,mbf->mab", by, about[3:, 3:], by)
 
 
-def _propagated(solution: Solution, i: int, seconds: float, walk_std: float) -> Gaussian:
-    """Predict a moving caller's position some time after the last node, (2) and (2, 2)."""
-    b, v, C = slice(i, i + 2), slice(i + 2, i + 4), solution.covariance
-    both = seconds * (C[b, v] + C[v, b])
-    strayed = walk_std**2 * seconds**3 / 3.0 * np.eye(2)
-    return Gaussian(
-        mean=solution.state[b] + seconds * solution.state[v],
-        covariance=C[b, b] + both + seconds**2 * C[v, v] + strayed,
-    )
-
-
-def _ray(
-    pose: Gaussian, bearing: float, std: float, rays: RayConfig
-) -> list[tuple[Gaussian, float]]:
-    """Return the Gaussian hypotheses of a ray, at least two, with equal weights."""
-    ranges, stds = ray_members(rays)
-    if len(ranges) == 1:
-        ranges, stds = np.repeat(ranges, 2), np.repeat(stds, 2)
-    angle = pose.mean[2] + bearing
-    along = np.array([np.cos(angle), np.sin(angle)])
-    ahead, across = np.outer(along, along), np.eye(2) - np.outer(along, along)
-    return [
-        (
-            Gaussian(
-                mean=pose.mean[:2] + far * along,
-                covariance=spread**2 * ahead + (far * std) ** 2 * across + pose.covariance[:2, :2],
-            ),
-            1.0 / len(ranges),
-        )
-        for far, spread in zip(ranges, stds, strict=True)
-    ]
-
-
-def _rows(*parts: list[tuple[int, Gaussian, float]]) -> Landmarks:
-    """Collect labelled Gaussians with weights into a map."""
-    rows = [row for part in parts for row in part]
+def _map_of(rows: Sequence[MapRow]) -> Landmarks:
+    """Convert the rows of a map to arrays."""
     return Landmarks(
-        landmark=np.array([label for label, _, _ in rows], dtype=np.int64),
-        mean=np.array([place.mean for _, place, _ in rows]).reshape(-1, 2),
-        covariance=np.array([place.covariance for _, place, _ in rows]).reshape(-1, 2, 2),
-        weight=np.array([weight for _, _, weight in rows], dtype=float),
+        landmark=np.array([row[0] for row in rows], dtype=np.int64),
+        mean=np.array([row[1] for row in rows]).reshape(-1, 2),
+        covariance=np.array([row[2] for row in rows]).reshape(-1, 2, 2),
+        weight=np.array([row[3] for row in rows], dtype=float),
     )

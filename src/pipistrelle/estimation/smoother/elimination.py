@@ -70,58 +70,38 @@ def transition(
     noise: NoiseModel,
 ) -> float:
     """Linearise the motion to node k (F, u, Q, parameter Jacobian); return twice its cost."""
-    F, u, Q, at, (mx, my, mh) = work.F, work.u, work.Q, points[0], _motion(legs, k, points[1])
+    F, u, Q, (at, border) = work.F, work.u, work.Q, points
     F[:], Q[:] = 0.0, 0.0
     x, y, heading = at[k - 1, 0], at[k - 1, 1], at[k - 1, 2]
     dx, dy, c, s = at[k, 0] - x, at[k, 1] - y, math.cos(heading), math.sin(heading)
     for a in range(POSE):
         F[a, a] = 1.0
     F[0, 2], F[1, 2] = -dy, dx
-    off = c * dx + s * dy - mx, c * dy - s * dx - my, wrap_angle(at[k, 2] - heading - mh)
+    mx, my, mh = legs.mean[k, 0], legs.mean[k, 1], legs.mean[k, 2]
     for e in range(work.by.shape[1]):
-        ahead, aside = legs.slopes[k, 0, e], legs.slopes[k, 1, e]
+        ahead, aside, turn = legs.slopes[k, 0, e], legs.slopes[k, 1, e], legs.slopes[k, 2, e]
+        mx, my, mh = (
+            mx + ahead * border[1 + e],
+            my + aside * border[1 + e],
+            mh + turn * border[1 + e],
+        )
         work.by[0, e], work.by[1, e] = c * ahead - s * aside, s * ahead + c * aside
-        work.by[2, e] = legs.slopes[k, 2, e]
-    if legs.scale[0] > 0:
-        scale = 1.0 + points[1][legs.scale[0]]
+        work.by[2, e] = turn
+    off = c * dx + s * dy - mx, c * dy - s * dx - my, wrap_angle(at[k, 2] - heading - mh)
+    if legs.scale > 0:
+        scale = 1.0 + border[legs.scale]
         work.by[0, 0] += (c * off[0] - s * off[1]) / scale
         work.by[1, 0] += (s * off[0] + c * off[1]) / scale
-        _stretch(legs.noise[k], scale, work.A)
+        for a in range(POSE):
+            for b in range(POSE):
+                by_a, by_b = scale if a < 2 else 1.0, scale if b < 2 else 1.0
+                work.A[a, b] = legs.noise[k, a, b] * by_a * by_b
         cost = _odometry(work.A, off, (c, s), u, Q)
     else:
         cost = _odometry(legs.noise[k], off, (c, s), u, Q)
     for v in range(places.first.size):
         cost += _transition_of_caller(work, k, v, legs.seconds[k], places, at, noise)
     return cost
-
-
-@no_alloc
-def _stretch(
-    N: Float[np.ndarray, "3 3"], scale: float, stretched: Float[np.ndarray, "d d"]
-) -> None:
-    """Write the noise of a motion with x and y multiplied by a scale."""
-    for a in range(POSE):
-        for b in range(POSE):
-            stretched[a, b] = N[a, b] * (scale if a < 2 else 1.0) * (scale if b < 2 else 1.0)
-
-
-@no_alloc
-def _motion(legs: Legs, k: Whole, border: Float[np.ndarray, " n"]) -> tuple[float, float, float]:
-    """Return the motion to node k with the parameters at their linearisation points."""
-    x, y, turn = legs.mean[k, 0], legs.mean[k, 1], legs.mean[k, 2]
-    for e in range(legs.slopes.shape[2]):
-        x += legs.slopes[k, 0, e] * border[1 + e]
-        y += legs.slopes[k, 1, e] * border[1 + e]
-        turn += legs.slopes[k, 2, e] * border[1 + e]
-    return x, y, turn
-
-
-@no_alloc
-def write_start(work: Work, legs: Legs, at: Float[np.ndarray, "k d"]) -> float:
-    """Write u and Q of the start; return twice the cost of its linearisation point."""
-    turn = wrap_angle(at[0, 2] - legs.mean[0, 2])
-    off = at[0, 0] - legs.mean[0, 0], at[0, 1] - legs.mean[0, 1], turn
-    return _odometry(legs.noise[0], off, (1.0, 0.0), work.u, work.Q)
 
 
 @no_alloc
@@ -229,7 +209,7 @@ def eliminate(
     places: Arrays,
     points: PointArrays,
     links: Arrays,
-    noise: tuple[float, ...],
+    noise: NoiseModel,
     span: tuple[Whole, Whole, Whole, Whole, Whole],
 ) -> float:
     """Eliminate the chain between two nodes, in place; return the added chi-square cost.
@@ -237,7 +217,7 @@ def eliminate(
     ``span``: node of the front, first node to update, end of the nodes, columns, node of link 0.
     """
     front, legs, rows, places = Front(*front), Legs(*legs), Rows(*rows), Places(*places)
-    links, noise, (stands, first, last, n, base) = Links(*links), NoiseModel(*noise), span
+    links, (stands, first, last, n, base) = Links(*links), span
     work, cost = work_of(front.C.shape[0], n, legs.slopes.shape[2]), 0.0
     for k in range(first, last):
         if k > stands:
@@ -256,13 +236,13 @@ def step_to(
     places: Arrays,
     points: PointArrays,
     links: Arrays,
-    noise: tuple[float, ...],
+    noise: NoiseModel,
     span: tuple[Whole, Whole, Whole],
 ) -> float:
     """Predict the frontal state to a node without its measurements; return twice the cost."""
     front, legs, (k, n, base) = Front(*front), Legs(*legs), span
     work = work_of(front.C.shape[0], n, legs.slopes.shape[2])
-    cost = transition(work, k, legs, Places(*places), points, NoiseModel(*noise))
+    cost = transition(work, k, legs, Places(*places), points, noise)
     step(front, work, Links(*links), k - base, n)
     return cost
 
@@ -274,8 +254,10 @@ def begin(
 ) -> float:  # fmt: skip
     """Initialise the frontal state with the start and parameter priors; return twice the cost."""
     front[0][:], front[1][:], front[2][:] = 0.0, 0.0, 0.0
-    work = work_of(POSE, 1, 0)
-    cost = write_start(work, Legs(*legs), at)
+    work, start = work_of(POSE, 1, 0), Legs(*legs)
+    mean, turn = start.mean[0], wrap_angle(at[0, 2] - start.mean[0, 2])
+    off = at[0, 0] - mean[0], at[0, 1] - mean[1], turn
+    cost = _odometry(start.noise[0], off, (1.0, 0.0), work.u, work.Q)
     for a in range(POSE):
         front[0][a, 0] = work.u[a]
         for b in range(POSE):
@@ -336,8 +318,15 @@ def leave(
     aside, own = np.zeros((2, n)), np.zeros((d, 2))
     for g in range(column.size):
         i, H, K = column[g], left[0][g], left[1][g]
-        _take_out(information, i, by)
-        _take_slopes(C, i, own)
+        for e in range(2):
+            for j in range(n):
+                by[e, j] = information[max(i + e, j), min(i + e, j)]
+            for a in range(d):
+                own[a, e] = C[a, i + e]
+                C[a, i + e] = 0.0
+        for e in range(2):
+            for j in range(n):
+                information[max(i + e, j), min(i + e, j)] = 0.0
         det = by[0, i] * by[1, i + 1] - by[0, i + 1] * by[0, i + 1]
         V[0, 0], V[1, 1] = by[1, i + 1] / det, by[0, i] / det
         V[0, 1] = V[1, 0] = -by[0, i + 1] / det
@@ -354,46 +343,15 @@ def leave(
         cholesky(P, L)
         for e in range(2):
             solve_with(L, K[e])
-        _write_rest(V, own, K, left[2][g])
+        rest = left[2][g]
+        for e in range(2):
+            for f in range(e + 1):
+                rest[e, f] = V[e, f]
+                for a in range(d):
+                    rest[e, f] -= K[e, a] * (own[a, 0] * V[0, f] + own[a, 1] * V[1, f])
+                rest[f, e] = rest[e, f]
         multiply(K, C, aside)
         add(aside, H, -1.0)
-
-
-@no_alloc
-def _take_out(
-    information: Float[np.ndarray, "n n"], i: Whole, by: Float[np.ndarray, "2 n"]
-) -> None:
-    """Move the rows of column pair i from a lower triangle to ``by``, leaving zeros."""
-    for e in range(2):
-        for j in range(by.shape[1]):
-            by[e, j] = information[max(i + e, j), min(i + e, j)]
-    for e in range(2):
-        for j in range(by.shape[1]):
-            information[max(i + e, j), min(i + e, j)] = 0.0
-
-
-@no_alloc
-def _take_slopes(C: Float[np.ndarray, "d n"], i: Whole, own: Float[np.ndarray, "d 2"]) -> None:
-    """Move the derivatives by column pair i from C to ``own``, leaving zeros."""
-    for a in range(C.shape[0]):
-        own[a, 0], own[a, 1] = C[a, i], C[a, i + 1]
-        C[a, i] = C[a, i + 1] = 0.0
-
-
-@no_alloc
-def _write_rest(
-    V: Float[np.ndarray, "2 2"],
-    own: Float[np.ndarray, "d 2"],
-    K: Float[np.ndarray, "2 d"],
-    W: Float[np.ndarray, "2 2"],
-) -> None:
-    """Write V - K C_c V to W."""
-    for e in range(2):
-        for f in range(e + 1):
-            W[e, f] = V[e, f]
-            for a in range(own.shape[0]):
-                W[e, f] -= K[e, a] * (own[a, 0] * V[0, f] + own[a, 1] * V[1, f])
-            W[f, e] = W[e, f]
 
 
 @no_alloc

@@ -43,7 +43,7 @@ from pipistrelle.estimation.checking import (
 from pipistrelle.estimation.measurement import HUBER_K, observe
 from pipistrelle.estimation.motion import Motion
 from pipistrelle.estimation.rays import gate_bounds
-from pipistrelle.estimation.recovery import corrected
+from pipistrelle.estimation.recovery import recovering
 from pipistrelle.estimation.smoother.belief import SmootherBelief
 from pipistrelle.estimation.smoother.history import (
     NEVER,
@@ -77,6 +77,7 @@ from pipistrelle.estimation.smoother.preintegration import (
 from pipistrelle.estimation.smoother.records import (
     Arrays,
     Front,
+    NoiseModel,
     Places,
     PointArrays,
     Rows,
@@ -86,7 +87,6 @@ from pipistrelle.estimation.smoother.records import (
 )
 from pipistrelle.estimation.smoother.solution import joint
 from pipistrelle.estimation.smoother.sweep import (
-    Noise,
     Points,
     Solution,
     Sweep,
@@ -116,8 +116,8 @@ def drop_outside(
     """
     rows, places, front = Rows(*rows), Places(*places), Front(*front)
     (k, first, last), (dropped, squared, degrees) = span, (0, 0.0, 0.0)
-    work = work_of(front.P.shape[0], 1, 0)
-    view = view_of(estimate[0][k], estimate[1], places, k)
+    d, n = front.P.shape[0], R.shape[0]
+    work, view = work_of(d, 1, 0), view_of(estimate[0][k], estimate[1], places, k)
     for m in range(first, last):
         point = point_of(rows.ends[m, 0], k, places, estimate)
         if point[0] == 0:
@@ -126,8 +126,11 @@ def drop_outside(
         if rows.ends[m, 1] >= 0:
             caller = point_of(rows.ends[m, 1], k, places, estimate)
             if caller[0] != 0:
-                off = _surprise_of_excess_path(work, numbers, view, (point, caller), front, R)
-                if off > bounds[0]:
+                by_chain, by_border = np.zeros((1, d)), np.zeros((1, n))
+                path, chain, size = write_excess_path(work, view, (point, caller))
+                _part(work, (chain, size), by_chain[0], by_border[0])
+                S = joint(front, R, n, by_chain, by_border)[0, 0] + numbers[EXCESS_PATH_STD] ** 2
+                if (numbers[EXCESS_PATH] - path) ** 2 / S > bounds[0]:
                     rows.ends[m, 1] = -1
                     dropped += 1
         if math.isnan(numbers[BEARING]):
@@ -169,40 +172,19 @@ def _surprise_of_direction(
     """Return the squared innovation of a bearing, and its range if measured, and its dimension."""
     (i, px, py), d, n = point, front.P.shape[0], R.shape[0]
     seen = observe(view.x, view.y, view.heading, px, py)
-    off, across = (
-        wrap_angle(numbers[BEARING] - bearing_of(view, seen, numbers[SLOPE])),
-        numbers[BEARING_STD],
-    )
+    off = wrap_angle(numbers[BEARING] - bearing_of(view, seen, numbers[SLOPE]))
     size = 1 if math.isnan(numbers[RANGE]) else 2
     by_chain, by_border = np.zeros((size, d)), np.zeros((size, n))
     _part(work, write_bearing(work, view, seen, numbers[SLOPE], i), by_chain[0], by_border[0])
     if size == 2:
         _part(work, write_range(work, view, seen, i), by_chain[1], by_border[1])
     S = joint(front, R, n, by_chain, by_border)
-    bb = S[0, 0] + across * across
+    bb = S[0, 0] + numbers[BEARING_STD] * numbers[BEARING_STD]
     if size == 1:
         return off * off / bb, 1
     rr, far = S[1, 1] + numbers[RANGE_STD] ** 2, numbers[RANGE] - seen[0] / view.scale
     det = bb * rr - S[1, 0] * S[1, 0]
     return (rr * off * off - 2.0 * S[1, 0] * off * far + bb * far * far) / det, 2
-
-
-@kernel
-def _surprise_of_excess_path(
-    work: Work,
-    numbers: Float[np.ndarray, " 8"],
-    view: View,
-    ends: tuple[Point, Point],
-    front: Front,
-    R: Float[np.ndarray, "n n"],
-) -> float:
-    """Return the squared innovation of an excess path over its variance."""
-    d, n = front.P.shape[0], R.shape[0]
-    by_chain, by_border = np.zeros((1, d)), np.zeros((1, n))
-    path, chain, size = write_excess_path(work, view, ends)
-    _part(work, (chain, size), by_chain[0], by_border[0])
-    variance = joint(front, R, n, by_chain, by_border)[0, 0] + numbers[EXCESS_PATH_STD] ** 2
-    return (numbers[EXCESS_PATH] - path) ** 2 / variance
 
 
 PRIOR_STD, PRIOR_SHARE = 20.0, 0.1
@@ -244,10 +226,10 @@ class Smoother:
         check_gate(self.gate)
 
     @property
-    def noise(self) -> Noise:
-        """Noise of measurements and moving callers, as a tuple for kernels."""
+    def noise(self) -> NoiseModel:
+        """Noise of measurements and moving callers."""
         believed = HUBER_K if self.robust else math.inf
-        return believed, PRIOR_STD, float(self.speed_std), float(self.walk_std), 0.0
+        return NoiseModel(believed, PRIOR_STD, float(self.speed_std), float(self.walk_std))
 
     def init(self, pose: Gaussian) -> SmootherBelief:
         """Return the initial belief at a pose, (3) and (3, 3), without landmarks."""
@@ -302,7 +284,7 @@ class Smoother:
         scan = usable_scan(scan)
         if scan.landmark.size == 0:
             return belief
-        return corrected(self._corrected, belief, scan, self.gate, self.rays.range_bounds[1])
+        return recovering(self._corrected, belief, scan, self.gate, self.rays.range_bounds[1])
 
     def _corrected(self, belief: SmootherBelief, scan: Scan) -> SmootherBelief:
         """Update the belief with the measurements that pass the gate."""
@@ -351,7 +333,8 @@ class Smoother:
         k = history.nodes - 1
         if k % STRETCH or math.isinf(self.window):
             return history
-        since = history.silent_for()
+        time = np.cumsum(history.legs.entries(2))
+        since = time[-1] - time[np.maximum(history.silent, 0)]
         leaving = (since > self.window) & (solution.columns > 0)
         return with_leaving(history, leaving, k // STRETCH - 1) if leaving.any() else history
 

@@ -14,7 +14,7 @@ from jaxtyping import Bool, Float, Int
 
 from pipistrelle.detection.scans import BEARING, NUMBERS, RANGE, Scan
 from pipistrelle.estimation.beliefs import Gaussian
-from pipistrelle.estimation.measurement import columns_of, excess_paths, timings_of
+from pipistrelle.estimation.measurement import caller_labels
 from pipistrelle.estimation.smoother.preintegration import (
     NOTHING,
     SMALLEST_STD,
@@ -30,8 +30,6 @@ STRETCH = 64
 """
 NEVER = np.iinfo(np.int64).max
 """Number of a segment that never occurs."""
-FREE, GIVEN = np.ones(1, np.int64), np.zeros(1, np.int64)
-"""Separator column of the speed scale: the first, or none (`records.Legs.scale`)."""
 Slot = tuple[int, bool]
 """A label, and whether it belongs to a moving caller."""
 
@@ -82,10 +80,14 @@ class History:
 
     @property
     def motion(self) -> Arrays:
-        """Motion to each node, as `records.Legs`."""
-        mean, noise, seconds, rows, _, slopes = self.legs.arrays
-        free = self.calibration.scale_is_free(self.ranged)
-        return mean, noise, seconds, rows, slopes, FREE if free else GIVEN
+        """Motion to each node, as `records.Legs`.
+
+        If the speed scale is the only source of absolute size, the motion residual is taken at the
+        odometry's scale, as it would fall with a shrinking world.
+        """
+        (mean, noise, seconds, rows, _, slopes), names = self.legs.arrays, self.calibration.names
+        free = "speed_scale" in names and (not self.ranged or "speed_of_sound" in names)
+        return mean, noise, seconds, rows, slopes, 1 if free else 0
 
     @property
     def span(self) -> tuple[int, int, int]:
@@ -108,11 +110,6 @@ class History:
     def silent(self) -> Int[np.ndarray, " l"]:
         """Last node with a measurement of each separator landmark, or -1."""
         return self._of_placed(self.heard[:, 1])
-
-    def silent_for(self) -> Float[np.ndarray, " l"]:
-        """Return the time since the last measurement of each separator landmark [s]."""
-        time = np.cumsum(self.legs.entries(2))
-        return time[-1] - time[np.maximum(self.silent, 0)]
 
     def _of_placed(self, values: Int[np.ndarray, " s"]) -> Int[np.ndarray, " l"]:
         """Reorder per-slot values by the landmarks' index in the separator."""
@@ -180,11 +177,8 @@ def _write_leg(legs: Arrays, steps: Arrays, led: Led, span: tuple[Whole, Whole, 
     count = led[0].shape[0]
     first, moved = last - count, False
     for j in range(count):
-        steps[0][first + j], steps[1][first + j], steps[2][first + j] = (
-            led[0][j],
-            led[1][j],
-            led[2][j],
-        )
+        steps[0][first + j], steps[1][first + j] = led[0][j], led[1][j]
+        steps[2][first + j] = led[2][j]
     ends[k, 0], ends[k, 1], seconds[k] = first, last, took
     mean[k], noise[k], slopes[k] = 0.0, 0.0, 0.0
     for a in range(3 if count else 0):
@@ -226,13 +220,10 @@ def _slots_of(
     history: History, scan: Scan
 ) -> tuple[Int[np.ndarray, " m"], Int[np.ndarray, " m"], History]:
     """Return the slots of a scan's landmarks and callers (-1: none), and a history with them."""
-    labels, callers = scan.landmark.tolist(), np.full(scan.landmark.size, -1)
-    if (timings := timings_of(scan)) is not None:
-        found = excess_paths(columns_of(scan), timings)
-        callers[found.row] = found.caller
+    labels, callers = scan.landmark.tolist(), caller_labels(scan).tolist()
     moving = {*scan.moving.tolist(), *history.callers}
     named = [(label, label in moving) for label in labels]
-    calling = [(label, label in moving) for label in callers.tolist()]
+    calling = [(label, label in moving) for label in callers]
     slots = history.slots
     if new := sorted(slot for slot in {*named, *calling} if slot[0] >= 0 and slot not in slots):
         slots = {**slots, **{slot: len(slots) + n for n, slot in enumerate(new)}}

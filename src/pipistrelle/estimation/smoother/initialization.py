@@ -17,7 +17,6 @@ from jaxtyping import Float, Int
 from pipistrelle.detection.scans import BEARING, BEARING_STD, EXCESS_PATH, EXCESS_PATH_STD, RANGE
 from pipistrelle.estimation.measurement import (
     MIN_TDOA_SIGMAS,
-    caller_range_by_excess_path,
     range_by_excess_path,
 )
 from pipistrelle.estimation.smoother.observations import View, direction_of, point_of, view_of
@@ -39,7 +38,7 @@ MAX_RANGE = 1e6
 
 
 @kernel
-def place_by_excess_path(
+def excess_path_range(
     rows: Rows,
     heard: tuple[Whole, Whole, Whole],
     view: View,
@@ -135,13 +134,11 @@ def unscented_range(
     return first, math.sqrt(total / 8.0) / first
 
 
-@kernel
+@no_alloc
 def _range(way: Float[np.ndarray, "4"], caller: bool) -> float:
     """Return the range of a landmark or of a caller from an excess path."""
     c, s = math.cos(way[2]), math.sin(way[2])
-    if caller:
-        return caller_range_by_excess_path(way[3], way[0], way[1], c, s)
-    return range_by_excess_path(way[3], way[0], way[1], c, s)
+    return range_by_excess_path(way[3], way[0], way[1], c, s, caller)
 
 
 MIN_CROSSING_ANGLE = 0.5
@@ -162,11 +159,8 @@ def entering_places(
 ) -> Float[np.ndarray, "m 2"]:
     """Return initial positions for a frame's landmarks and callers, NaN if still uncertain."""
     rows, places, front = Rows(*rows), Places(*places), Front(*front)
-    k, first, last = span
-    view, found = (
-        view_of(estimate[0][k], estimate[1], places, k),
-        np.full((last - first, 2), np.nan),
-    )
+    (k, first, last), found = span, np.full((span[2] - span[1], 2), np.nan)
+    view = view_of(estimate[0][k], estimate[1], places, k)
     for m in range(first, last):
         slot, numbers = rows.ends[m, 0], rows.numbers[m]
         if places.index[slot] != 0 or math.isnan(numbers[BEARING]):
@@ -174,7 +168,7 @@ def entering_places(
         away = numbers[RANGE] * view.scale
         if math.isnan(away):
             heard = m, first, last
-            away = place_by_excess_path(rows, heard, view, k, places, estimate, front, R)
+            away = excess_path_range(rows, heard, view, k, places, estimate, front, R)
         if math.isnan(away) and not moves[slot]:
             away = range_by_crossing(rows, m, estimate, places)
         angle = direction_of(view, numbers)

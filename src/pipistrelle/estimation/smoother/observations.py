@@ -240,10 +240,8 @@ def nonlinearity(
     for i in range(1, off[1].size):
         border[i] += off[1][i]
     state = points[0][k] + off[0]
-    then, now = (
-        view_of(points[0][k], points[1], places, k),
-        view_of(state, border, places, k),
-    )
+    then = view_of(points[0][k], points[1], places, k)
+    now = view_of(state, border, places, k)
     for m in range(first, last):
         numbers, there = rows.numbers[m], point_of(rows.ends[m, 0], k, places, points)
         if there[0] == 0:
@@ -257,9 +255,8 @@ def nonlinearity(
             angle, far = bearing_of(now, sight, numbers[SLOPE]), sight[0]
             most = max(most, abs(wrap_angle(angle - line)) / numbers[BEARING_STD])
             if not math.isnan(numbers[RANGE]):
-                line = seen[0] / then.scale + _along(
-                    work, write_range(work, then, seen, there[0]), off
-                )
+                row = write_range(work, then, seen, there[0])
+                line = seen[0] / then.scale + _along(work, row, off)
                 most = max(most, abs(far / now.scale - line) / numbers[RANGE_STD])
         if rows.ends[m, 1] >= 0:
             caller = point_of(rows.ends[m, 1], k, places, points)
@@ -311,15 +308,13 @@ def hear(
     noise: NoiseModel,
 ) -> float:
     """Accumulate a node's measurements in T, G and information; return twice their cost."""
-    (k, begin, end), believed, cost, G = span, noise.believed, 0.0, work.G
-    work.T[:] = 0.0
-    for a in range(G.shape[0]):
-        for j in range(G.shape[1]):
-            G[a, j] = 0.0
+    (k, begin, end), believed, cost = span, noise.believed, 0.0
+    work.T[:], work.G[:] = 0.0, 0.0
     work.alone[0] = _is_sure(front, span, rows, places, points, noise.damping)
     write(front.C, work.C)
-    if noise.damping > 0.0:
-        _hold(work, front, noise.damping)
+    for a in range(front.P.shape[0] if noise.damping > 0.0 else 0):  # Levenberg
+        work.at[0], work.slope[0] = a, math.sqrt(noise.damping)
+        _add(work, front, 1, 1, (1.0, 0.0))
     view = view_of(points[0][k], points[1], places, k)
     for m in range(begin, end):
         numbers, landmark = rows.numbers[m], point_of(rows.ends[m, 0], k, places, points)
@@ -330,8 +325,12 @@ def hear(
         if rows.ends[m, 1] >= 0:
             caller = point_of(rows.ends[m, 1], k, places, points)
             if caller[0] != 0:
-                ends = (landmark, caller)
-                cost += _hear_excess_path(work, front, numbers, view, ends, believed)
+                path, chain, size = write_excess_path(work, view, (landmark, caller))
+                sure = 1.0 / max(numbers[EXCESS_PATH_STD], LEAST_DEVIATION)
+                off = (path - numbers[EXCESS_PATH]) * sure
+                less, loss = _huber(off * off, believed)
+                _add(work, front, chain, size, (less * sure, less * off))
+                cost += loss
     return cost
 
 
@@ -376,11 +375,8 @@ def _add_direction(
 ) -> None:
     """Add a bearing and a range to a landmark in separator column i, faster than by `_add`."""
     (c, s), (q, p, h), (b, r), T, G = cosines, slopes, off, work.T, work.G
-    xx, xy, yy = (
-        q * q * s * s + p * p * c * c,
-        (p * p - q * q) * c * s,
-        q * q * c * c + p * p * s * s,
-    )
+    xx, yy = q * q * s * s + p * p * c * c, q * q * c * c + p * p * s * s
+    xy = (p * p - q * q) * c * s
     xh, yh, xr, yr = -h * q * s, h * q * c, p * c * r - q * s * b, p * s * r + q * c * b
     T[0, 0] += xx
     T[0, 1] += xy
@@ -407,24 +403,6 @@ def _add_direction(
     lower[i] += xy
     lower[i + 1] += yy
     front.information[0, 0] += b * b + r * r
-
-
-@no_alloc
-def _hear_excess_path(
-    work: Work,
-    front: Front,
-    numbers: Float[np.ndarray, " 8"],
-    view: View,
-    ends: tuple[Point, Point],
-    believed: float,
-) -> float:
-    """Add an excess path; return twice its cost."""
-    path, chain, size = write_excess_path(work, view, ends)
-    sure = 1.0 / max(numbers[EXCESS_PATH_STD], LEAST_DEVIATION)
-    off = (path - numbers[EXCESS_PATH]) * sure
-    less, cost = _huber(off * off, believed)
-    _add(work, front, chain, size, (less * sure, less * off))
-    return cost
 
 
 @no_alloc
@@ -483,14 +461,6 @@ def _correct_by_row(work: Work, front: Front, chain: Whole, size: Whole) -> None
         share = w[i] / S
         if share != 0.0:
             add_multiple(w, share, front.information[i, : i + 1])
-
-
-@no_alloc
-def _hold(work: Work, front: Front, damping: float) -> None:
-    """Add Levenberg damping to each number of the state."""
-    for a in range(front.P.shape[0]):
-        work.at[0], work.slope[0] = a, math.sqrt(damping)
-        _add(work, front, 1, 1, (1.0, 0.0))
 
 
 @no_alloc

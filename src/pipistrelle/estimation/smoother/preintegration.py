@@ -84,14 +84,6 @@ class Calibration:
     sensor: Int[np.ndarray, "4"]
     """Separator columns of the sensor parameters (`OF_SENSOR`); 0 if not estimated."""
 
-    def scale_is_free(self, ranged: bool) -> bool:
-        """Return whether the speed scale is the only source of absolute size.
-
-        The motion residual is then taken at the odometry's scale, as it would fall with a shrinking
-        world.
-        """
-        return "speed_scale" in self.names and (not ranged or "speed_of_sound" in self.names)
-
 
 def numbers_of(parameters: Iterable[str]) -> tuple[str, ...]:
     """Return the names of the numbers of parameters, in the order of the separator.
@@ -111,11 +103,7 @@ def calibration_of(config: Config, motion: Motion) -> Calibration:
     >>> calibration_of(config, Motion(model="unicycle", control_std=(0.1, 0.1))).sensor
     array([1, 0, 3, 0])
     """
-    asked, about, sound = (
-        set(config.filter.calibrate),
-        config.prior,
-        config.assumed_sound_speed,
-    )
+    asked, about, sound = {*config.filter.calibrate}, config.prior, config.assumed_sound_speed
     if "wheelbase" in asked and motion.model != "bicycle":
         raise InputError(
             f'filter.calibrate: found "wheelbase" for a {motion.model} model of motion, which has '
@@ -148,9 +136,6 @@ NOTHING = calibration_of(Config(), Motion(model="unicycle", control_std=(0.0, 0.
 SMALLEST_STD = 1e-6
 """Added in quadrature to the start and each motion [m, rad], so that no prior is exact."""
 
-NO_PARAMETERS = np.empty(0, np.int64)
-"""No odometry parameters."""
-
 Steps = tuple[Float[np.ndarray, "s 3"], Float[np.ndarray, "s 3 3"]]
 """Means and covariances of control steps relative to the node before."""
 Led = tuple[Float[np.ndarray, "s 3"], Float[np.ndarray, "s 3 3"], Float[np.ndarray, "s 3 q"]]
@@ -165,10 +150,6 @@ class Odometry:
     covariance: Float[np.ndarray, "m 3 3"]  # of x, y and heading in the node's axes
     slopes: Float[np.ndarray, "m 3 q"]  # Jacobian of the mean by the odometry parameters
     seconds: float = 0.0  # total duration [s]
-
-    def moves(self) -> bool:
-        """Return whether the vehicle has moved, or may have."""
-        return bool(np.any(self.mean[-1:]) or np.any(self.covariance[-1:]))
 
 
 def no_odometry(parameters: int = 0) -> Odometry:
@@ -185,14 +166,9 @@ def extended(
     motion: Motion,
     controls: Float[np.ndarray, "k c"],
     dt: Float[np.ndarray, " k"],
-    parameters: Int[np.ndarray, " q"] = NO_PARAMETERS,
+    parameters: Int[np.ndarray, " q"],
 ) -> Odometry:
-    """Append control steps to odometry; ``parameters``: codes of `OF_ODOMETRY`.
-
-    >>> motion = Motion(model="unicycle", control_std=(0.1, 0.1))
-    >>> extended(no_odometry(), motion, np.ones((2, 2)) * [1.0, 0.0], np.ones(2)).mean[:, 0]
-    array([1., 2.])
-    """
+    """Append control steps to odometry; ``parameters``: codes of `OF_ODOMETRY`."""
     steps = odometry.mean, odometry.covariance, odometry.slopes
     numbers = motion_numbers(motion)
     mean, covariance, slopes = _extended(steps, controls, dt, numbers, parameters)
@@ -201,13 +177,7 @@ def extended(
 
 
 def placed(start: Gaussian, odometry: Odometry, first: int = 0) -> Gaussian:
-    """Return the world poses after each step from index ``first``, (m, 3) and (m, 3, 3).
-
-    >>> north = Gaussian(mean=np.array([0.0, 1.0, np.pi / 2]), covariance=np.zeros((3, 3)))
-    >>> way = {"covariance": np.zeros((1, 3, 3)), "slopes": np.zeros((1, 3, 0))}
-    >>> placed(north, Odometry(mean=np.array([[2.0, 0.0, 0.1]]), **way)).mean.round(9) + 0.0
-    array([[0.        , 3.        , 1.67079633]])
-    """
+    """Return the world poses after each step from index ``first``, (m, 3) and (m, 3, 3)."""
     steps = odometry.mean[first:], odometry.covariance[first:]
     poses, spreads = _placed((start.mean, start.covariance), steps)
     return Gaussian(mean=poses, covariance=spreads)

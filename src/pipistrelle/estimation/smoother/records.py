@@ -261,7 +261,7 @@ class Legs(NamedTuple):
     rows: Int[np.ndarray, "k 2"]  # first measurement of the node, and the end of its range
     slopes: Float[np.ndarray, "k 3 q"]
     """Jacobian of the motion by the odometry parameters, which come first in the separator."""
-    scale: Int[np.ndarray, "1"]
+    scale: Whole
     """Separator column of the speed scale if nothing else fixes the size of the world, else 0."""
 
 

@@ -70,16 +70,6 @@ def places_left(
 
 
 @optimised_once
-def spread_with_border(
-    C: Float[np.ndarray, "d n"], border: Float[np.ndarray, "n n"]
-) -> Float[np.ndarray, "d n"]:
-    """Return the cross-covariance of the separator and a state with derivatives C by it."""
-    X = np.zeros(C.shape)
-    multiply(C, border, X)
-    return X
-
-
-@optimised_once
 def spread_back(
     links: Arrays,
     covariances: tuple[
@@ -97,7 +87,8 @@ def spread_back(
     across, turned, before = np.zeros((d, n)), np.zeros((n, d)), np.zeros((d, d))
     for k in range(count - 1, -1, -1):
         D, G = links.D[k], links.G[k]
-        _transpose_slopes(D, turned)
+        transpose(D, turned)
+        turned[0] = 0.0
         multiply(X, turned, cross[k])
         transpose(G, before)
         add_product(P, before, cross[k], 1.0)
@@ -110,15 +101,6 @@ def spread_back(
         _make_symmetric(P)
         write(P, own[k])
     return own, cross
-
-
-@no_alloc
-def _transpose_slopes(D: Float[np.ndarray, "d n"], turned: Float[np.ndarray, "n d"]) -> None:
-    """Write the transpose of D, with 0 for its constant column."""
-    for a in range(D.shape[0]):
-        turned[0, a] = 0.0
-        for j in range(1, D.shape[1]):
-            turned[j, a] = D[a, j]
 
 
 @no_alloc
@@ -194,20 +176,13 @@ def factor(R: Float[np.ndarray, "n n"], n: Whole) -> None:
 def _factor_rows(R: Float[np.ndarray, "n n"], i: Whole, count: Whole) -> None:
     """Factor ``count`` rows from row i upwards, and subtract each from the others above it."""
     for p in range(i, i - count, -1):
-        row = R[p]
-        _divide(row, p)
+        row, inverse = R[p], 1.0 / math.sqrt(R[p, p])
+        for j in range(p + 1):
+            row[j] *= inverse
         for r in range(i - count + 1, p):
             share, other = row[r], R[r]
             for j in range(r + 1):
                 other[j] -= share * row[j]
-
-
-@no_alloc
-def _divide(row: Float[np.ndarray, " n"], i: Whole) -> None:
-    """Divide a row by the root of its pivot."""
-    inverse = 1.0 / math.sqrt(row[i])
-    for j in range(i + 1):
-        row[j] *= inverse
 
 
 @no_alloc

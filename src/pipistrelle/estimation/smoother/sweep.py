@@ -16,7 +16,14 @@ from jaxtyping import Float, Int
 from pipistrelle.estimation.smoother.elimination import begin, eliminate, enter, leave, step_to
 from pipistrelle.estimation.smoother.history import STRETCH, History, in_hindsight
 from pipistrelle.estimation.smoother.observations import nonlinearity
-from pipistrelle.estimation.smoother.records import CALLER, POSE, Arrays, Stack
+from pipistrelle.estimation.smoother.records import (
+    CALLER,
+    POSE,
+    Arrays,
+    NoiseModel,
+    Stack,
+    multiply,
+)
 from pipistrelle.estimation.smoother.solution import (
     Left,
     border_covariance,
@@ -24,13 +31,10 @@ from pipistrelle.estimation.smoother.solution import (
     solve,
     spread_back,
     spread_left,
-    spread_with_border,
     trace_back,
 )
 from pipistrelle.jit import optimised_once
 
-Noise = tuple[float, ...]
-"""Fields of `records.NoiseModel`."""
 COLUMNS = 32
 """Increment of the separator's capacity [columns]."""
 
@@ -99,7 +103,7 @@ class Solution:
 class Sweep:
     """Forward elimination: the frontal state and the separator's columns at a node of the chain."""
 
-    def __init__(self, history: History, noise: Noise, points: Points) -> None:
+    def __init__(self, history: History, noise: NoiseModel, points: Points) -> None:
         """Start with a separator that contains only parameters."""
         self.history, self.noise, self.points = history, noise, points
         self.columns = np.zeros(len(history.placed), np.int64)
@@ -114,25 +118,23 @@ class Sweep:
         self._settle()
         self.cost = begin(
             self.front, self.history.motion, self.points.at.arrays[0], self.border,
-            self.history.calibration.stds, self.noise[4],
+            self.history.calibration.stds, self.noise.damping,
         )  # fmt: skip
 
-    def take_up(self, kept: Sequence[Stretch], first: int) -> None:
-        """Resume the elimination at a segment, keeping the segments before it."""
-        self.stretches, begun = list(kept[:first]), kept[first]
-        self.columns[: begun.columns.size] = begun.columns
-        self.front, self.cost = tuple(map(np.copy, begun.front)), begun.cost
+    def resume(
+        self,
+        stretches: Sequence[Stretch],
+        columns: Int[np.ndarray, " l"],
+        front: Arrays,
+        cost: float,
+    ) -> None:
+        """Resume the elimination after some segments, with the separator's columns there."""
+        self.stretches, self.cost = list(stretches), cost
+        self.columns[: columns.size], self.front = columns, tuple(map(np.copy, front))
         self.border = np.zeros(len(self.front[2]))
         self.border[1 : 1 + self.points.parameters.size] = self.points.parameters
         self._settle()
         self._write_spots(np.flatnonzero(self.columns))
-
-    def go_on(self, solution: Solution) -> None:
-        """Resume the elimination at the end of a solution."""
-        self.stretches, self.cost = list(solution.stretches), solution.cost
-        self.columns[: solution.columns.size] = solution.columns
-        self.front, self.border = tuple(map(np.copy, solution.front)), solution.border.copy()
-        self._settle()
 
     def go_to_the_end(self) -> None:
         """Eliminate all remaining segments."""
@@ -179,7 +181,7 @@ class Sweep:
         self._write_spots(numbers)
         known = self.history.known[0][numbers], self.history.known[1][numbers]
         at = self.columns[numbers]
-        self.cost += enter(self.front[2], at, known, self.border, self.noise[4])
+        self.cost += enter(self.front[2], at, known, self.border, self.noise.damping)
 
     def admit(self, history: History) -> None:
         """Adopt a history with new landmarks, which join later, and new moving callers."""
@@ -194,7 +196,9 @@ class Sweep:
         for v in range(len(before.callers), len(history.callers)):
             i = POSE + CALLER * v
             self.points.at.arrays[0][k, i : i + 2] = history.begun[v]
-            P[range(i, i + 4), range(i, i + 4)] = np.square(np.repeat(self.noise[1:3], 2))
+            P[range(i, i + 4), range(i, i + 4)] = np.square(
+                np.repeat((self.noise.place_std, self.noise.speed_std), 2)
+            )
 
     def part(self) -> None:
         """Eliminate the landmarks scheduled to leave the separator after the last segment."""
@@ -239,7 +243,7 @@ class Sweep:
                 front=tuple(map(np.copy, self.front)),
                 columns=self.columns.copy(),
                 cost=self.cost,
-                links=_links(STRETCH, d, w),
+                links=Stack(tuple(np.zeros((STRETCH, d, size)) for size in (w, d, d))),
                 gone=none,
                 freed=none,
                 left=(np.empty((0, 2, w)), np.empty((0, 2, d)), np.empty((0, 2, 2))),
@@ -312,11 +316,6 @@ def _wider(stretch: Stretch, d: int) -> Stretch:
     )
 
 
-def _links(k: int, d: int, w: int) -> Stack:
-    """Allocate k conditionals of the backward pass (`records.Links`)."""
-    return Stack((np.zeros((k, d, w)), np.zeros((k, d, d)), np.zeros((k, d, d))))
-
-
 def _room(columns: int) -> int:
     """Round a number of columns up to a multiple of `COLUMNS`."""
     return -(-columns // COLUMNS) * COLUMNS
@@ -342,12 +341,17 @@ STILL = 1e-4
 
 
 def eliminated(
-    history: History, noise: Noise, points: Points, kept: Sequence[Stretch] = (), first: int = 0
+    history: History,
+    noise: NoiseModel,
+    points: Points,
+    kept: Sequence[Stretch] = (),
+    first: int = 0,
 ) -> Solution:
     """Linearise, eliminate and solve the chain; segments before ``first`` come from ``kept``."""
     sweep = Sweep(history, noise, points)
     if first:
-        sweep.take_up(kept, first)
+        begun = kept[first]
+        sweep.resume(kept[:first], begun.columns, begun.front, begun.cost)
     else:
         sweep.begin()
     sweep.go_to_the_end()
@@ -355,13 +359,13 @@ def eliminated(
 
 
 def stepped(
-    solution: Solution, history: History, noise: Noise, guess: Float[np.ndarray, " d"]
+    solution: Solution, history: History, noise: NoiseModel, guess: Float[np.ndarray, " d"]
 ) -> Sweep:
     """Return the chain extended by a node linearised at a guess, before the node's measurements."""
     at = solution.points.at.extended(1)
     at.arrays[0][history.nodes - 1] = guess
     sweep = Sweep(history, noise, replace(solution.points, at=at))
-    sweep.go_on(solution)
+    sweep.resume(solution.stretches, solution.columns, solution.front, solution.cost)
     sweep.step()
     return sweep
 
@@ -374,7 +378,7 @@ def off_line(solution: Solution, history: History) -> float:
 
 
 def relinearised(
-    solution: Solution, history: History, noise: Noise, still: float = STILL
+    solution: Solution, history: History, noise: NoiseModel, still: float = STILL
 ) -> Solution:
     """Relinearise the chain at its solution; return it unchanged if that does not lower the cost.
 
@@ -382,18 +386,18 @@ def relinearised(
     """
     further, damping = _at_solution(solution, history, noise, still), LEAST_DAMPING
     while not further.cost <= solution.cost and damping <= MOST_DAMPING:
-        damped = eliminated(history, (*noise[:4], damping), solution.points)
+        damped = eliminated(history, noise._replace(damping=damping), solution.points)
         further, damping = _at_solution(damped, history, noise, 0.0), 10.0 * damping
     return further if further.cost <= solution.cost else solution
 
 
-def _at_solution(solution: Solution, history: History, noise: Noise, still: float) -> Solution:
+def _at_solution(solution: Solution, history: History, noise: NoiseModel, still: float) -> Solution:
     """Linearise, eliminate and solve the chain at its solution."""
     points, first = solved_points(solution, history, still)
     return eliminated(history, noise, points, solution.stretches, first)
 
 
-def converged(solution: Solution, history: History, noise: Noise) -> Solution:
+def converged(solution: Solution, history: History, noise: NoiseModel) -> Solution:
     """Iterate to the optimum, with landmarks leaving the separator after their last measurement.
 
     Huber weights converge linearly: the ratio of two steps extrapolates all further steps (Aitken).
@@ -519,9 +523,13 @@ def smoothed(best: Solution, history: History) -> Smoothed:
     size, n, w = history.nodes, best.beta.size, len(best.border)
     border, P = np.zeros((w, w)), best.covariance.copy()
     border[:n, :n] = border_covariance(best.factor)
-    covariances = P, spread_with_border(best.front[0], border), border
+    X = np.zeros(best.front[0].shape)
+    multiply(best.front[0], border, X)
+    covariances = P, X, border
     covariance, cross = np.zeros((2, size, *P.shape))
-    covariance[-1], own = P, _known_beforehand(history)
+    covariance[-1], (xx, xy, yy) = P, history.known[1].T
+    own = np.stack([yy, -xy, -xy, xx], axis=1).reshape(-1, 2, 2)  # the priors
+    own /= (xx * yy - xy * xy)[:, None, None]
     there, parameters = np.flatnonzero(best.columns), slice(1, 1 + best.points.parameters.size)
     for number in there.tolist():
         at = slice(best.columns[number], best.columns[number] + 2)
@@ -544,10 +552,3 @@ def smoothed(best: Solution, history: History) -> Smoothed:
         parameters=best.points.parameters,
         parameter_covariance=about,
     )
-
-
-def _known_beforehand(history: History) -> Float[np.ndarray, "l 2 2"]:
-    """Return the prior covariances of the separator's landmarks."""
-    xx, xy, yy = history.known[1].T
-    det = xx * yy - xy * xy
-    return np.stack([yy, -xy, -xy, xx], axis=1).reshape(-1, 2, 2) / det[:, None, None]

@@ -30,8 +30,8 @@ from pipistrelle.estimation.beliefs import (
     Innovations,
     Landmarks,
     Track,
-    answer,
     at_steps,
+    completed,
     in_sight,
     no_landmarks,
 )
@@ -377,10 +377,9 @@ def _move(session: Session[B], drive: Drive, first: int, last: int, path: Gaussi
 
 def _follow(callers: dict[int, Gaussian], scan: Scan, belief: Belief, at: tuple[int, int]) -> None:
     """Store the positions of moving callers in sight at step k."""
-    found, (k, steps) = answer(belief, "moving") if scan.moving.size else None, at
-    if found is None:
+    if not scan.moving.size:
         return
-    moving = in_sight(found)
+    moving, (k, steps) = in_sight(completed(belief, Belief).moving()), at
     for row in range(moving.landmark.size):
         nowhere = Gaussian(mean=np.full((steps, 2), nan), covariance=np.full((steps, 2, 2), nan))
         track = callers.setdefault(int(moving.landmark[row]), nowhere)
@@ -391,28 +390,28 @@ def _track_of(
     belief: Belief, time: Float[np.ndarray, " k"], path: Gaussian, callers: dict[int, Gaussian]
 ) -> Track:
     """Return the track of a drive from its final belief and its online estimates."""
+    belief = completed(belief, Belief)
     online = replace(path, invariant=belief.pose().invariant)
-    revised, cloud = answer(belief, "path"), answer(belief, "cloud")
+    revised, cloud, sums = belief.path(), belief.cloud(), belief.innovations
     if revised is not None:
         check_poses("path", revised, time.size)
-    innovations = getattr(belief, "innovations", None)
     return Track(
         time=time,
         pose=revised or online,
         landmarks=belief.landmarks(),
         gated=belief.gated,
-        innovations=innovations if isinstance(innovations, Innovations) else NO_INNOVATIONS,
+        innovations=sums if isinstance(sums, Innovations) else NO_INNOVATIONS,
         cloud=cloud,
-        full=None if cloud is None else getattr(belief, "full", None),
+        full=None if cloud is None else belief.full,
         online=online if revised else None,
-        calibration=answer(belief, "calibration") or {},
+        calibration=belief.calibration(),
         callers=_retraced(callers, belief, time.size),
     )
 
 
 def _retraced(callers: dict[int, Gaussian], belief: Belief, steps: int) -> Mapping[int, Gaussian]:
     """Replace online tracks of callers by revised tracks, and fill the gaps of these."""
-    revised = answer(belief, "tracks") if callers else None
+    revised = belief.tracks() if callers else None
     if revised is None:
         return callers
     tracks = dict(revised)

@@ -13,7 +13,7 @@ from pipistrelle.arrays.layout import Scattered, layout_of
 from pipistrelle.arrays.sampling import off_raster, sampling
 from pipistrelle.config import SQUARE, Config, InputError, Section
 from pipistrelle.detection.front_end import front_end
-from pipistrelle.estimation.beliefs import Belief, Gaussian
+from pipistrelle.estimation.beliefs import Belief, Gaussian, completed
 from pipistrelle.estimation.catalogue import CATALOGUE, check_distinct, entry, worded
 from pipistrelle.estimation.data_association.sequential import association_of
 from pipistrelle.estimation.motion import Motion
@@ -60,8 +60,9 @@ def check_filters(
                 f"has {', '.join(parts)}"
             )
         methods = ("pose", "landmarks", "path", "cloud")
-        present = (part for part in methods if hasattr(belief, part))
-        if fixed := [part for part in present if not callable(getattr(belief, part))]:
+        if fixed := [
+            part for part in methods if not callable(getattr(completed(belief, Belief), part))
+        ]:
             raise InputError(
                 f"filter {name}: init returns a belief whose {', '.join(fixed)} cannot be called; "
                 f"of a belief {', '.join(methods)} are methods, the last two where it has them"

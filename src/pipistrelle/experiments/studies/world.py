@@ -27,7 +27,7 @@ from pipistrelle import kernel_clock
 from pipistrelle.acoustics.emitter import beamwidth_of
 from pipistrelle.config import Config, InputError
 from pipistrelle.estimation.association import KNOWN
-from pipistrelle.estimation.beliefs import Track
+from pipistrelle.estimation.beliefs import Track, revises_path
 from pipistrelle.estimation.catalogue import SECTIONS
 from pipistrelle.estimation.smoother.preintegration import numbers_of
 from pipistrelle.evaluation.accuracy import (
@@ -161,7 +161,7 @@ def world_schemas(plan: Plan) -> "dict[str, dict[str, Any]]":
     scores = dict.fromkeys(kept, pl.Float64)
     motion = motion_of(plan.config.motion)
     beliefs = (first_belief(name, motion, plan.config) for name in plan.filters)
-    online = any(hasattr(belief, "path") for belief in beliefs)
+    online = any(revises_path(belief) for belief in beliefs)
     estimated = numbers_of({name for config in configs for name in config.filter.calibrate})
     counts = dict.fromkeys(("landmarks_full", "landmarks_total", "gated"), pl.Int32)
     last = ("landmarks_full_mean", "clutter_per_frame", "wall_s", "cpu_s")
