@@ -75,7 +75,7 @@ def test_comments_constants_and_defaults_are_passed_over():
 def test_a_range_of_a_later_ros_has_its_variance():
     later = get_typestore(Stores.LATEST)
     kinds = types_of(RANGE, sound(RANGE, later), idl=False, first=False)
-    assert kinds.fielddefs[RANGE] == later.fielddefs[RANGE]
+    assert kinds.fielddefs[RANGE][1] == later.fielddefs[RANGE][1]
     assert "variance" in dict(kinds.fielddefs[RANGE][1])
 
 

@@ -31,7 +31,7 @@ from pipistrelle.detection.logs.bag_messages import (
     TurnError,
     pose_of,
 )
-from pipistrelle.detection.logs.poses import MOTION_COVARIANCE, POSE, motions_between
+from pipistrelle.detection.logs.poses import MOTION_COVARIANCE, POSE, motions_between, path_of
 from pipistrelle.detection.logs.recording import Log, assemble
 from pipistrelle.detection.logs.vehicle import NOISY
 from pipistrelle.detection.scans import UNLABELLED, WIDEST
@@ -344,10 +344,7 @@ def read_bag(
 def read_poses(
     path: Path, settings: BagConfig, remarks: Remarks | None = None
 ) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, "n 3"]] | None:
-    """Read times [s] and poses [m, m, rad] of the truth, heading unwrapped; None without topic.
-
-    The later of two poses at one time is used. `remarks` receives notes and warnings.
-    """
+    """Read the truth as `path_of` does, None without a topic; `remarks` receives warnings."""
     if settings.truth is None:
         return None
     with opened(path) as bag:
@@ -357,10 +354,7 @@ def read_poses(
             with faults_named(f"{path}, topic {topic}, message {message.number}"):
                 true.add(message, settings, lambda m, s: (_time(m, s), *pose(m.content)))
     rows = true.sound(remarks or Remarks())
-    column = _table(f"{path}, topic {topic}", ("time", *POSE), rows).column
-    last = np.append(np.diff(column["time"]) > 0.0, True)
-    heading = np.unwrap(column["heading"][last])
-    return column["time"][last], np.column_stack([column["x"][last], column["y"][last], heading])
+    return path_of(_table(f"{path}, topic {topic}", ("time", *POSE), rows))
 
 
 def _time(message: Message, settings: BagConfig) -> float:

@@ -313,7 +313,7 @@ def types_of(name: str, text: str, *, idl: bool, first: bool) -> Any:
     `text`: the definition in the bag, or empty; `idl`: whether it is IDL; `first`: whether of ROS
     1.
     """
-    known = _known(first, latest=False)
+    known = _known(first)
     if name not in known.fielddefs:
         raise InputError(f"found the type {shown(name)}, expected one that ROS or we define")
     if not text.strip():
@@ -321,22 +321,17 @@ def types_of(name: str, text: str, *, idl: bool, first: bool) -> Any:
     told = read_definition(name, text, idl=idl)
     there = {one: fields for one, (_, fields) in known.fielddefs.items()} | told
     same, fault = _compared(name, there, known.fielddefs)
-    if not same and not first:
-        latest = _known(first, latest=True)
-        if _compared(name, there, latest.fielddefs)[0]:
-            return latest
     if fault:
         raise refusal(f"the definition of {name}", *fault, "write ROS's own definition")
     return known if same else _registered(name, there)
 
 
 @cache
-def _known(first: bool, *, latest: bool) -> Any:
-    """Return the types that rosbags and this package define, for ROS 1 or a version of ROS 2."""
+def _known(first: bool) -> Any:
+    """Return the types that rosbags and this package define, for ROS 1 or ROS 2."""
     from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
-    second = Stores.LATEST if latest else Stores.ROS2_HUMBLE
-    store = get_typestore(Stores.ROS1_NOETIC if first else second)
+    store = get_typestore(Stores.ROS1_NOETIC if first else Stores.ROS2_HUMBLE)
     for known, fields in DEFINITIONS.items():
         store.register(get_types_from_msg(fields, known))
     return store

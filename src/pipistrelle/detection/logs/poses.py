@@ -19,7 +19,7 @@ from jaxtyping import Float, Int
 from pipistrelle.config import FARTHEST
 from pipistrelle.geometry import wrap
 from pipistrelle.refusals import refusal
-from pipistrelle.text_tables import Table, place_of
+from pipistrelle.text_tables import Table, place_of, points_of
 
 POSE = ("x", "y", "heading")
 """Columns of a row of poses, besides its time."""
@@ -53,6 +53,17 @@ def motions_between(odometry: Table, time: Float[np.ndarray, " t"]) -> Float[np.
         return moved
     covariance = _step_covariances(ends, there, stamp, poses, stated)
     return np.hstack([moved, covariance[:, *_FULL]])
+
+
+def path_of(table: Table) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, "n 3"]]:
+    """Return times [s] and poses [m, m, rad] of a table, heading unwrapped.
+
+    The later of two rows with one time is used.
+    """
+    time = table.column["time"]
+    last = np.append(np.diff(time) > 0.0, True)
+    heading = np.unwrap(table.column["heading"][last])
+    return time[last], np.column_stack((points_of(table)[last], heading))
 
 
 def relative_motions(poses: Float[np.ndarray, "t 3"]) -> Float[np.ndarray, "t-1 3"]:

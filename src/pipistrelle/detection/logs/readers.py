@@ -88,11 +88,6 @@ def _is_bag(path: Path) -> bool:
     return (path / "metadata.yaml").exists() or bool(storages(path))
 
 
-def _is_mrclam(folder: Path) -> bool:
-    """Return whether a folder is a MRCLAM set: it has barcodes, or a robot's odometry."""
-    return (folder / "Barcodes.dat").exists() or any(folder.glob("Robot*_Odometry.dat"))
-
-
 def _mrclam_robots(folder: Path) -> list[Robot]:
     """List the robots with odometry in a MRCLAM set, by number if the file name has one."""
     files = sorted(path.name for path in folder.glob("Robot*_Odometry.dat"))
@@ -114,7 +109,9 @@ MRCLAM = Reader(
     title="a MRCLAM set",
     help="a UTIAS MRCLAM folder",
     robot_help="a MRCLAM folder, 1 to 5",
-    recognises=_is_mrclam,
+    recognises=lambda folder: (
+        (folder / "Barcodes.dat").exists() or any(folder.glob("Robot*_Odometry.dat"))
+    ),
     read=_imported("folder", "read_mrclam"),
     robots=_mrclam_robots,
     files=("*.dat",),

@@ -107,7 +107,8 @@ class Vehicle(Section):
 
     def told(self) -> dict[str, Any]:
         """Return the values as fields of a `Log`."""
-        values = {name: getattr(self, name) for name in type(self).model_fields if name in TOLD}
+        told = (*SHARED, "wheelbase", "speed_offset")
+        values = {name: getattr(self, name) for name in type(self).model_fields if name in told}
         values["control_std"] = tuple(getattr(self, f"{name}_std") for name in NOISY[self.motion])
         values["association"] = self.association.model_dump(exclude_none=True)
         return values
@@ -153,12 +154,10 @@ KINDS: dict[str, type[Vehicle]] = {
     "ackermann": _Ackermann,
     "poses": _Poses,
 }
-OF_FILES = ("format", "step", "time_offset")
-"""Keys that affect how the tables are read."""
-SHARED = tuple(name for name in Vehicle.model_fields if name not in OF_FILES)
-"""Keys that every log has."""
-TOLD = (*SHARED, "wheelbase", "speed_offset")
-"""Keys that become fields of a `Log`, if the motion model has them."""
+SHARED = tuple(
+    name for name in Vehicle.model_fields if name not in ("format", "step", "time_offset")
+)
+"""Keys of all logs that do not only affect how the tables are read."""
 
 
 def read_vehicle(path: Path) -> tuple[Vehicle, tuple[str, ...]]:

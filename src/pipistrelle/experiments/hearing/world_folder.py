@@ -127,16 +127,15 @@ def laid_over(world: World, layer: Layer, values: Layer) -> Layer:
 
 def _decided(world: World, layer: Layer) -> Layer:
     """Return the settings that a world's files fix; raise if a layer contradicts them."""
-    decided: Layer = {}
-    if world.landmarks is not None:
-        decided[_COUNT] = Given(len(world.landmarks), f"{world.name}: landmarks.csv")
-    for key, given in decided.items():
-        if key in layer and layer[key].value != given.value:
-            raise InputError(
-                f"{layer[key].where}: found {shown(layer[key].value)}, but the world's "
-                f"landmarks.csv has {given.value}; leave it out"
-            )
-    return decided
+    if world.landmarks is None:
+        return {}
+    count, given = len(world.landmarks), layer.get(_COUNT)
+    if given is not None and given.value != count:
+        raise InputError(
+            f"{given.where}: found {shown(given.value)}, but the world's landmarks.csv has "
+            f"{count}; leave it out"
+        )
+    return {_COUNT: Given(count, f"{world.name}: landmarks.csv")}
 
 
 def read_world(folder: Path) -> World:

@@ -16,6 +16,7 @@ import numpy as np
 from jaxtyping import Float
 
 from pipistrelle.config import BagConfig
+from pipistrelle.detection.logs.poses import path_of
 from pipistrelle.detection.logs.readers import Robot
 from pipistrelle.detection.logs.recording import Log, check_seconds
 from pipistrelle.experiments.drives import LabelledPoints, Truth
@@ -147,10 +148,7 @@ def read_path(
     """
     table = read_table(path, TRUTH.columns, separator=separator)
     check_seconds(table)
-    column = table.column
-    last = np.append(np.diff(column["time"]) > 0, True)
-    heading = np.unwrap(column["heading"][last])
-    return column["time"][last], np.column_stack((points_of(table)[last], heading))
+    return path_of(table)
 
 
 def read_landmarks(path: Path, columns: tuple[str, ...], separator: str | None) -> LabelledPoints:
