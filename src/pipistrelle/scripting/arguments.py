@@ -14,7 +14,6 @@ from typing import TYPE_CHECKING, Any, get_args
 from pydantic import create_model
 
 from pipistrelle.config import STRATEGIES, BagConfig, Config, InputError, Section, Strategy
-from pipistrelle.detection.logs.readers import reader_of
 from pipistrelle.estimation.catalogue import (
     CATALOGUE,
     PAPERS,
@@ -372,14 +371,6 @@ def check_open(flags: Layer) -> None:
         if not is_open(key):
             why = "the log decides this" if key in LOGGED else "means nothing to a recorded log"
             raise InputError(f"{given.where}: {why}; leave it out")
-
-
-def check_bag(flags: Layer, log: Path) -> None:
-    """Raise if a setting of ROS bags is given for another kind of log."""
-    given = [given for key, given in flags.items() if key[0] == "bag"]
-    reader = reader_of(log)
-    if given and reader.recognises(log) and not reader.configured:
-        raise InputError(f"{given[0].where}: means nothing to {reader.title}; leave it out")
 
 
 def has_excess_paths(recorded: "Log") -> bool:

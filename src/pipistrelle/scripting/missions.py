@@ -13,6 +13,7 @@ import numpy as np
 from pipistrelle.acoustics.paths import moves
 from pipistrelle.config import Config, InputError, Strategy
 from pipistrelle.detection.logs.folder import log_files
+from pipistrelle.detection.logs.readers import reader_of
 from pipistrelle.detection.logs.recording import Log, LogCaller
 from pipistrelle.detection.noise import unstated
 from pipistrelle.detection.scans import Scan
@@ -41,7 +42,6 @@ from pipistrelle.experiments.runs.validate import checked_scenario, warnings_of
 from pipistrelle.files import LOG, SOUND, WORLD, OwnFiles, without_links
 from pipistrelle.scripting.arguments import (
     Door,
-    check_bag,
     check_open,
     folder_named,
     frames_named,
@@ -125,7 +125,9 @@ def prepare_slam(
         raise InputError(
             f"{width.where}: found {width.value:g}, expected above 0 and up to 360 [deg]"
         )
-    check_bag(given, place)
+    of_bags, reader = [it for key, it in given.items() if key[0] == "bag"], reader_of(place)
+    if of_bags and reader.recognises(place) and not reader.configured:
+        raise InputError(f"{of_bags[0].where}: means nothing to {reader.title}; leave it out")
     recorded, truth = load(place, robot, bag=bag)
     config, overruled = with_log(layer, recorded, place)
     config = of_estimators(config, filters)

@@ -107,9 +107,9 @@ def _stopwatch() -> Callable[[str], float]:
 
 def closing_table(
     trials: "Sequence[TrialResult]",
-    count: int | None = None,
-    driven: float | None = None,
-    names: "Mapping[str, str] | None" = None,
+    count: int | None,
+    driven: float | None,
+    names: Mapping[str, str],
 ) -> str:
     """Format the scores of a mission as a table with a column per estimate, and notes below it.
 
@@ -120,7 +120,7 @@ def closing_table(
 
     columns = [dict(_cells(trial, count, driven)) for trial in trials]
     filters = [short_name(trial.filter) for trial in trials]
-    heads = [(names or {}).get(trial.strategy, trial.strategy) for trial in trials]
+    heads = [names.get(trial.strategy, trial.strategy) for trial in trials]
     lines = [("", *heads), ("", *filters)]
     width = max(11, 1 + max(map(len, filters)))
     for title in dict.fromkeys(title for column in columns for title in column):

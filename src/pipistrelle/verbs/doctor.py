@@ -51,7 +51,12 @@ def _findings() -> Iterator[tuple[str, str]]:
     yield "cores", str(cores())
     yield "kernel cache", os.environ["NUMBA_CACHE_DIR"]
     yield "ffmpeg", shutil.which("ffmpeg") or "not found; --animate mp4 needs it, gif does not"
-    yield "PIPISTRELLE_DATA", _data(os.environ.get("PIPISTRELLE_DATA"))
+    place = os.environ.get("PIPISTRELLE_DATA")
+    if place is None:
+        place = "not set; only tests and timings on recorded logs need it"
+    elif not (Path(place) / "mrclam").is_dir():
+        place += ": holds no folder mrclam; set it to the folder that does"
+    yield "PIPISTRELLE_DATA", place
 
 
 def _libraries() -> Iterator[tuple[str, str]]:
@@ -70,12 +75,3 @@ def _libraries() -> Iterator[tuple[str, str]]:
             yield name, version(name) + beside
         except PackageNotFoundError:
             yield name, f"not found{beside}; python -m pip install '{whole}'"
-
-
-def _data(place: str | None) -> str:
-    """Return the state of the folder of recorded logs."""
-    if place is None:
-        return "not set; only tests and timings on recorded logs need it"
-    if not (Path(place) / "mrclam").is_dir():
-        return f"{place}: holds no folder mrclam; set it to the folder that does"
-    return place
