@@ -34,6 +34,7 @@ import tomli_w
 from pipistrelle.config import Config
 from pipistrelle.detection.scans import scan_of
 from pipistrelle.experiments.hearing.listening import listen
+from pipistrelle.experiments.hearing.oracle import label_detections
 from pipistrelle.experiments.hearing.scenario import world_of
 from pipistrelle.experiments.named_settings import Case
 from pipistrelle.experiments.runs.heard_world import drive_of, scans_of
@@ -54,6 +55,8 @@ PRUNES = tuple(float(f"{digit}e-{decade}") for decade in range(12, 1, -1) for di
 STUDIES = Path(__file__).parents[2] / "src/pipistrelle/experiments/studies"
 Run = Callable[[Callable[[int], Any]], list[Any]]
 """Calls a function with the number of each world; lists what it returns."""
+Oracle = Callable[..., Any]
+"""Labels detections, as `label_detections` does."""
 
 
 def main() -> None:
@@ -103,9 +106,12 @@ def changed(config: Config, change: Mapping[str, Any]) -> Config:
     return config
 
 
-def landmarks_seen(config: Config, beams: Sequence[str], world: int) -> dict[str, int]:
+def landmarks_seen(
+    config: Config, beams: Sequence[str], world: int, *, oracle: Oracle = label_detections
+) -> dict[str, int]:
     """Count the landmarks that each strategy sees; passive is heard beside the last beam."""
-    heard = listen(world_of(config, world), config, [BEAMS[b] for b in beams], iteration=world)
+    radii = [BEAMS[b] for b in beams]
+    heard = listen(world_of(config, world), config, radii, iteration=world, oracle=oracle)
     cases = {"passive": ("passive", heard[-1])}
     for beam, frames in zip(beams, heard, strict=True):
         cases |= {f"{strategy} {beam}": (strategy, frames) for strategy in ("fused", "active")}
@@ -117,8 +123,17 @@ def landmarks_seen(config: Config, beams: Sequence[str], world: int) -> dict[str
     }
 
 
-def fit_levels(config: Config, run: Run) -> tuple[Config, dict[str, list[int]]]:
+def fit_levels(
+    config: Config,
+    run: Run,
+    *,
+    oracle: Oracle = label_detections,
+    most_active: float = MOST_ACTIVE,
+    step: int = 8,
+) -> tuple[Config, dict[str, list[int]]]:
     """Fit both source levels to a tenth of a decibel; return them, and what is then seen.
+
+    `step` [0.1 dB] is the first step of the search from the levels of `config`.
 
     Each is found with the other held, in turn, until neither moves: the vehicle's level hardly
     changes what passive sensing sees, but the beacon's does change what fused sensing sees.
@@ -130,7 +145,7 @@ def fit_levels(config: Config, run: Run) -> tuple[Config, dict[str, list[int]]]:
     @cache
     def seen(vehicle: int, beacon: int, *beams: str) -> dict[str, list[int]]:
         settings = at(vehicle, beacon)
-        rows = run(partial(landmarks_seen, settings, beams))
+        rows = run(partial(landmarks_seen, settings, beams, oracle=oracle))
         counts = {name: [row[name] for row in rows] for name in rows[0]}
         means = (f"{name} {fmean(count):.2f}" for name, count in counts.items())
         print(f"{vehicle / 10} and {beacon / 10} dB:", ", ".join(means), flush=True)
@@ -149,9 +164,11 @@ def fit_levels(config: Config, run: Run) -> tuple[Config, dict[str, list[int]]]:
     before = None
     while before != (vehicle, beacon):
         before = (vehicle, beacon)
-        beacon = nearest(passive, PAPER["passive"], beacon)
-        vehicle = nearest(fused, PAPER["fused 180"], vehicle)
-        while active(vehicle) > MOST_ACTIVE:
+        beacon = nearest(passive, PAPER["passive"], beacon, step)
+        vehicle = nearest(fused, PAPER["fused 180"], vehicle, step)
+        if active(vehicle) > most_active:
+            vehicle = nearest(active, most_active, vehicle, step)
+        while active(vehicle) > most_active:
             vehicle -= 1
     return at(vehicle, beacon), seen(vehicle, beacon, *BEAMS)
 

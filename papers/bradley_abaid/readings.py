@@ -54,7 +54,16 @@ from typing import Any, cast
 
 import numpy as np
 import polars as pl
-from calibration import PAPER_FULL, SEED, Run, at_least, changed, fit_levels, in_worlds
+from calibration import (
+    PAPER_FULL,
+    SEED,
+    Oracle,
+    Run,
+    at_least,
+    changed,
+    fit_levels,
+    in_worlds,
+)
 
 from pipistrelle.config import STRATEGIES, Config, Strategy
 from pipistrelle.detection.front_end import FrameMeasurements
@@ -62,6 +71,7 @@ from pipistrelle.estimation.rays import RANGED as RANGE_READINGS
 from pipistrelle.evaluation.accuracy import rmse
 from pipistrelle.evaluation.comparison import pooled_std
 from pipistrelle.experiments.hearing.listening import listen
+from pipistrelle.experiments.hearing.oracle import label_detections
 from pipistrelle.experiments.hearing.scenario import world_of
 from pipistrelle.experiments.named_settings import Case
 from pipistrelle.experiments.runs.heard_world import drive_of, scans_of
@@ -128,6 +138,8 @@ position, EKF's fused beats active below 42 degrees and not above; FastSLAM's ne
 worse than active and fused; FastSLAM is worse than EKF in every case. In mean NEES, FastSLAM is
 above EKF with each strategy; EKF's active below passive, and fused lower at 11 than at 180 degrees;
 FastSLAM's fused above active and passive."""
+PARTS = ("landmarks", "spread", "left_out", "gap")
+"""Parts of the misfit; the spread is of `second_readings`."""
 DRAWS = 1000
 ALL_DRAWN = "any"
 """Stands where a level makes no difference."""
@@ -146,7 +158,7 @@ def main() -> None:
     trials = pl.concat(read_kept(path) for path in paths)
     readings = all_readings(trials)
     values = drawn(list(readings.values()))
-    table = misfits(readings, values, fits)
+    table = misfits(readings, values, {key: fits["/".join(key[:3])] for key in readings})
     write_table(table, published(OUTPUT, chosen), "rays.prune")
     tied = table.filter("tied").sort("departures", "misfit")
     print("chosen by the rule, of", tied.height, "tied:", tied.select(*FACTORS).row(0))
@@ -241,7 +253,9 @@ def fitted(path: Path, run: Run) -> dict[str, Change]:
     return fits
 
 
-def fit_tau(config: Config, run: Run, change: Changing = as_heard) -> float:
+def fit_tau(
+    config: Config, run: Run, change: Changing = as_heard, oracle: Oracle = label_detections
+) -> float:
     """Find the tau, of the series 1, 2, 5, at which passive EKF-SLAM places as many as the paper.
 
     The more is pruned the more is placed, so that halving finds it. ``change`` is done to what is
@@ -251,7 +265,7 @@ def fit_tau(config: Config, run: Run, change: Changing = as_heard) -> float:
     @cache
     def placed(i: int) -> float:
         pruned = changed(config, {"rays.prune": PRUNES[i]})
-        return fmean(run(partial(placed_passively, pruned, change)))
+        return fmean(run(partial(placed_passively, pruned, change, oracle)))
 
     low, high = 0, len(PRUNES) - 1
     while high - low > 1:
@@ -261,18 +275,18 @@ def fit_tau(config: Config, run: Run, change: Changing = as_heard) -> float:
 
 
 @cache
-def heard_passively(settled: str, world: int) -> tuple[Any, Any]:
+def heard_passively(settled: str, oracle: Oracle, world: int) -> tuple[Any, Any]:
     """Hear a world once for all tau; the settings come as text, to be a key."""
     config = Config.model_validate_json(settled)
     scenario = world_of(config, world)
-    (heard,) = listen(scenario, config, [BEAMS[11]], iteration=world)
+    (heard,) = listen(scenario, config, [BEAMS[11]], iteration=world, oracle=oracle)
     return drive_of(scenario, config), heard
 
 
-def placed_passively(config: Config, change: Changing, world: int) -> int:
+def placed_passively(config: Config, change: Changing, oracle: Oracle, world: int) -> int:
     """Count the landmarks that passive EKF-SLAM fully initialises."""
     plain = config.model_copy(update={"rays": Config().rays})
-    drive, heard = heard_passively(plain.model_dump_json(), world)
+    drive, heard = heard_passively(plain.model_dump_json(), oracle, world)
     scans = scans_of(change(heard, world), "passive", config)
     case = Case(strategy="passive", filter="ekf", iteration=world)
     return run_trial(case, drive, scans, config).scores.landmarks_full
@@ -341,7 +355,11 @@ def varied(chosen: Mapping[str, str], strategy: Strategy) -> Iterator[tuple[str,
 class Reading:
     """One combination's numbers, a row per world: (worlds, cases) of each filter."""
 
-    def __init__(self, trials: pl.DataFrame, levels: Mapping[str, str]) -> None:
+    expected = EXPECTED
+
+    def __init__(
+        self, trials: pl.DataFrame, levels: Mapping[str, str], scores: Sequence[str] = ()
+    ) -> None:
         chosen = trials
         for factor, level in levels.items():
             chosen = chosen.filter(pl.col(factor).is_in([level, ALL_DRAWN]))
@@ -349,7 +367,7 @@ class Reading:
         self.columns = {
             (name, score): self._columns(chosen.filter(pl.col("filter") == name), score)
             for name in EXCLUDED
-            for score in ("full", "total", "diverged", "position", "nees")
+            for score in ("full", "total", "diverged", "position", "nees", *scores)
         }
 
     @staticmethod
@@ -376,7 +394,7 @@ class Reading:
                     off.append((self.columns[name, score][case][counted].mean() - mean) / sigma)
         shares = [
             math.log((lost[name] * len(rows) + 0.5) / (expected * len(rows) + 0.5))
-            for name, expected in EXPECTED.items()
+            for name, expected in self.expected.items()
         ]
         gap = self.gap(rows)
         beyond = [max(gap[b] - 1.0, 0.0) if b >= 65 else max(1.0 - gap[b], 0.0) for b in BEAMS]
@@ -453,8 +471,8 @@ class Reading:
 
 
 def misfit_of(parts: Mapping[str, float]) -> float:
-    """Put the three parts together."""
-    return rmse(np.array([parts["landmarks"], parts["left_out"], parts["gap"]]))
+    """Return the root of the mean square of the parts."""
+    return rmse(np.array([parts[name] for name in PARTS if name in parts]))
 
 
 def all_readings(trials: pl.DataFrame) -> dict[Levels, Reading]:
@@ -474,7 +492,10 @@ def drawn(readings: Sequence[Reading]) -> np.ndarray:
 
 
 def misfits(
-    readings: Mapping[Levels, Reading], values: np.ndarray, fits: Mapping[str, Change]
+    readings: Mapping[Levels, Reading],
+    values: np.ndarray,
+    fits: Mapping[Levels, Change],
+    defaults: Mapping[str, str] = DEFAULTS,
 ) -> pl.DataFrame:
     """Table of all combinations: what was fitted, what was found, the misfit; the least first."""
     best, table = int(values[0].argmin()), []
@@ -482,8 +503,8 @@ def misfits(
         rows = np.arange(reading.worlds)
         table.append(
             {
-                **dict(zip(FACTORS, levels, strict=True)),
-                **fits["/".join(levels[:3])],
+                **dict(zip(defaults, levels, strict=True)),
+                **fits[levels],
                 **reading.parts(rows),
                 **{f"gap_{beam}": gap for beam, gap in reading.gap(rows).items()},
                 "misfit": values[0, i],
@@ -493,7 +514,7 @@ def misfits(
                 **reading.placed(rows),
                 **reading.features(rows),
                 "features": sum(reading.features(rows).values()),
-                "departures": sum(map(str.__ne__, levels, DEFAULTS.values())),
+                "departures": sum(map(str.__ne__, levels, defaults.values())),
             }
         )
     tied = pl.col("above_best") <= pl.col("above_best_error")

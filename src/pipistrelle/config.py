@@ -131,6 +131,11 @@ class ScenarioConfig(Section):
     """Number of landmarks, without the beacon."""
     radius: Positive = 25.0
     """Largest distance of a landmark from the centre [m]."""
+    inner_radius: NonNegative = 0.0
+    """Smallest distance of a landmark of the disc from the centre [m]."""
+    density: Literal["area", "distance"] = "area"
+    """Distribution of the landmarks over the disc: uniform over its area, or uniform in distance
+    from the centre and in direction, which is denser at the centre."""
     spacing: NonNegative = 3.0
     """Smallest distance between two landmarks [m]."""
     clearance: NonNegative = 0.5

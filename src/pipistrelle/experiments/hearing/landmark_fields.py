@@ -60,11 +60,15 @@ def nearest(points: Points, place: Float[np.ndarray, "2"]) -> float:
 def _scattered(
     setup: ScenarioConfig, path: Points, callers: Points, rng: np.random.Generator
 ) -> Points:
-    """Draw landmarks uniformly over the disc; repeat each until it keeps all distances."""
-    placed = np.empty((setup.landmarks, 2))
+    """Draw landmarks over the disc or annulus; repeat each until it keeps all distances."""
+    placed, inner = np.empty((setup.landmarks, 2)), setup.inner_radius / setup.radius
     for i in range(setup.landmarks):
         for _ in range(MAX_DRAWS):
-            distance = setup.radius * math.sqrt(rng.uniform())
+            share = rng.uniform()
+            if setup.density == "area":
+                distance = setup.radius * math.sqrt(inner**2 + (1.0 - inner**2) * share)
+            else:
+                distance = setup.radius * (inner + (1.0 - inner) * share)
             direction = rng.uniform(-math.pi, math.pi)
             place = distance * np.array([math.cos(direction), math.sin(direction)])
             apart = nearest(placed[:i], place) >= setup.spacing
@@ -113,7 +117,12 @@ def _is_clear(
 
 
 def _refuse_crowd(setup: ScenarioConfig) -> None:
-    """Raise if there are more landmarks than the disc can hold."""
+    """Raise if there are more landmarks than the disc can hold, or if it has no room at all."""
+    if setup.field == "disc" and setup.inner_radius >= setup.radius:
+        raise InputError(
+            f"scenario.inner_radius: found {setup.inner_radius:g} m, expected less than "
+            f"scenario.radius, {setup.radius:g} m"
+        )
     half = 0.5 * setup.spacing
     most = MAX_COVERAGE * ((setup.radius + half) / max(half, 1e-100)) ** 2
     if setup.field == "disc" and setup.landmarks > max(most, 1.0):
