@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from scipy.stats import kstest
 
 from pipistrelle.config import InputError, ScenarioConfig
 from pipistrelle.experiments.hearing.landmark_fields import MAX_ROW_OFFSET, landmarks_in, nearest
@@ -40,6 +41,26 @@ def test_all_keep_clear_of_path_callers_and_each_other(kind):
             assert nearest(path, place) >= 0.5
             assert nearest(callers, place) >= 0.5
             assert nearest(places[:i], place) >= (3.0 if kind == "disc" else 0.5)
+
+
+@pytest.mark.parametrize(("density", "power"), [("area", 2), ("distance", 1)])
+def test_an_annulus_is_uniform_in_area_or_in_distance(density, power):
+    places = field("disc", landmarks=4000, spacing=0.0, inner_radius=3.0, density=density)
+    distance = np.hypot(*places.T)
+    assert distance.min() >= 3.0
+    assert distance.max() <= 25.0
+
+    def probability_of_uniform(power):
+        share = (distance**power - 3.0**power) / (25.0**power - 3.0**power)
+        return kstest(share, "uniform").pvalue
+
+    assert probability_of_uniform(power) > 1e-3
+    assert probability_of_uniform(3 - power) < 1e-6
+
+
+def test_an_annulus_without_room_is_refused():
+    with pytest.raises(InputError, match=r"scenario\.inner_radius: found 25 m, expected less than"):
+        field("disc", inner_radius=25.0)
 
 
 @pytest.mark.parametrize("kind", ["rows", "rooms"])
