@@ -232,10 +232,7 @@ def film_writer(path: Path) -> Callable[[Pictures, Path], None]:
 
 
 def write_gif(pictures: Pictures, path: Path) -> None:
-    """Write a GIF that repeats after `HOLD` seconds, in a fixed palette against flicker.
-
-    `pictures`: at least one.
-    """
+    """Write a GIF that repeats after `HOLD` seconds, in a fixed palette against flicker."""
     from PIL import Image
 
     palette = _palette()
@@ -249,10 +246,7 @@ def write_gif(pictures: Pictures, path: Path) -> None:
 
 
 def write_mp4(pictures: Pictures, path: Path) -> None:
-    """Write an MP4 (H.264) through ffmpeg.
-
-    `pictures`: at least one. Raises InputError with the message of ffmpeg if it fails.
-    """
+    """Write an MP4 (H.264) through ffmpeg; raise InputError with its message if it fails."""
     pictures = iter(pictures)
     first = next(pictures)
     height, width, _ = first.shape

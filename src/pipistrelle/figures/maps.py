@@ -1,7 +1,7 @@
 """The map of an estimate: outlines, limits, the true world, the estimate, particles, the legend.
 
 A figure of maps is laid out by `draw_maps`. A `MapPanel` holds the frames of an estimate and the
-artists that show one of them; `mission` shows the last frame, `film` a frame per picture.
+artists that show a frame; `mission` shows the last frame, `film` a frame per picture.
 """
 
 from collections.abc import Mapping, Sequence
@@ -229,7 +229,7 @@ def head(axes: "Axes", strategy: str, estimator: str, name: str = "") -> "Annota
 class MapPanel:
     """An estimate at its frames, and the artists of its map.
 
-    `case`: strategy and filter. `frames`: at least one. `beamwidth` [rad]: None for no beam; a
+    `case`: strategy and filter. `frames`: not empty. `beamwidth` [rad]: None for no beam; a
     passive strategy has none.
     """
 

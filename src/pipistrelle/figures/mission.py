@@ -168,24 +168,21 @@ def outcome(trial: TrialResult, truth: Truth) -> str:
 def _draw_errors(rows: Sequence["Axes"], trial: TrialResult, true_path: np.ndarray) -> None:
     """Draw position error, heading error and NEES over time, with their bounds."""
     colour, track = strategy_colour(trial.strategy), trial.track
-    covariance = track.pose.covariance
-    error = pose_error(track.pose.mean, true_path)
+    elapsed, covariance = track.time - track.time[0], track.pose.covariance
     variance = np.stack([covariance[:, 0, 0] + covariance[:, 1, 1], covariance[:, 2, 2]])
-    bounds = 3.0 * np.sqrt(np.maximum(variance, 0.0))
-    position, heading, consistency = rows
-    elapsed = track.time - track.time[0]
+    far, wide = 3.0 * np.sqrt(np.maximum(variance, 0.0))
+    wide = np.rad2deg(wide)
     distance = position_error(track.pose.mean, true_path)
-    position.fill_between(elapsed, bounds[0], color=colour, alpha=0.16, lw=0)
-    position.plot(elapsed, distance, color=colour, lw=1.1)
-    turn, bound = np.rad2deg(error[:, 2]), np.rad2deg(bounds[1])
-    heading.fill_between(elapsed, -bound, bound, color=colour, alpha=0.16, lw=0)
-    heading.plot(elapsed, turn, color=colour, lw=1.1)
-    consistency.axhspan(*anees_bounds(1), color="#d9d9d9", alpha=0.6, lw=0)
-    epsilon = track_nees(track.pose, true_path)
-    consistency.plot(elapsed, epsilon, color=colour, lw=0.9)
-    consistency.set(yscale="log", xlabel="time [s]", xlim=(0.0, elapsed[-1]))
-    for axes in (position, heading):
+    turn = np.rad2deg(pose_error(track.pose.mean, true_path)[:, 2])
+    *errors, consistency = rows
+    bands = (far, 0.0, distance), (-wide, wide, turn)
+    for axes, (low, high, error) in zip(errors, bands, strict=True):
+        axes.fill_between(elapsed, low, high, color=colour, alpha=0.16, lw=0)
+        axes.plot(elapsed, error, color=colour, lw=1.1)
         axes.tick_params(labelbottom=False)
+    consistency.axhspan(*anees_bounds(1), color="#d9d9d9", alpha=0.6, lw=0)
+    consistency.plot(elapsed, track_nees(track.pose, true_path), color=colour, lw=0.9)
+    consistency.set(yscale="log", xlabel="time [s]", xlim=(0.0, elapsed[-1]))
 
 
 def _scale_errors(panels: Sequence[Sequence["Axes"]]) -> None:

@@ -136,8 +136,8 @@ def callers_marked(scans: Sequence[Scan]) -> bool:
 def excess_paths_at(frame: Snapshot) -> dict[int, list[int]]:
     """Return at most two rows of a scan with excess paths that define ellipses, by landmark.
 
-    Their landmarks are in the map and their callers have estimated positions. Of more rows of a
-    landmark, the pair is returned whose ellipses cross at the largest angle.
+    Their landmarks are in the map and their callers have estimated positions. Two of more rows are
+    the rows with ellipses that cross at the largest angle.
     """
     scan, heard = frame.scan, np.isfinite(frame.scan.excess_path)
     heard &= (scan.caller < len(scan.callers)) & np.isin(scan.landmark, frame.landmarks.landmark)
@@ -156,7 +156,7 @@ def excess_paths_at(frame: Snapshot) -> dict[int, list[int]]:
 def _squarest(
     frame: Snapshot, label: int, callers: Float[np.ndarray, "c 2"], rows: list[int]
 ) -> list[int]:
-    r"""Return the pair of rows whose ellipses cross at the largest angle.
+    r"""Return two rows with the ellipses that cross at the largest angle.
 
     The normal of an ellipse bisects the angle between the lines to its foci:
     :math:`(l - b)/|l - b| + (l - p)/|l - p|`.

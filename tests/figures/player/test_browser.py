@@ -39,6 +39,22 @@ def desk(browser, written):
     page.context.close()
 
 
+@pytest.fixture
+def page_of(browser, tmp_path):
+    """Open the page of a playback; at the end it must have been quiet."""
+    path, pages = tmp_path / "view.html", []
+
+    def opened_page(played):
+        path.write_text(written_page(played), encoding="utf-8")
+        pages.append(shown(browser, path))
+        return pages[-1][0]
+
+    yield opened_page
+    for page, noise in pages:
+        assert noise == [path.as_uri()]
+        page.context.close()
+
+
 def pose_shown(page, place=0):
     """Where a panel says that the vehicle is."""
     data = page.locator(".panel").nth(place).evaluate("panel => ({ ...panel.dataset })")
@@ -101,30 +117,21 @@ def test_nothing_is_wider_than_the_screen(opened):
             assert box["x"] + box["width"] <= inner + 0.5, name
 
 
-@pytest.mark.parametrize("frame", [1, 20, 40])
-def test_a_frame_shows_the_vehicle_where_it_is_believed_and_where_it_is(opened, played, frame):
+def test_a_frame_shows_the_vehicle_where_it_is_believed_and_where_it_is(opened, played):
     page, _ = opened
-    go(page, frame)
-    pose = estimate_of(played, "fused").pose[frame - 1]
     assert page.locator(".panel").first.get_attribute("data-estimate") == "fused · EKF"
-    assert pose_shown(page) == pytest.approx(pose[:2], abs=1e-4)
-    dart = page.evaluate("DART_PIXELS * panels[0].map.pixel")
-    assert np.hypot(*(middle(page, "vehicle") - pose[:2])) < 0.3 * dart
-    true = played.true_pose[frame - 1]
-    assert np.hypot(*(middle(page, "true-vehicle") - true[:2])) < 0.3 * dart
-    assert page.locator("#clock").inner_text() == f"{0.5 * frame:.1f} s · {frame} of 40"
-
-
-def test_the_slider_moves_the_robot(opened, played):
-    page, _ = opened
-    go(page, 1)
-    before = middle(page, "vehicle")
-    go(page, 40)
-    moved = middle(page, "vehicle") - before
-    path = estimate_of(played, "fused").pose[[0, 39], :2]
-    dart = page.evaluate("DART_PIXELS * panels[0].map.pixel")
-    assert np.hypot(*(moved - (path[1] - path[0]))) < 0.6 * dart
-    assert np.hypot(*moved) > 5.0
+    drawn = []
+    for frame in (1, 20, 40):
+        go(page, frame)
+        pose = estimate_of(played, "fused").pose[frame - 1]
+        assert pose_shown(page) == pytest.approx(pose[:2], abs=1e-4)
+        dart = page.evaluate("DART_PIXELS * panels[0].map.pixel")
+        drawn.append(middle(page, "vehicle"))
+        assert np.hypot(*(drawn[-1] - pose[:2])) < 0.3 * dart
+        true = played.true_pose[frame - 1]
+        assert np.hypot(*(middle(page, "true-vehicle") - true[:2])) < 0.3 * dart
+        assert page.locator("#clock").inner_text() == f"{0.5 * frame:.1f} s · {frame} of 40"
+    assert np.hypot(*(drawn[-1] - drawn[0])) > 5.0
 
 
 @pytest.mark.parametrize("frame", [1, 12, 40])
@@ -306,16 +313,12 @@ def test_a_landmarks_life_is_a_line_that_grows_thick_when_it_is_placed(desk, pla
     assert widths[0] < widths[1]
 
 
-def test_a_page_without_truth_shows_no_position_error(browser, watched, tmp_path):
+def test_a_page_without_truth_shows_no_position_error(page_of, watched):
     done, snapshots = watched
     drive = replace(done.drive, truth=NO_TRUTH)
     blind = replace(done, drive=drive, callers=(), beamwidth=None)
-    fused = {("fused", "ekf"): snapshots["fused", "ekf"]}
-    path = tmp_path / "view.html"
-    path.write_text(written_page(playback(blind, fused)), encoding="utf-8")
-    page, noise = shown(browser, path)
+    page = page_of(playback(blind, {("fused", "ekf"): snapshots["fused", "ekf"]}))
     go(page, 40)
-    assert noise == [path.as_uri()]
     assert page.locator(".panel").count() == 1
     assert page.locator(".head select").is_disabled()
     assert page.locator("#beside").is_hidden()
@@ -323,10 +326,9 @@ def test_a_page_without_truth_shows_no_position_error(browser, watched, tmp_path
     for layer in ("true-path", "true-vehicle", "places", "ties", "callers", "beam"):
         assert shapes(page, layer) == 0, layer
     assert shapes(page, "vehicle") == 1
-    page.context.close()
 
 
-def test_an_estimate_that_is_nowhere_is_shown_without_a_complaint(browser, played, tmp_path):
+def test_an_estimate_that_is_nowhere_is_shown_without_a_complaint(page_of, played):
     estimate = estimate_of(played, "fused")
     wild = np.full(estimate.mapped.numbers.shape, 1e300)
     lost = replace(
@@ -334,41 +336,30 @@ def test_an_estimate_that_is_nowhere_is_shown_without_a_complaint(browser, playe
         outcome="failed: <b>it fell</b>",
         pose=np.full_like(estimate.pose, np.nan),
         spread=np.full_like(estimate.spread, np.nan),
-        mapped=Rows(first=estimate.mapped.first, landmark=estimate.mapped.landmark, numbers=wild),
+        mapped=replace(estimate.mapped, numbers=wild),
     )
-    path = tmp_path / "view.html"
-    path.write_text(written_page(replace(played, estimates=(lost,))), encoding="utf-8")
-    page, noise = shown(browser, path)
+    page = page_of(replace(played, estimates=(lost,)))
     for frame in (1, 20, 40):
         go(page, frame)
-    assert noise == [path.as_uri()]
     assert page.locator(".head p").inner_text() == "failed: <b>it fell</b>"
     assert shapes(page, "vehicle") == 0
-    page.context.close()
 
 
-def test_a_mission_of_one_frame_is_shown(browser, watched, tmp_path):
-    done, snapshots = watched
-    path = tmp_path / "view.html"
-    path.write_text(written_page(playback(done, snapshots, most=1)), encoding="utf-8")
-    page, noise = shown(browser, path)
+def test_a_mission_of_one_frame_is_shown(page_of, watched):
+    page = page_of(playback(*watched, most=1))
     page.keyboard.press("End")
     page.keyboard.press("Space")
     page.wait_for_timeout(100)
-    assert noise == [path.as_uri()]
     assert page.locator("#clock").inner_text().endswith("1 of 1")
-    page.context.close()
 
 
-def test_a_revised_path_is_shown_with_the_online_path(browser, played, tmp_path):
+def test_a_revised_path_is_shown_with_the_online_path(page_of, played):
     estimate = estimate_of(played, "fused")
     points = np.vstack([estimate.start, estimate.pose])[:, :2] + 3.0
     nobody = np.zeros(len(points), int)
     rows = Rows(first=np.array([0, len(points)]), landmark=nobody, numbers=points)
     smooth = replace(estimate, revised_at=np.array([39]), revised=rows)
-    path = tmp_path / "view.html"
-    path.write_text(written_page(replace(played, estimates=(smooth,))), encoding="utf-8")
-    page, _ = shown(browser, path)
+    page = page_of(replace(played, estimates=(smooth,)))
     go(page, 39)
     assert shapes(page, "revised") == 0
     go(page, 40)
@@ -377,7 +368,6 @@ def test_a_revised_path_is_shown_with_the_online_path(browser, played, tmp_path)
     off = np.hypot(*(points[-1] - played.true_pose[39, :2]))
     said = page.locator(".position output").inner_text()
     assert f"{off:.2f} m as revised at the end" in said
-    page.context.close()
 
 
 def test_text_has_enough_contrast(opened):
@@ -486,16 +476,12 @@ def test_with_ellipses_nothing_is_wider_than_the_screen_and_all_callers_have_nam
     assert [(ratio, what) for ratio, what in ratios if ratio < 4.5] == []
 
 
-def test_callers_without_truth_are_labelled_at_their_estimates(browser, timed, tmp_path):
+def test_callers_without_truth_are_labelled_at_their_estimates(page_of, timed):
     known = playback(*timed)
     nowhere = tuple((label, name, np.full(2, np.nan)) for label, name, _ in known.callers[:2])
     estimate = estimate_of(known, "fused")
-    blind = replace(
-        known, callers=nowhere, estimates=(replace(estimate, callers=estimate.callers[:, :2]),)
-    )
-    path = tmp_path / "view.html"
-    path.write_text(written_page(blind), encoding="utf-8")
-    page, noise = shown(browser, path)
+    some = replace(estimate, callers=estimate.callers[:, :2])
+    page = page_of(replace(known, callers=nowhere, estimates=(some,)))
     go(page, 40)
     assert shapes(page, "callers") == 0
     assert shapes(page, "believed-callers") == 2
@@ -504,5 +490,3 @@ def test_callers_without_truth_are_labelled_at_their_estimates(browser, timed, t
     )
     away = np.hypot(*(np.array(spots) * [1.0, -1.0] - estimate.callers[39, :2, :2]).T)
     assert (away < 2.0).all()
-    assert noise == [path.as_uri()]
-    page.context.close()
