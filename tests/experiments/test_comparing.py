@@ -79,7 +79,7 @@ def test_the_same_estimates_are_compared_and_others_are_named(folders):
         ("active ekf", "fused iekf", [""]),
     ],
 )
-def test_estimates_are_matched_by_what_differs_within_a_folder(folders, one, two, titles):
+def test_estimates_are_matched_by_the_parts_that_differ_within_a_folder(folders, one, two, titles):
     keys = [[tuple(name.split()) for name in text.split(", ")] for text in (one, two)]
     paths = [dict.fromkeys(some, mine) for some, mine in zip(keys, (OFF, NOISY), strict=True)]
     compared = compare_missions(folders(*paths))

@@ -122,7 +122,7 @@ def test_a_path_that_is_lost_or_far_away_leaves_the_others_to_be_seen(tmp_path):
     assert 10.0 < right - left < 60.0
     assert figure.axes[2].get_ylim()[1] < 1e3
     figure = draw_comparison(missions_of(tmp_path / "all", *[{("fused", "ekf"): LOST}] * 2))
-    save_figure(figure, tmp_path / "out2", "comparison")
+    figure.draw_without_rendering()
 
 
 def test_studies_have_a_panel_for_each_score_and_a_line_for_each_case(tmp_path):

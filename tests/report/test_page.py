@@ -13,16 +13,15 @@ import pytest
 
 from pipistrelle.__main__ import main
 from pipistrelle.config import InputError
-from pipistrelle.experiments.studies.plan import cases_of, find_plan, read_plan
+from pipistrelle.experiments.studies.plan import cases_of, read_plan
 from pipistrelle.experiments.studies.world import TABLES, done_worlds, with_sums, world_file
 from pipistrelle.files import LOG, REPORT, RESULTS, OwnFiles
 from pipistrelle.report.claims import TABLE_II
 from pipistrelle.report.page import write_report
 from pipistrelle.report.study import RULES, read_study
 from pipistrelle.report.variables import setting_variable
-from pipistrelle.settings import from_flags
 from report.drawing import draw_only
-from report.invented import STRATEGIES, invent, narrowed, with_third, write_store
+from report.invented import PLAN, RADII, STRATEGIES, invent, narrowed, with_third, write_store
 
 FIGURES = [
     "anees_ekf", "anees_fastslam", "example_map", "gain", "heading_rmse", "landmarks", "map_rmse",
@@ -156,6 +155,7 @@ def test_links_lead_to_files_and_places_that_are_there_once(reported):
     reader = read(reported)
     places = [attrs["id"] for _, attrs in reader.found if "id" in attrs]
     assert len(places) == len(set(places))
+    assert "departures" not in places, "the settings are the paper's"
     for attrs in reader.of("a"):
         target = attrs["href"]
         if target.startswith("#"):
@@ -227,8 +227,11 @@ def test_no_text_of_a_study_becomes_markup(tmp_path, undrawn):
 
 def test_failed_trials_are_counted_over_all_combinations(tmp_path, capsys, undrawn):
     grid = '"air.relative_humidity" = [0.3, 0.7]\n'
-    plan, _, _ = write_store(tmp_path / "store", invent(1), grid=grid)
-    moist = [c.number for c in cases_of(plan) if c.values["air.relative_humidity"] == 0.7]
+    (tmp_path / "plan.toml").write_text(
+        PLAN.format(iterations=2, settings="", radii=[*RADII]) + grid
+    )
+    cases = cases_of(read_plan(tmp_path / "plan.toml"))
+    moist = [case.number for case in cases if case.values["air.relative_humidity"] == 0.7]
     failed = [(0, moist[0]), (1, moist[5]), (1, moist[-1])]
     again = tmp_path / "again"
     write_store(again, invent(2), grid=grid, failed=failed)
@@ -241,16 +244,6 @@ def test_failed_trials_are_counted_over_all_combinations(tmp_path, capsys, undra
     text = (again / "report" / "index.html").read_text(encoding="utf-8")
     assert "3 failed trials" in text
     assert len(re.findall(r"<h4>World \d, .*, air\.relative_humidity = 0\.7</h4>", text)) == 3
-
-
-def test_the_page_lists_near_its_top_the_settings_that_differ_from_the_papers(tmp_path, undrawn):
-    for flags, there in (({"beacon": {"level_db": 45.0}}, True), ({}, False)):
-        plan = read_plan(find_plan("paper"), from_flags(flags))
-        write_report(replace(invent(2), config=plan.config, grid=plan.grid), tmp_path)
-        ids = [attrs.get("id") for _, attrs in read(tmp_path).found]
-        assert ("departures" in ids) is there
-        if there:
-            assert ids.index("departures") < ids.index("claims")
 
 
 def test_the_summary_is_plain_json_even_of_a_study_that_diverged(tmp_path, undrawn):
@@ -316,7 +309,8 @@ def panels_of(folder, figure):
 def test_a_third_filter_has_its_panels_rows_and_files(tmp_path, monkeypatch):
     draw_only(monkeypatch, "Smoother")
     write_report(with_third(invent(4), "toy_slam.filters:Smoother"), tmp_path)
-    read(tmp_path)
+    ids = [attrs.get("id") for _, attrs in read(tmp_path).found]
+    assert ids.index("departures") < ids.index("claims"), "its settings are not the paper's"
     titles = ["EKF", "FastSLAM 2.0", "Smoother"]
     assert panels_of(tmp_path, "position_rmse") == titles
     assert panels_of(tmp_path, "landmarks") == titles

@@ -184,7 +184,7 @@ def kind_of(folders: Sequence[Path]) -> Literal["missions", "studies"]:
 def distinguishing(folders: Iterable[Iterable[Estimate]]) -> tuple[bool, bool]:
     """Return whether strategies, and whether filters, differ within any folder.
 
-    Others do not name an estimate: folders of one filter each are compared strategy by strategy.
+    Others do not name an estimate: folders of a single filter are compared strategy by strategy.
     """
     parts = [[set(part) for part in zip(*estimates, strict=True)] for estimates in folders]
     strategies, filters = zip(*parts, strict=True)
@@ -356,7 +356,7 @@ def _one_drive(missions: Sequence[StoredMission]) -> bool:
 def compare_studies(folders: Sequence[Path], *, drop_diverged: bool = False) -> ComparedStudies:
     """Compare the scores of two or more studies.
 
-    `drop_diverged`: leave out worlds in which either of two cases diverged; otherwise all worlds
+    `drop_diverged`: leave out worlds where either of two cases diverged; otherwise all worlds
     with a number count. Raises InputError if a folder cannot be read, has no finished world, or no
     case is in all of them.
     """
@@ -638,11 +638,11 @@ def write_comparison(
     notes: Sequence[str],
     draw: Callable[[Path], None] = lambda _: None,
 ) -> None:
-    """Write a comparison into a folder, in place of an earlier one.
+    """Write a comparison into a folder, in place of an earlier comparison.
 
     `own`: the folder, as `pipistrelle.files.claim` gives it. `command`: the command line.
     `notes`: remarks for the README. `draw`: writes the figure into a folder. Raises InputError if a
-    file cannot be written, or one to be replaced was changed.
+    file cannot be written, or a file to be replaced was changed.
     """
     buffer, table = io.BytesIO(), comparison_table(compared)
     table.write_parquet(buffer)

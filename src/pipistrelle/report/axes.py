@@ -87,7 +87,7 @@ def axis_of_words(words: Sequence[str]) -> Axis:
 
 
 def facets_of(study: Study, variable: Variable | None, axis: Axis) -> tuple[list[Facet], bool]:
-    """Split a study's cases into panels over one of its variables, or over the filters.
+    """Split a study's cases into panels over a variable, or over the filters.
 
     Returns: a panel per filter and combination of the other variables with the strategies as
     lines; if these are more than `MOST_PANELS`, a panel per filter and strategy with a line per
@@ -120,10 +120,10 @@ def facets_of(study: Study, variable: Variable | None, axis: Axis) -> tuple[list
         for strategy in among if many else ():
             at = trials[name, strategy].at[rows]
             first = np.sort(np.unique(at, axis=1, return_index=True)[1]).tolist()
-            faint = 0.75 / max(len(first) - 1, 1)
+            last = max(len(first) - 1, 1)
             look = {"way": (name, strategy), "x": x, "aside": x}
             lines = [
-                Line(name=names[j], strength=1.0 - faint * i, cells=rows[:, j], **look)
+                Line(name=names[j], strength=1.0 - 0.75 * i / last, cells=rows[:, j], **look)
                 for i, j in enumerate(first)
             ]
             facets.append((f"{title}, {strategy}", lines))

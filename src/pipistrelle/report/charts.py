@@ -68,8 +68,6 @@ from pipistrelle.report.variables import (
     with_article,
 )
 
-EDGE = 1.08
-"""Position of single worlds of passive sensing, as a multiple of the widest beam."""
 WORLDS = "Mean ± σ over worlds; dots: single worlds above that"
 PASSIVE = " (passive's at the right edge, where they do not depend on the beam)"
 BOUND = (
@@ -91,18 +89,16 @@ class Level:
     score: str
     """One of `study.READ`, or `study.COMMON`."""
     label: str
-    """Label of the vertical axis."""
     column: str
-    """Column of the CSV."""
+    """Label of the vertical axis, and column of the CSV."""
     scale: float = 1.0
     """Factor from the score to the axis."""
     caption: str = WORLDS
     more: str = ""
     """End of the caption."""
     beside: str = ""
-    """Score of a dashed line, if any."""
     named: str = "bound"
-    """Name of the dashed line."""
+    """Score of a dashed line, if any, and its name."""
     worlds: bool = True
     """Whether single worlds are shown."""
     log: bool = False
@@ -180,7 +176,7 @@ def level_charts(selection: Selection, only: str = "") -> list[Chart]:
 
 
 def _chart(selection: Selection, what: Level, variable: Variable | None) -> Chart:
-    """Chart one level over one variable."""
+    """Chart a level over a variable."""
     study = selection.study
     axis = axis_of(variable) if variable else axis_of_words([*filter_titles(study).values()])
     facets, many = facets_of(study, variable, axis)
@@ -232,7 +228,7 @@ def _drawn(
 ) -> list[Series]:
     """Return the lines of a panel, single worlds above each, and the dashed bound.
 
-    `apart`: points beside each other in place of lines. `many`: lines of combinations.
+    `apart`: points side by side in place of lines. `many`: lines of combinations.
     """
     found = []
     for line in lines:
@@ -286,7 +282,7 @@ def _worlds_above(
     above = [sample[sample > end] for sample, end in zip(per_place, top, strict=True)]
     at = line.aside
     if flat:
-        above, at = above[:1], EDGE * line.x[-1:]
+        above, at = above[:1], 1.08 * line.x[-1:]  # beyond the widest beam
     return Series(
         name=f"{line.name}, worlds above σ",
         role=line.way[1],
@@ -378,7 +374,7 @@ def about(
 def _panel(
     measure: changes.Measure, family: Sequence[changes.Effect], axis: Axis, at: Mapping[str, float]
 ) -> Panel:
-    """Return the panel of the effects in one measure, a series per strategy."""
+    """Return the panel of the effects in a measure, a series per strategy."""
     ways: dict[str, list[changes.Effect]] = {}
     for effect in family:
         if effect.measure == measure:
@@ -404,7 +400,7 @@ def _changes(
     at: Mapping[str, float],
     effects: Sequence[changes.Effect],
 ) -> Series:
-    """Return the differences of one strategy, with 0 at the reference value."""
+    """Return the differences of a strategy, with 0 at the reference value."""
     measure, findings = effects[0].measure, [effect.finding for effect in effects]
     mean, edges = _bars(findings)
     mean, edges = np.append(0.0, mean), np.vstack(([np.nan, np.nan], edges))
@@ -426,7 +422,7 @@ def _bars(findings: Sequence[Finding]) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _gain_chart(selection: Selection, variable: Variable) -> Chart:
-    """Chart the gain of fused over active along one variable."""
+    """Chart the gain of fused over active along a variable."""
     study, axis = selection.study, axis_of(variable)
     panels = []
     for what, score in GAINS:
@@ -492,7 +488,7 @@ def anees_charts(selection: Selection) -> list[Chart]:
 
 
 def _anees_chart(selection: Selection, name: str, title: str) -> Chart:
-    """Chart one filter's ANEES over time."""
+    """Chart a filter's ANEES over time."""
     study = selection.study
     ways = [(name, strategy) for strategy in STRATEGIES if (name, strategy) in study.trials]
     lines = {way: _anees_lines(selection, way) for way in ways}

@@ -88,7 +88,7 @@ Verdict = Literal["reproduced", "not-reproduced", "open"]
 
 
 class Printed(NamedTuple):
-    """Row of Table II for one filter: mean and standard deviation of landmarks."""
+    """Row of Table II for a filter: mean and standard deviation of landmarks."""
 
     filter: str
     beamwidth: float
@@ -188,7 +188,7 @@ def differences(
     that do not depend on the beamwidth count once. `name`: label of the pair. `relation`: as in
     `Statement`. `above`, `below` [deg]: only beamwidths from `above` on and below `below`. `sigma`:
     whether the margin is the pooled standard deviation over worlds; otherwise 0. `fitted_above`
-    [deg]: settings were fitted to wider beams. Returns: empty if the study lacks one of the two.
+    [deg]: settings were fitted to wider beams. Returns: empty if the study lacks either.
     """
     study = selection.study
     if not {first, second} <= study.trials.keys():
@@ -229,8 +229,8 @@ def approach(selection: Selection, score: str, name: str) -> Float[np.ndarray, "
 
     .. math:: |s_{fused} - s_{passive}| \approx a + b \log_2(\mathrm{HPBW})
 
-    Returns: b of each world, in the score's unit per doubling; None if the filter lacks one of the
-    two, or the study has a single beamwidth.
+    Returns: b of each world, in the score's unit per doubling; None if the filter lacks either
+    strategy, or the study has a single beamwidth.
     """
     fused, passive = (name, "fused"), (name, "passive")
     study = selection.study
@@ -737,7 +737,7 @@ def findings(selections: Mapping[Rule, Selection]) -> list[dict[str, str]]:
 
 
 def _texts(selection: Selection, name: str) -> dict[str, str]:
-    """Return the findings of a filter under one rule, in words."""
+    """Return the findings of a filter under a rule, in words."""
     study, words = selection.study, {}
     if {(name, "fused"), (name, "active")} <= study.trials.keys():
         for score, digits in ((LANDMARKS, ".0f"), (POSITION_BOUND, ".3f")):

@@ -1,4 +1,4 @@
-"""Effects: changes of a score from one value of a variable to another, in the same world.
+"""Effects: changes of a score between two values of a variable, in the same world.
 
 Every value is compared with the reference: the least number, the first word, or the truth for
 assumed settings and biases. Differences are averaged over the other variables in each world, and
@@ -80,7 +80,7 @@ class Measure:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Pairing:
-    """Cases that differ only in the value of one factor."""
+    """Cases that differ only in the value of a factor."""
 
     factor: str
     """Name of the variable, `STRATEGY` or `FILTER`."""
@@ -101,7 +101,7 @@ class Pairing:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Effect:
-    """A pairing judged in one measure over the worlds."""
+    """A pairing judged in a measure over the worlds."""
 
     pairing: Pairing
     measure: Measure
@@ -177,7 +177,7 @@ def _numbers(study: Study, score: str, cells: Sequence[Cell]) -> list[Float[np.n
 def compare(
     selection: Selection, measure: Measure, rows: Sequence[Sequence[Pair]]
 ) -> tuple[Contrast, ...]:
-    """Compare the pairs of each row, averaged in each world; the rows are one family."""
+    """Compare the pairs of each row, averaged in each world; the rows are a family."""
     if not any(rows):
         return ()
     frame = _frame(selection, [(0, measure, pairs) for pairs in rows])
@@ -345,7 +345,7 @@ def record(by_rule: Mapping[Rule, Sequence[Effect]], headline: Rule) -> list[dic
 
 
 def _plain_effect(effect: Effect) -> dict[str, Any]:
-    """Return an effect under one exclusion rule as JSON values."""
+    """Return an effect under an exclusion rule as JSON values."""
     ratio, finding = effect.measure.ratio, effect.finding
     low, high = finding.family
     would = math.nan if finding.holds is not None or effect.untouched else (high - low) / 2.0
@@ -379,7 +379,7 @@ def json_finding(finding: Finding, *, effect: bool = False, ratio: bool = False)
 
 
 def headline(subject: str, title: str, unit: str, contrast: Contrast, cases: int = 1) -> str:
-    """Return one sentence for one contrast: direction, size and interval of the change.
+    """Return a sentence for a contrast: direction, size and interval of the change.
 
     `subject`: the two values, as "B instead of A". `title` and `unit`: of the score. `cases`: over
     which the change is averaged.

@@ -243,7 +243,7 @@ def _template() -> "Template":
 
 
 def _side_by_side(figures: list[dict[str, Any]]) -> list[dict[str, Any]]:
-    """Mark figures of one panel as pairs, and the last of an odd number as single."""
+    """Mark figures of a single panel as pairs, and the last of an odd number as single."""
     single = [figure for figure in figures if figure["columns"] == 1]
     for figure in single:
         figure["place"] = "single"

@@ -2,7 +2,7 @@
 
 A combination is one value of each variable. Combinations are numbered as a product, the last
 variable fastest; if the beamwidth is the only variable, they are the beamwidths, narrowest first.
-A `Selection` is a study under one exclusion rule: every claim, chart and table is made from one.
+A `Selection` is a study under an exclusion rule: every claim, chart and table is made from one.
 """
 
 from collections import Counter
@@ -133,7 +133,7 @@ class Study:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Selection:
-    """A study under one exclusion rule, as `select` makes it."""
+    """A study under an exclusion rule, as `select` makes it."""
 
     study: Study
     rule: Rule
@@ -158,7 +158,7 @@ def has_numbers(study: Study, score: str) -> bool:
 
 
 def along(study: Study, variable: Variable) -> Int[np.ndarray, "k m"]:
-    """Return the numbers of the combinations, a row for each value of one variable.
+    """Return the numbers of the combinations, a row for each value of a variable.
 
     `variable`: one of the study's. Returns: columns are the combinations of the other variables.
     """
@@ -260,7 +260,7 @@ def rmse_of(
 
 
 def mean_std(sample: Float[np.ndarray, " m"]) -> tuple[float, float]:
-    """Return the mean and standard deviation of a sample: NaN of no world, 0 spread of one."""
+    """Return the mean and standard deviation of a sample: NaN without worlds."""
     if len(sample) == 0:
         return np.nan, np.nan
     return float(np.mean(sample)), float(np.std(sample, ddof=1)) if len(sample) > 1 else 0.0

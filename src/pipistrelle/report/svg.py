@@ -18,8 +18,8 @@ from pipistrelle.report.variables import three_digits
 
 WIDTH, HEIGHT = 400.0, 280.0
 """Size of a panel [px on a small screen]."""
-LEFT, RIGHT, TOP, BOTTOM = 54.0, 8.0, 10.0, 42.0
-"""Margins."""
+BOX = (54.0, 392.0, 10.0, 238.0)
+"""Left, right, upper and lower edges of the axes."""
 SLANT = 34.0
 """Additional room for slanted words."""
 MAX_READINGS = 80
@@ -58,7 +58,7 @@ def panel_svg(panel: Panel) -> Markup:
 def _add(
     svg: Element, name: str, kind: str = "", text: str = "", title: str = "", **attributes: str
 ) -> None:
-    """Append an element, with a title that can be read if it has one."""
+    """Append an element, with a title if it can be read."""
     given = {key.replace("_", "-"): value for key, value in attributes.items()}
     element = SubElement(svg, name, ({"class": kind} if kind else {}) | given)
     element.text = text
@@ -107,7 +107,8 @@ def _texts_at(named: Sequence[Series], axis: Axis, place: float) -> list[tuple[s
 def _box(panel: Panel) -> tuple[float, float, float, float]:
     """Return the left, right, upper and lower edges; equal axes have no margins."""
     if not panel.equal:
-        return LEFT, WIDTH - RIGHT, TOP, HEIGHT - BOTTOM - SLANT * panel.x.slanted
+        left, right, top, bottom = BOX
+        return left, right, top, bottom - SLANT * panel.x.slanted
     (left, right), (low, high) = panel.x.limits, panel.y.limits
     return 0.0, WIDTH, 0.0, WIDTH * (high - low) / (right - left)
 

@@ -48,7 +48,7 @@ def effect_tables(
 
     `otherwise`: the same effects without diverged cases. A table has name, title, meaning, whether
     it is of a variable (`varied`), and rows: filter, strategy and value, with a cell per measure.
-    `end` is false between a number's ends. A `below` row gives the effect at one combination or
+    `end` is false between a number's ends. A `below` row gives the effect at a combination or
     without diverged cases; it is `contrary` if the position RMSE changes in another direction.
     """
     study, measures = selection.study, changes.measures_of(selection.study)
@@ -126,7 +126,7 @@ def _label(study: Study, effect: changes.Effect, variable: Variable | None) -> s
 def _apart(effects: Sequence[changes.Effect]) -> list[tuple[str, dict[str, Any], bool]]:
     """Return rows of single combinations: all if few, otherwise opposite effects.
 
-    `effects`: of one pairing in every measure. Returns: label, cells by score, and whether the
+    `effects`: of a pairing in every measure. Returns: label, cells by score, and whether the
     effect on the position RMSE is opposite.
     """
     rows = []
@@ -142,7 +142,7 @@ def _apart(effects: Sequence[changes.Effect]) -> list[tuple[str, dict[str, Any],
 
 
 def _cells(effects: Sequence[changes.Effect], at: int | None = None) -> dict[str, dict[str, Any]]:
-    """Return text and interval of effects by score, on average or at one combination."""
+    """Return text and interval of effects by score, on average or at a combination."""
     cells = {}
     for effect in effects:
         measure, finding = effect.measure, effect.finding if at is None else effect.apart[at]

@@ -120,7 +120,7 @@ def written(values: Sequence[Any]) -> tuple[str, ...]:
 
 
 def word_of(variable: Variable, value: Any) -> str:
-    """Return the text of one of a variable's values."""
+    """Return the text of a value of a variable."""
     return variable.words[list(map(repr, variable.given)).index(repr(value))]
 
 

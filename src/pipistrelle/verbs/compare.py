@@ -251,7 +251,7 @@ def _study_tables(compared: "ComparedStudies") -> Iterator[str]:
 
 
 def _number(value: float | None, digits: int) -> str:
-    """Format a number, a huge one in few digits; a dash without one."""
+    """Format a number, in few digits if it is huge; a dash if it is missing."""
     if value is None or value != value:
         return "-"
     return f"{value:.{digits}f}" if abs(value) < 1e5 else f"{value:.3g}"
