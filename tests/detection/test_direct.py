@@ -169,7 +169,8 @@ def planted(*bursts, pulse=M, noise_std=0.0, rng=None):
         share = np.diff(np.clip(edges, begin, begin + lasts))
         x[:, FACE, TONE] += amplitude * np.sqrt(2.0) * share[:, None] * phase
     if rng is not None:
-        x += noise_std / np.sqrt(2.0) * (rng.normal(size=(*x.shape, 2)) @ [1.0, 1.0j])
+        drawn = rng.normal(size=(BLOCKS, ELEMENTS, 2)) @ [1.0, 1.0j]
+        x[:, FACE, TONE] += noise_std / np.sqrt(2.0) * drawn
     return filter_blocks(x, pulse=pulse, block=1, noise_std=1.0)
 
 

@@ -216,8 +216,15 @@ def arrivals_at(
     arrivals: Arrivals, rows: Bool[np.ndarray, " a"] | Int[np.ndarray, " k"] | slice
 ) -> Arrivals:
     """Select rows of the arrivals."""
-    names = [name for name in Arrivals.__slots__ if getattr(arrivals, name) is not None]
-    return Arrivals(**{name: getattr(arrivals, name)[rows] for name in names})
+    return Arrivals(
+        delay=arrivals.delay[rows],
+        level_db=arrivals.level_db[rows],
+        bearing=arrivals.bearing[rows],
+        frequency=arrivals.frequency[rows],
+        caller=arrivals.caller[rows],
+        landmark=arrivals.landmark[rows],
+        departure=None if arrivals.departure is None else arrivals.departure[rows],
+    )  # faster than by their names
 
 
 def arrivals_together(parts: Sequence[Arrivals]) -> Arrivals:

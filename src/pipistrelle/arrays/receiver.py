@@ -86,7 +86,7 @@ def add_echo_blocks(
         _add_scattered_blocks(signal[:, 0], sounds, grid, *each)
         return
     ears = layout.normal, layout.position, sampling.speed_of_sound
-    _add_echo_blocks(signal.view(np.float64), sounds, grid, *ears)
+    _add_echo_blocks(signal.view(np.float64), sounds, grid, ears)
 
 
 def _heard_by_each(
@@ -254,34 +254,43 @@ def _steer(
 
 @no_alloc
 def _add_echo(
-    heard: Float[np.ndarray, "b c i"],
-    sums: Complex[np.ndarray, "c b"],
-    direct: Float[np.ndarray, " i"],
-    turned: Float[np.ndarray, " i"],
+    heard: Float[np.ndarray, "b f c i"],
+    room: tuple,
+    phasor: complex,
+    bearing: float,
+    frequency: float,
+    ears: tuple,
 ) -> None:
-    """Add an arrival's envelope, times its steering vector, to the blocks of a face."""
-    for b in range(heard.shape[0]):
-        for p in range(heard.shape[1]):
-            re, im, parts = sums[p, b].real, sums[p, b].imag, heard[b, p]
-            for i in range(parts.size):
-                parts[i] += re * direct[i] + im * turned[i]
+    """Add an arrival's envelope, times its steering vector, to its blocks.
+
+    ``room``: block sums of the envelope per tone, and work arrays; ``ears``: normals of the faces,
+    positions of the elements, and the speed of sound.
+    """
+    sums, direct, turned = room
+    normal, position, speed_of_sound = ears
+    for f in range(normal.size):
+        angle = bearing - normal[f]
+        if math.cos(angle) < 0.0:
+            continue
+        wave = 2.0 * math.pi * frequency * math.sin(angle) / speed_of_sound
+        _steer(direct, turned, phasor, wave, position)
+        for b in range(heard.shape[0]):
+            for p in range(heard.shape[2]):
+                re, im, parts = sums[p, b].real, sums[p, b].imag, heard[b, f, p]
+                for i in range(parts.size):
+                    parts[i] += re * direct[i] + im * turned[i]
 
 
 @kernel
 def _add_echo_blocks(
-    signal: Float[np.ndarray, "b f c i"],
-    sounds: tuple,
-    grid: tuple,
-    normal: Float[np.ndarray, " f"],
-    position: Float[np.ndarray, " e"],
-    speed_of_sound: float,
+    signal: Float[np.ndarray, "b f c i"], sounds: tuple, grid: tuple, ears: tuple
 ) -> None:
     """Add every arrival to interleaved block sums, with real and imaginary parts as neighbours."""
     sound, on = _Sounds(*sounds), _Grid(*grid)
     blocks, _, tones, parts = signal.shape
     rate, block, blank = on.rate, on.block, on.blank
     sums = np.empty((tones, blocks), dtype=np.complex128)
-    direct, turned = np.empty(parts), np.empty(parts)
+    room = sums, np.empty(parts), np.empty(parts)
     for a in range(sound.delay.size):
         delay, frequency = sound.delay[a], sound.frequency[a]
         start = max(math.ceil(delay * rate), blank * block)
@@ -295,13 +304,8 @@ def _add_echo_blocks(
         turns = -2.0 * math.pi * frequency * delay
         phasor = sound.amplitude[a] * complex(math.cos(turns), math.sin(turns))
         first = start // block - blank
-        for f in range(normal.size):
-            angle = sound.bearing[a] - normal[f]
-            if math.cos(angle) < 0.0:
-                continue
-            wave = 2.0 * math.pi * frequency * math.sin(angle) / speed_of_sound
-            _steer(direct, turned, phasor, wave, position)
-            _add_echo(signal[first : first + count, f], sums, direct, turned)
+        touched = signal[first : first + count]
+        _add_echo(touched, room, phasor, sound.bearing[a], frequency, ears)
 
 
 @kernel

@@ -134,17 +134,12 @@ def average_faces(
     (array([41.]), array([3.43]))
     """
     direct = detections.direct or DirectCalls(np.empty(0, np.int64), np.empty(0), np.empty(0), 0.0)
-    found, known = tuple(columns_of(detections)), label != UNLABELLED
+    found, clutter = tuple(columns_of(detections)), np.count_nonzero(label == UNLABELLED)
     landmark, caller, numbers = _average(
-        np.unique(label[known]),
-        label,
-        found,
-        tuple(direct),
-        averaging == "weighted",
-        speed_of_sound,
+        label, found, tuple(direct), averaging == "weighted", speed_of_sound
     )
     rows = Scan(time=time, landmark=landmark, caller=caller, numbers=numbers, callers=callers)
-    return FrameMeasurements(rows=rows, clutter=int(label.size - known.sum()))
+    return FrameMeasurements(rows=rows, clutter=int(clutter))
 
 
 def same_echo(
@@ -169,8 +164,24 @@ def same_echo(
 
 
 @kernel
+def _distinct(label: Int[np.ndarray, " d"]) -> Int[np.ndarray, " n"]:
+    """Return the sorted distinct labels, without UNLABELLED."""
+    labels, count = np.empty_like(label), 0
+    for d in range(label.size):
+        place = count
+        while place > 0 and labels[place - 1] > label[d]:
+            place -= 1
+        if label[d] == UNLABELLED or (place > 0 and labels[place - 1] == label[d]):
+            continue
+        for i in range(count, place, -1):
+            labels[i] = labels[i - 1]
+        labels[place] = label[d]
+        count += 1
+    return labels[:count]
+
+
+@kernel
 def _average(
-    labels: Int[np.ndarray, " n"],
     label: Int[np.ndarray, " d"],
     detections: tuple,
     calls: tuple,
@@ -178,7 +189,7 @@ def _average(
     speed_of_sound: float,
 ) -> tuple[Int[np.ndarray, " m"], Int[np.ndarray, " m"], Float[np.ndarray, "8 m"]]:
     """Average each label's and caller's strongest detections; return label, caller and numbers."""
-    found, direct = Columns(*detections), DirectCalls(*calls)
+    found, direct, labels = Columns(*detections), DirectCalls(*calls), _distinct(label)
     faces = callers = 0
     for d in range(label.size):
         faces, callers = max(faces, found.face[d] + 1), max(callers, found.caller[d] + 1)
