@@ -6,8 +6,8 @@ import pytest
 
 from pipistrelle.config import AssociationConfig, Config, InputError, RayConfig
 from pipistrelle.detection.scans import UNLABELLED, labelled, make_scan
-from pipistrelle.estimation.association import Assignment, edited, expected
-from pipistrelle.estimation.beliefs import Gaussian
+from pipistrelle.estimation.association import expected
+from pipistrelle.estimation.beliefs import Belief, Gaussian, completed
 from pipistrelle.estimation.data_association.sequential import association_of
 from pipistrelle.estimation.ekf.filter import EkfSlam
 from pipistrelle.estimation.ekf.gaussian import INVARIANT, LINEAR
@@ -268,14 +268,9 @@ def test_a_moving_caller_goes_with_its_velocity_and_is_never_merged():
 
 def test_a_belief_that_cannot_be_edited_is_refused():
     with pytest.raises(InputError, match=r"a Gaussian cannot; expected a belief with edited"):
-        edited(Gaussian(mean=np.zeros(3), covariance=np.eye(3)), remove=(4,))
+        completed(Gaussian(mean=np.zeros(3), covariance=np.eye(3)), Belief).edited((4,), ())
     belief = mapped(LINEAR)[1]
-    assert edited(belief) is belief
-
-
-def assignment(**changes):
-    """Return an assignment of no rows."""
-    return Assignment(label=np.empty(0, np.int64), **changes)
+    assert belief.edited((), ()) is belief
 
 
 def test_an_unmapped_landmark_is_refused_by_expected():

@@ -117,7 +117,7 @@ def test_the_joint_gaussian_contains_the_pose_and_map_of_the_belief(name):
 
 @pytest.mark.parametrize("name", ["ekf", "iekf", "smoother"])
 def test_a_scan_revised_later_equals_a_scan_revised_at_once(name):
-    heard = driven(name, Script({})).state().past[1].came
+    heard = driven(name, Script({})).state().past[1].original
     stated = replace(
         heard, landmark=np.array([7, 2, UNLABELLED]), numbers=heard.numbers + np.zeros((8, 1))
     )
@@ -184,6 +184,6 @@ def test_a_removed_label_may_be_assigned_again():
     haunted = driven("iekf", Renamed({}), scans=6, ghosts=(2,))
     assert sorted(haunted.belief.labels()) == [1, 2, 3]
     last = session.labels[-1].copy()
-    session._take_back((3,))
+    session._remove((3,))
     assert sorted(session.belief.labels()) == [1, GHOST], "and no more goes than is asked for"
     assert last.tolist() == [1, GHOST, 3]

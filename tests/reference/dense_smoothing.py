@@ -36,7 +36,7 @@ def misfits(history, x):
 
         def off(ends, parameters, k=k, root=root):
             scale = np.ones(3)
-            if k and asked.scale_is_free(history.ranged):
+            if k and history.motion[5]:
                 scale[:2] = 1.0 + parameters[0]
             led = mean[k] + slopes[k] @ parameters[: asked.odometry.size]
             return root / scale @ odometry(ends, led, k)

@@ -207,6 +207,10 @@ class SlowEkfSlam:
     def weight(self):
         return np.array([self.aggregated[block] for block in self.all_members()])
 
+    def linear(self):
+        """Covariance of the linear error."""
+        return self.covariance
+
     def drop(self, blocks):
         """Marginalise blocks out."""
         for block in blocks:

@@ -8,7 +8,7 @@ import pytest
 from pipistrelle.config import FastSlamConfig
 from pipistrelle.estimation.fastslam.block import LANES
 from pipistrelle.estimation.fastslam.filter import FastSlam
-from pipistrelle.estimation.fastslam.poses import normalised
+from pipistrelle.estimation.fastslam.particles import normalised
 from reference.fastslam import SlowFastSlam
 from reference.missions import (
     BICYCLE,

@@ -64,7 +64,9 @@ class Scan:
     """Label of each caller as a landmark, by its number; UNLABELLED for the vehicle, and if
     unknown, as for numbers beyond the array."""
     moving: Int[np.ndarray, " v"] = field(default_factory=lambda: NO_CALLERS)
-    """Labels of the callers that move; in a scan without labels, their numbers."""
+    """Labels of the callers that move; none in a scan without labels."""
+    moving_callers: Int[np.ndarray, " w"] = field(default_factory=lambda: NO_CALLERS)
+    """Numbers of the callers that move, in a scan without labels."""
     direct: Int[np.ndarray, " d"] = field(default_factory=lambda: NO_CALLERS)
     """Row of each caller's direct call, by the caller's number, in a scan without labels; -1 if
     there is none. The row's label becomes the caller's (`labelled`)."""
@@ -141,7 +143,8 @@ def with_columns(scan: Scan, **columns: np.ndarray | float) -> Scan:
     """
     own = {name: getattr(scan, name) for name in COLUMNS}
     made = _made_of(scan.time, scan.landmark.shape, own | columns)
-    return replace(made, callers=scan.callers, moving=scan.moving, direct=scan.direct)
+    kept = ("callers", "moving", "moving_callers", "direct")
+    return replace(made, **{name: getattr(scan, name) for name in kept})
 
 
 def _made_of(time: float, shape: tuple[int, ...], given: dict[str, np.ndarray | float]) -> Scan:
@@ -225,13 +228,14 @@ def with_callers(scan: Scan, callers: Int[np.ndarray, " c"]) -> Scan:
     """Set the labels of the callers in a scan without labels, by their numbers, or UNLABELLED.
 
     >>> scan = make_scan(0.5, np.full(2, -1), np.zeros(2), caller=1)
-    >>> heard = replace(scan, direct=np.array([-1, 0, 1]), moving=np.array([1, 2]))
+    >>> heard = replace(scan, direct=np.array([-1, 0, 1]), moving_callers=np.array([1, 2]))
     >>> with_callers(heard, np.array([-1, -1, 9])).moving
     array([9])
     """
-    moving = callers[scan.moving]
+    moving = callers[scan.moving_callers]
     moving = moving[moving != UNLABELLED]
-    return replace(scan, callers=callers, moving=moving, direct=NO_CALLERS)
+    known = {"callers": callers, "moving": moving}
+    return replace(scan, **known, moving_callers=NO_CALLERS, direct=NO_CALLERS)
 
 
 def without_excess_paths(scan: Scan, *numbers: int) -> Scan:

@@ -80,17 +80,6 @@ def class_of(role: Role, name: str) -> type:
     return kind
 
 
-def title_met(name: str) -> str | None:
-    """Return the title of an external class; None if it is not imported or has no printable title.
-
-    >>> title_met("never.imported:Here") is None
-    True
-    """
-    module, _, wanted = name.partition(":")
-    title = getattr(getattr(sys.modules.get(module), wanted, None), "title", None)
-    return title if isinstance(title, str) and title.isprintable() else None
-
-
 def build(role: Role, name: str, kind: Any, given: tuple[Any, ...], values: dict[str, Any]) -> Any:
     """Build an object of an external class; raise InputError if that fails.
 
@@ -219,10 +208,17 @@ def entry(name: str) -> Entry:
         raise InputError(f"filter {name}: title: found {title!r}, expected {expected}")
     if not isinstance(limit, (int, float)) or not limit > 0.0:
         raise InputError(f"filter {name}: nees_limit: found {limit!r}, expected a number above 0")
+
+    def built(config: Config, motion: "Motion") -> "Estimator":
+        settings = config.filter.model_copy(update={"gate": gate_of(name, config)})
+        config = config.model_copy(update={"filter": settings})
+        values = {"motion": motion, "rays": config.rays, "gate": settings.gate, "config": config}
+        return build(ESTIMATOR, name, kind, (config, motion), values)
+
     return Entry(
         name=name,
         title=title,
-        build=lambda config, motion: _built(name, kind, _with_gate(name, config), motion),
+        build=built,
         sections=READ,
         nees_limit=float(limit),
         memory=lambda landmarks, members, config: 0.0,
@@ -267,7 +263,9 @@ def title_of(name: str) -> str:
     """
     if name in CATALOGUE:
         return CATALOGUE[name].title
-    return title_met(name) or short_name(name)
+    module, _, wanted = name.partition(":")
+    title = getattr(getattr(sys.modules.get(module), wanted, None), "title", None)
+    return title if isinstance(title, str) and title.isprintable() else short_name(name)
 
 
 def check_distinct(names: Iterable[str], where: str = "filter") -> None:
@@ -284,52 +282,41 @@ def check_distinct(names: Iterable[str], where: str = "filter") -> None:
             raise InputError(f"{where}: {first} and {name} would write the same files; rename one")
 
 
-def _builder(name: str, where: str) -> "Callable[[Config, Motion], Estimator]":
-    """Return a function that builds an EKF, given as ``module:Class`` within `estimation`."""
+Options = Callable[[Config, "Motion"], dict[str, Any]]
+"""Function that returns an estimator's own arguments from the settings."""
+
+
+def _builder(name: str, where: str, options: Options) -> "Callable[[Config, Motion], Estimator]":
+    """Return a function that builds an estimator, given as ``module:Class`` within `estimation`."""
 
     def build(config: Config, motion: "Motion") -> "Estimator":
         module, _, kind = where.partition(":")
         made = getattr(import_module(f"pipistrelle.estimation.{module}"), kind)
-        return made(**_settings(name, config, motion))
+        gate = gate_of(name, config)
+        return made(motion=motion, rays=config.rays, gate=gate, **options(config, motion))
 
     return build
 
 
-def _settings(name: str, config: Config, motion: "Motion") -> dict[str, Any]:
+def _ekf_options(config: Config, _: "Motion") -> dict[str, Any]:
     """Return the arguments common to the EKFs and the smoother."""
     settings = config.filter
     return {
-        "motion": motion,
-        "rays": config.rays,
-        "gate": gate_of(name, config),
         "robust": settings.robust == "huber",
         "speed_std": settings.caller_speed_std,
         "walk_std": settings.caller_walk_std,
     }
 
 
-def _smoother(config: Config, motion: "Motion") -> "Estimator":
-    """Build the smoother."""
-    from pipistrelle.estimation.smoother.filter import Smoother
+def _smoother_options(config: Config, motion: "Motion") -> dict[str, Any]:
+    """Return the arguments of the smoother."""
     from pipistrelle.estimation.smoother.preintegration import calibration_of
 
-    return Smoother(
-        **_settings("smoother", config, motion),
-        calibration=calibration_of(config, motion),
-        window=config.filter.window or math.inf,
-    )
-
-
-def _built(name: str, kind: Any, config: Config, motion: "Motion") -> "Estimator":
-    """Build an external estimator."""
-    values = {"motion": motion, "rays": config.rays, "gate": config.filter.gate, "config": config}
-    return build(ESTIMATOR, name, kind, (config, motion), values)
-
-
-def _with_gate(name: str, config: Config) -> Config:
-    """Return the settings with a numeric gate, as external estimators receive them."""
-    settings = config.filter.model_copy(update={"gate": gate_of(name, config)})
-    return config.model_copy(update={"filter": settings})
+    own = {
+        "calibration": calibration_of(config, motion),
+        "window": config.filter.window or math.inf,
+    }
+    return _ekf_options(config, motion) | own
 
 
 def _smoother_bytes(landmarks: int, _: int, config: Config) -> float:
@@ -342,14 +329,6 @@ def _smoother_bytes(landmarks: int, _: int, config: Config) -> float:
 def _ekf_bytes(landmarks: int, members: int, _: Config) -> float:
     """Estimate the EKF's memory [bytes]: three covariances, before, during and after an update."""
     return COPIES * DOUBLE * (3 + 2 * landmarks * members) ** 2
-
-
-def _fastslam(config: Config, motion: "Motion") -> "Estimator":
-    """Build FastSLAM 2.0."""
-    from pipistrelle.estimation.fastslam.filter import FastSlam
-
-    gate = gate_of("fastslam", config)
-    return FastSlam(motion=motion, rays=config.rays, gate=gate, settings=config.fastslam)
 
 
 def _fastslam_bytes(landmarks: int, members: int, config: Config) -> float:
@@ -365,7 +344,7 @@ CATALOGUE = {
         Entry(
             name="ekf",
             title="EKF",
-            build=_builder("ekf", "ekf.filter:EkfSlam"),
+            build=_builder("ekf", "ekf.filter:EkfSlam", _ekf_options),
             sections=READ,
             nees_limit=50.0,
             memory=_ekf_bytes,
@@ -374,7 +353,11 @@ CATALOGUE = {
         Entry(
             name="fastslam",
             title="FastSLAM 2.0",
-            build=_fastslam,
+            build=_builder(
+                "fastslam",
+                "fastslam.filter:FastSlam",
+                lambda config, _: {"settings": config.fastslam},
+            ),
             sections=(*READ, "fastslam"),
             nees_limit=2750.0,
             memory=_fastslam_bytes,
@@ -382,7 +365,7 @@ CATALOGUE = {
         Entry(
             name="iekf",
             title="invariant EKF",
-            build=_builder("iekf", "ekf.filter:InvariantEkfSlam"),
+            build=_builder("iekf", "ekf.filter:InvariantEkfSlam", _ekf_options),
             sections=READ,
             nees_limit=50.0,
             memory=_ekf_bytes,
@@ -391,7 +374,7 @@ CATALOGUE = {
         Entry(
             name="smoother",
             title="smoother",
-            build=_smoother,
+            build=_builder("smoother", "smoother.filter:Smoother", _smoother_options),
             sections=(*READ, "prior"),
             nees_limit=50.0,
             memory=_smoother_bytes,

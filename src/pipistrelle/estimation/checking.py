@@ -35,12 +35,11 @@ from pipistrelle.detection.scans import (
     settled,
 )
 from pipistrelle.estimation.beliefs import Gaussian, Landmarks
-from pipistrelle.estimation.motion import MOVED, Motion
+from pipistrelle.estimation.motion import MOVED, Controls, Durations, Motion
 from pipistrelle.jit import Flag, Whole, kernel
 from pipistrelle.refusals import shown
 
 FLOAT, INTEGER = np.dtype(np.float64), np.dtype(np.int64)
-ARRAY = np.ndarray
 WHOLES = ("landmark", "caller", "callers", "moving")
 """Integer columns of a scan."""
 MIN_STD = 1e-12
@@ -160,8 +159,8 @@ def usable_known(known: Landmarks) -> Landmarks:
 
 
 def usable_controls(
-    motion: Motion, controls: Float[np.ndarray, "k c"], dt: Float[np.ndarray, " k"]
-) -> tuple[Float[np.ndarray, "k c"], Float[np.ndarray, " k"]]:
+    motion: Motion, controls: Controls, dt: Durations
+) -> tuple[Controls, Durations]:
     """Return control steps and their durations [s] as arrays; raise InputError if invalid."""
     steps, times = controls, dt
     if not (_is_plain(controls) and _is_plain(dt)):
@@ -202,7 +201,18 @@ def usable_scan(scan: Scan) -> Scan:
             "makes one of columns"
         )
     if not _is_laid_out(scan):
-        scan = _laid_out(scan)
+        columns: dict[str, Any] = {n: _converted(getattr(scan, n), INTEGER) for n in WHOLES}
+        columns["numbers"] = _converted(scan.numbers, FLOAT)
+        whole = not any(column is None for column in columns.values())
+        made = replace(scan, **columns) if whole else scan
+        if not _is_laid_out(made):
+            shapes = ", ".join(f"{name} {_shape_of(getattr(scan, name))}" for name in columns)
+            raise InputError(
+                f"scan at {scan.time} s: found {shapes}; expected whole numbers (m) for landmark "
+                f"and caller, numbers ({NUMBERS}, m), and rows of whole numbers for callers and "
+                "moving; pipistrelle.detection.scans.make_scan makes a scan of columns"
+            )
+        scan = made
     fault = _fault(scan.landmark, scan.caller, scan.numbers, scan.callers, scan.moving)
     if fault > UNSETTLED:
         raise InputError(f"scan at {scan.time} s: found {_worded(scan, fault)}")
@@ -211,42 +221,18 @@ def usable_scan(scan: Scan) -> Scan:
 
 def _is_laid_out(scan: Scan) -> bool:
     """Return whether a scan's columns are arrays as kernels require them."""
-    landmark, caller, numbers = scan.landmark, scan.caller, scan.numbers
-    callers, moving = scan.callers, scan.moving
+    whole = (scan.landmark, scan.caller, scan.callers, scan.moving)
     return (
-        type(landmark) is type(caller) is type(numbers) is type(callers) is type(moving) is ARRAY
-        and landmark.dtype == caller.dtype == callers.dtype == moving.dtype == INTEGER
-        and numbers.dtype == FLOAT
-        and landmark.ndim == callers.ndim == moving.ndim == 1
-        and caller.shape == landmark.shape
-        and numbers.shape == (NUMBERS, landmark.size)
-        and landmark.flags.carray
-        and caller.flags.carray
-        and numbers.flags.carray
-        and callers.flags.carray
-        and moving.flags.carray
+        all(_is_plain(column, INTEGER) and column.ndim == 1 for column in whole)
+        and _is_plain(scan.numbers)
+        and scan.caller.shape == scan.landmark.shape
+        and scan.numbers.shape == (NUMBERS, scan.landmark.size)
     )
 
 
-def _laid_out(scan: Scan) -> Scan:
-    """Convert a scan's columns to arrays for kernels; raise InputError if that fails."""
-    columns: dict[str, Any] = {name: _converted(getattr(scan, name), INTEGER) for name in WHOLES}
-    columns["numbers"] = _converted(scan.numbers, FLOAT)
-    if not any(column is None for column in columns.values()):
-        made = replace(scan, **columns)
-        if _is_laid_out(made):
-            return made
-    shapes = ", ".join(f"{name} {_shape_of(getattr(scan, name))}" for name in columns)
-    raise InputError(
-        f"scan at {scan.time} s: found {shapes}; expected whole numbers (m) for landmark and "
-        f"caller, numbers ({NUMBERS}, m), and rows of whole numbers for callers and moving; "
-        "pipistrelle.detection.scans.make_scan makes a scan of columns"
-    )
-
-
-def _is_plain(values: Any) -> bool:
-    """Return whether values are a float array as kernels require it."""
-    return type(values) is ARRAY and values.dtype == FLOAT and values.flags.carray
+def _is_plain(values: Any, kind: np.dtype = FLOAT) -> bool:
+    """Return whether values are an array as kernels require it."""
+    return type(values) is np.ndarray and values.dtype == kind and values.flags.carray
 
 
 def _converted(values: Any, kind: np.dtype) -> np.ndarray | None:
@@ -340,12 +326,7 @@ def _fault_of_row(
 
 
 @kernel
-def _are_steps(
-    steps: Float[np.ndarray, "k c"],
-    times: Float[np.ndarray, " k"],
-    most: tuple[float, ...],
-    poses: Flag,
-) -> Flag:
+def _are_steps(steps: Controls, times: Durations, most: tuple[float, ...], poses: Flag) -> Flag:
     """Return whether all control steps and durations are within limits, with valid covariances."""
     for k in range(times.size):
         if not 0.0 < times[k] <= LONGEST_STEP:

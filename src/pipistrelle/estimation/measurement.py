@@ -27,6 +27,9 @@ NEAREST = 1e-3
 MIN_TDOA_SIGMAS = 3.0
 """Least ratio of an excess path to its standard deviation for initialisation. Between vehicle and
 caller it is 0, and an error would falsely place a point near one of them with high confidence."""
+MAX_RELATIVE_RANGE_STD = 0.2
+"""Largest standard deviation of the range of a crossing, or in the smoother by an excess path, that
+initialises a landmark, relative to the range."""
 HUBER_K = 2.0
 """Standard deviations above which Huber's rule down-weights a measurement."""
 

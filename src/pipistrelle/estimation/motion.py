@@ -28,6 +28,16 @@ BY_POSES = MOTION_MODELS.index("poses")
 ACKERMANN = MOTION_MODELS.index("ackermann")
 MOVED = 3
 """Size of a relative motion; its covariance follows: xx, xy, xh, yy, yh, hh."""
+SMALLEST_STD = 1e-6
+"""Standard deviation [m, rad] added in quadrature to what would be exact: a start, a step without
+noise, particles at one place. In the smoother also the least one of a measurement."""
+Pose = Float[np.ndarray, "3"]
+"""x, y [m] and heading [rad]."""
+PoseCovariance = Float[np.ndarray, "3 3"]
+Controls = Float[np.ndarray, "k c"]
+"""Control steps, a row each (`Motion.model`)."""
+Durations = Float[np.ndarray, " k"]
+"""Durations of control steps [s]."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -191,8 +201,8 @@ def relative_noise(
 
 @no_alloc
 def propagate_pose(
-    pose: Float[np.ndarray, "3"],
-    P: Float[np.ndarray, "3 3"],
+    pose: Pose,
+    P: PoseCovariance,
     control: Float[np.ndarray, " c"],
     dt: float,
     motion: MotionNumbers,
@@ -230,9 +240,7 @@ def propagate_pose(
     return dx, dy
 
 
-def motion_step(
-    motion: Motion, pose: Float[np.ndarray, "3"], control: Float[np.ndarray, " c"], dt: float
-) -> Float[np.ndarray, "3"]:
+def motion_step(motion: Motion, pose: Pose, control: Float[np.ndarray, " c"], dt: float) -> Pose:
     r"""Return the pose after a noise-free control step (Bradley & Abaid, Eq. (5)).
 
     .. math:: x_k = x_{k-1} + V\Delta_t \cos(\theta_{k-1} + \gamma), \quad
@@ -256,7 +264,7 @@ def motion_step(
 
 
 def relative_motions(
-    motion: Motion, controls: Float[np.ndarray, "k c"], dt: Float[np.ndarray, " k"]
+    motion: Motion, controls: Controls, dt: Durations
 ) -> tuple[Float[np.ndarray, "k 3"], Float[np.ndarray, "k 3 3"]]:
     """Return the motion of each control step in the vehicle's previous axes, and its covariance.
 
@@ -274,7 +282,7 @@ def relative_motions(
 
 @kernel
 def _relative_motions(
-    controls: Float[np.ndarray, "k c"], dt: Float[np.ndarray, " k"], motion: MotionNumbers
+    controls: Controls, dt: Durations, motion: MotionNumbers
 ) -> tuple[Float[np.ndarray, "k 3"], Float[np.ndarray, "k 3 3"]]:
     """Predict a pose at the origin through each control step separately."""
     ways, covariances = np.zeros((dt.size, 3)), np.zeros((dt.size, 3, 3))
@@ -310,8 +318,8 @@ def controls_between(
 
 
 def motion_jacobians(
-    motion: Motion, pose: Float[np.ndarray, "3"], control: Float[np.ndarray, " c"], dt: float
-) -> tuple[Float[np.ndarray, "3 3"], Float[np.ndarray, "3 n"]]:
+    motion: Motion, pose: Pose, control: Float[np.ndarray, " c"], dt: float
+) -> tuple[PoseCovariance, Float[np.ndarray, "3 n"]]:
     """Return the derivatives of `motion_step` by the pose, F, and by the noisy control, U.
 
     Arguments as in `motion_step`; F is (3, 3) and U (3, 2), for poses (3, 3). Source: Bradley &
@@ -349,7 +357,7 @@ def motion_noise(motion: Motion, control: Float[np.ndarray, " c"]) -> Float[np.n
 
 
 def _increment(
-    motion: Motion, pose: Float[np.ndarray, "3"], control: Float[np.ndarray, " c"], dt: float
+    motion: Motion, pose: Pose, control: Float[np.ndarray, " c"], dt: float
 ) -> tuple[float, ...]:
     """Call `motion_increment` with arrays."""
     numbers = motion_numbers(motion)

@@ -180,24 +180,6 @@ def log_likelihood(innovation: float, variance: float, printed: bool) -> float:
 
 
 @no_alloc
-def _weigh_in_logs(
-    log_likelihoods: Float[np.ndarray, " m"], weights: Float[np.ndarray, " h"], count: Whole
-) -> float:
-    """Multiply weights by likelihoods with underflow protection; return the log of their sum."""
-    largest, total = -np.inf, 0.0
-    for j in range(count):
-        log_weight = math.log(weights[j]) if weights[j] > 0.0 else -np.inf
-        weights[j] = log_likelihoods[j] + log_weight
-        largest = max(largest, weights[j])
-    for j in range(count):
-        weights[j] = math.exp(weights[j] - largest)
-        total += weights[j]
-    for j in range(count):
-        weights[j] /= total
-    return largest + math.log(total)
-
-
-@no_alloc
 def heaviest_member(weights: Float[np.ndarray, " h"], count: Whole) -> Whole:
     """Return the index of the largest weight, the first of equals."""
     best = 0
@@ -243,8 +225,18 @@ def weigh_and_share(
         log_total = largest + math.log(total)
         for j in range(count):
             weights[j] *= share[j] / total
-    else:
-        log_total = _weigh_in_logs(log_likelihoods, weights, count)
+    else:  # underflow
+        highest, total = -np.inf, 0.0
+        for j in range(count):
+            log_weight = math.log(weights[j]) if weights[j] > 0.0 else -np.inf
+            weights[j] = log_likelihoods[j] + log_weight
+            highest = max(highest, weights[j])
+        for j in range(count):
+            weights[j] = math.exp(weights[j] - highest)
+            total += weights[j]
+        for j in range(count):
+            weights[j] /= total
+        log_total = highest + math.log(total)
     total, most = 0.0, weights[heaviest_member(weights, count)] if aggregated else 1.0
     for j in range(count):
         if aggregated:

@@ -50,6 +50,7 @@ from pipistrelle.detection.scans import (
 )
 from pipistrelle.estimation.beliefs import Belief, JointGaussian
 from pipistrelle.estimation.measurement import excess_path_slopes, observe
+from pipistrelle.estimation.motion import Pose, PoseCovariance
 from pipistrelle.geometry import wrap_angle
 from pipistrelle.jit import Whole, kernel, no_alloc
 
@@ -73,12 +74,12 @@ class Recoverable(Belief):
         """Return the joint Gaussian of pose and landmarks, optionally only of given labels."""
 
     @abstractmethod
-    def freed(self, pose: Float[np.ndarray, "3"], stds: Float[np.ndarray, "3"]) -> Self:
+    def freed(self, pose: Pose, stds: Pose) -> Self:
         """Move the vehicle to a pose, with an independent error added."""
 
 
 B = TypeVar("B", bound=Recoverable)
-Fit = tuple[Float[np.ndarray, "3"], float, Bool[np.ndarray, "2 m"]]
+Fit = tuple[Pose, float, Bool[np.ndarray, "2 m"]]
 """A pose, its cost, and inlier masks of bearings with ranges and of excess paths."""
 
 
@@ -161,11 +162,7 @@ def _given_pose(P: Float[np.ndarray, "d d"]) -> Float[np.ndarray, "d d"]:
 
 
 @kernel
-def _fitted(
-    problem: Problem,
-    predicted: Float[np.ndarray, "3"],
-    stds: Float[np.ndarray, "3"],
-) -> Fit:
+def _fitted(problem: Problem, predicted: Pose, stds: Pose) -> Fit:
     """Return the pose of least cost, by graduated non-convexity from the predicted pose."""
     pose, (_, ratios) = predicted.copy(), _cost(problem, predicted, stds[0])
     largest = max(ratios.max(), 1.0)
@@ -195,9 +192,7 @@ def _fitted(
 
 
 @kernel
-def _cost(
-    problem: Problem, pose: Float[np.ndarray, "3"], reach: float
-) -> tuple[float, Float[np.ndarray, "2 m"]]:
+def _cost(problem: Problem, pose: Pose, reach: float) -> tuple[float, Float[np.ndarray, "2 m"]]:
     """Return the cost of a pose, and the ratio of squared residual to bound for each measurement.
 
     The first row is for bearings with ranges, the second for excess paths; 0 if not measured.
@@ -222,11 +217,7 @@ def _outlier(spread: float, det: float, size: Whole) -> float:
 
 @kernel
 def _step(
-    problem: Problem,
-    pose: Float[np.ndarray, "3"],
-    weights: Float[np.ndarray, "2 m"],
-    predicted: Float[np.ndarray, "3"],
-    stds: Float[np.ndarray, "3"],
+    problem: Problem, pose: Pose, weights: Float[np.ndarray, "2 m"], predicted: Pose, stds: Pose
 ) -> float:
     """Take a Gauss-Newton step with weighted measurements, in place; return log det information."""
     information, A, g = 0.0, np.zeros((3, 3)), np.zeros(3)
@@ -255,12 +246,7 @@ def _step(
 
 @no_alloc
 def _direction(
-    problem: Problem,
-    pose: Float[np.ndarray, "3"],
-    m: Whole,
-    weight: float,
-    A: Float[np.ndarray, "3 3"],
-    g: Float[np.ndarray, "3"],
+    problem: Problem, pose: Pose, m: Whole, weight: float, A: PoseCovariance, g: Pose
 ) -> tuple[float, float, Whole]:
     """Return the squared residual of a bearing (with its range), det S and their number.
 
@@ -292,12 +278,7 @@ def _direction(
 
 @no_alloc
 def _lateness(
-    problem: Problem,
-    pose: Float[np.ndarray, "3"],
-    m: Whole,
-    weight: float,
-    A: Float[np.ndarray, "3 3"],
-    g: Float[np.ndarray, "3"],
+    problem: Problem, pose: Pose, m: Whole, weight: float, A: PoseCovariance, g: Pose
 ) -> tuple[float, float]:
     """Return the squared residual of an excess path and S; add it to the normal equations."""
     numbers, ends, mean, C = problem
@@ -319,11 +300,7 @@ def _lateness(
 
 @no_alloc
 def _add(
-    A: Float[np.ndarray, "3 3"],
-    g: Float[np.ndarray, "3"],
-    slopes: tuple[float, float, float],
-    weight: float,
-    residual: float,
+    A: PoseCovariance, g: Pose, slopes: tuple[float, float, float], weight: float, residual: float
 ) -> None:
     """Add a residual with its derivatives to the normal equations."""
     for a in range(3):

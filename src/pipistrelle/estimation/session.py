@@ -28,12 +28,13 @@ from pipistrelle.estimation.beliefs import (
     some_of,
 )
 from pipistrelle.estimation.checking import usable_scan
+from pipistrelle.estimation.motion import Controls, Durations
 
 REMEMBERED = 40
 """Number of scans that data association may revise."""
 MOST_STEPS = 64
 """Most steps of a prediction, fixed as the EKF's rounding depends on it."""
-Leg = tuple[Float[np.ndarray, "k c"], Float[np.ndarray, " k"]]
+Leg = tuple[Controls, Durations]
 """Control steps and their durations [s]."""
 
 
@@ -144,7 +145,7 @@ class Session(Generic[B]):
             if self._association:
                 self._memory = self._association.knowing(self._memory, known, callers)
 
-    def move(self, controls: Float[np.ndarray, "k c"], dt: Float[np.ndarray, " k"]) -> Gaussian:
+    def move(self, controls: Controls, dt: Durations) -> Gaussian:
         """Predict through control steps; return the pose after each, (k, 3) and (k, 3, 3)."""
         if not self._live and len(dt) <= MOST_STEPS:
             if self._association:
@@ -203,7 +204,7 @@ class Session(Generic[B]):
         self._legs, self._open, self._dropped = [*state.legs], state.open, {*state.dropped}
         self.labels = [*state.labels]
 
-    def _move(self, controls: Float[np.ndarray, "k c"], dt: Float[np.ndarray, " k"]) -> Gaussian:
+    def _move(self, controls: Controls, dt: Durations) -> Gaussian:
         """Predict through control steps."""
         predicted = self._estimator.predict(self.belief, controls, dt, self._rng)
         if not (isinstance(predicted, tuple) and len(predicted) == 2):
@@ -213,7 +214,7 @@ class Session(Generic[B]):
         check_poses("predict", poses, len(dt))
         return poses
 
-    def _extend(self, controls: Float[np.ndarray, "k c"], dt: Float[np.ndarray, " k"]) -> Gaussian:
+    def _extend(self, controls: Controls, dt: Durations) -> Gaussian:
         """Predict again through the last, extended control steps; return the new steps' poses."""
         if self._open:
             self.belief, self._rng.bit_generator.state = self._open
@@ -353,7 +354,7 @@ class Session(Generic[B]):
             self._move(controls, dt)
 
 
-def _with_columns(controls: Float[np.ndarray, "k c"], width: int) -> Float[np.ndarray, "k w"]:
+def _with_columns(controls: Controls, width: int) -> Float[np.ndarray, "k w"]:
     """Return control steps with NaN for the covariance that they lack."""
     missing = np.full((len(controls), width - controls.shape[1]), np.nan)
     return np.hstack((controls, missing))

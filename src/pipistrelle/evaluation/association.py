@@ -202,33 +202,19 @@ def renamed(landmarks: Landmarks, found: Associated) -> Landmarks:
     return replace(landmarks, landmark=labels)
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class MapCounts:
-    """Numbers of missed, false and duplicate landmarks of a map."""
-
-    missed: int
-    """Measured often, and not on the map."""
-    false: int
-    """On the map, but caused by clutter, or near no true landmark."""
-    twice: int
-    """Already on the map under another label."""
-
-
 def map_counts(
     landmarks: Landmarks, found: Associated, away: Collection[int] = frozenset()
-) -> MapCounts:
+) -> tuple[int, int, int]:
     """Count missed, false and duplicate landmarks among the initialised ones of a map.
 
-    `away`: labels of landmarks near no true one, which count as false (`out_of_place`).
+    `away`: labels of landmarks near no true one, which count as false (`out_of_place`). Missed are
+    landmarks that were measured often, false also what clutter caused, and duplicate what is on the
+    map under another label.
     """
     labels = landmarks.landmark[placed(landmarks)].tolist()
     named = [UNLABELLED if n in away else found.names.get(n, UNLABELLED) for n in labels]
     true = [name for name in named if name != UNLABELLED]
-    return MapCounts(
-        missed=len(found.heard - {*true}),
-        false=len(named) - len(true),
-        twice=len(true) - len({*true}),
-    )
+    return len(found.heard - {*true}), len(named) - len(true), len(true) - len({*true})
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

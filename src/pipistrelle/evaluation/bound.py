@@ -27,7 +27,15 @@ from pipistrelle.estimation.motion import (
     motion_numbers,
     propagate_pose,
 )
-from pipistrelle.estimation.smoother.elimination import advance, correct, predicted
+from pipistrelle.estimation.smoother.elimination import (
+    advance,
+    correct,
+    factor,
+    predicted,
+    spread,
+    write_lower,
+)
+from pipistrelle.estimation.smoother.filter import PRIOR_STD
 from pipistrelle.estimation.smoother.observations import hear
 from pipistrelle.estimation.smoother.preintegration import NOTHING
 from pipistrelle.estimation.smoother.records import (
@@ -43,15 +51,12 @@ from pipistrelle.estimation.smoother.records import (
     write,
     write_identity,
 )
-from pipistrelle.estimation.smoother.solution import factor, spread, write_lower
 from pipistrelle.jit import Whole, no_alloc, optimised_once
 
 IN_ONE_WORLD = (
     "The bound is the least root mean square without bias on a path: in one world luck may beat it."
 )
 """Sentence shown with a bound beside errors."""
-PRIOR_STD = 20.0
-"""Standard deviation of a landmark before its first measurement [m]."""
 NO_ROUTES: Mapping[int, np.ndarray] = MappingProxyType({})
 """No caller moves."""
 
@@ -125,8 +130,12 @@ def pose_bound(
     place = dict(zip(fixed.tolist(), places, strict=True))
     nowhere = np.zeros(len(moving), np.int64), np.zeros((len(moving), 2))
     points = [np.zeros(1), *(place[one] for one in border.tolist())]
+    states = [path]  # then each moving caller's position, and its velocity in the next step
+    for route in (routes[one] for one in moving):
+        velocity = np.diff(route, axis=0) / np.diff(time)[:, np.newaxis]
+        states += [route, np.concatenate([velocity, velocity[-1:]])]
     return _bound(
-        _states(time, path, [routes[one] for one in moving]),
+        np.concatenate(states, axis=1),
         np.concatenate(points),
         (true_controls(motion, controls, time, path), np.diff(time)),
         motion_numbers(motion),
@@ -135,19 +144,6 @@ def pose_bound(
         (ends, np.ascontiguousarray(numbers[:, known].T)),
         np.column_stack([rows[:-1], rows[1:], reached[rows[1:]] + 2]),
     )
-
-
-def _states(
-    time: Float[np.ndarray, " t"],
-    path: Float[np.ndarray, "t 3"],
-    routes: Sequence[Float[np.ndarray, "t 2"]],
-) -> Float[np.ndarray, "t d"]:
-    """Return the pose, each moving caller's position, and its velocity in the next step."""
-    states = [path]
-    for route in routes:
-        velocity = np.diff(route, axis=0) / np.diff(time)[:, np.newaxis]
-        states += [route, np.concatenate([velocity, velocity[-1:]])]
-    return np.concatenate(states, axis=1)
 
 
 def true_controls(

@@ -87,7 +87,7 @@ def test_rows_of_a_misplaced_caller_begin_no_landmark(moves, hears_itself, heard
         level_db=np.full(size + 2, 40.0),
     )
     moving = np.ones(1, int) if moves else np.empty(0, int)
-    scan = replace(heard, direct=np.array([-1, size]), moving=moving)
+    scan = replace(heard, direct=np.array([-1, size]), moving_callers=moving)
     stage = association_of(Config(association=AssociationConfig(method="marginal")))
     after, assignment = stage.associate(memory, SimpleNamespace(joint=lambda: joint), scan)
     assert after.labels - memory.labels == begun

@@ -11,10 +11,12 @@ from scipy.stats import chi2
 
 from pipistrelle.config import RayConfig
 from pipistrelle.estimation.beliefs import Gaussian
+from pipistrelle.estimation.ekf.filter import EkfSlam, InvariantEkfSlam
 from pipistrelle.estimation.motion import Motion
 from pipistrelle.estimation.rays import RANGED
 from pipistrelle.geometry import range_and_bearing, wrap
 from reference.ekf_slam import SlowEkfSlam
+from reference.invariant_ekf import SlowInvariantEkfSlam
 from reference.missions import (
     BICYCLE,
     CIRCLE,
@@ -35,67 +37,95 @@ from reference.missions import (
 )
 from reference.odometry import ANYONE, wandering
 
-FIELDS = ("mean", "covariance", "landmark", "weight")
-
-OPTIONS = list(
-    itertools.product(
-        ("fused", "passive"),
-        ("instantaneous", "aggregated"),
-        ("anew", "heaviest", "bearing"),
-        (1.0, 3.0),
-        (1.0, 0.999),
+WEIGHTS = ("instantaneous", "aggregated")
+OPTIONS = [
+    (EkfSlam, *options)
+    for options in itertools.product(
+        ("fused", "passive"), WEIGHTS, ("anew", "heaviest", "bearing"), (1.0, 3.0), (1.0, 0.999)
     )
-)
+]
 FEW = [
-    ("active", "instantaneous", "anew", 1.0, 0.999),
-    ("fused", "instantaneous", "anew", 1.0, 1.0),
-    ("fused", "aggregated", "heaviest", 3.0, 0.999),
-    ("passive", "instantaneous", "anew", 3.0, 0.999),
-    *(("fused", "instantaneous", ranged, 2.0, 1.0) for ranged in RANGED if ranged != "anew"),
+    (EkfSlam, "active", "instantaneous", "anew", 1.0, 0.999),
+    (EkfSlam, "fused", "instantaneous", "anew", 1.0, 1.0),
+    (EkfSlam, "fused", "aggregated", "heaviest", 3.0, 0.999),
+    (EkfSlam, "passive", "instantaneous", "anew", 3.0, 0.999),
+    *((EkfSlam, "fused", "instantaneous", name, 2.0, 1.0) for name in RANGED if name != "anew"),
+    *(
+        (InvariantEkfSlam, strategy, weights, ranged, 2.0, 0.999)
+        for strategy in ("fused", "passive")
+        for weights in WEIGHTS
+        for ranged in ("anew", "bearing")
+    ),
 ]
 FIELDS = ("mean", "covariance", "landmark", "weight")
+LENGTHS = [(EkfSlam, 60), (InvariantEkfSlam, 40)]
 
 
 def assert_equal_to_reference(slam, mission, start=START):
     """Every frame of the two filters agrees to 1e-9; returns the last belief."""
-    slow = SlowEkfSlam(slam.motion, slam.range_std, slam.bearing_std, slam.rays, slam.gate)
+    twin = SlowInvariantEkfSlam if isinstance(slam, InvariantEkfSlam) else SlowEkfSlam
+    slow = twin(slam.motion, slam.range_std, slam.bearing_std, slam.rays, slam.gate)
     slow.start(start.mean, start.covariance)
     for frame, (belief, poses) in enumerate(followed(slam, mission, start)):
         means, covariances = slow.predict(mission.controls[frame], mission.dt[frame])
         slow.update(mission.scans[frame])
-        np.testing.assert_allclose(poses.mean, means, rtol=0, atol=1e-9)
-        np.testing.assert_allclose(poses.covariance, covariances, rtol=0, atol=1e-9)
-        for field in FIELDS:
-            np.testing.assert_allclose(
-                getattr(belief, field), getattr(slow, field), rtol=0, atol=1e-9, err_msg=field
-            )
+        linear, landmarks, size = slow.linear(), belief.landmarks(), len(slow.landmark)
+        mapped, rows = linear[3:, 3:].reshape(size, 2, size, 2), np.arange(size)
+        pairs = [
+            (poses.mean, means),
+            (poses.covariance, covariances),
+            (belief.pose().mean, slow.mean[:3]),
+            (belief.pose().covariance, linear[:3, :3]),
+            (landmarks.landmark, slow.landmark),
+            (landmarks.mean, slow.mean[3:].reshape(-1, 2)),
+            (landmarks.covariance, mapped[rows, :, rows, :]),
+            (landmarks.weight, slow.weight),
+        ]
+        if twin is SlowEkfSlam:
+            pairs += [(getattr(belief, field), getattr(slow, field)) for field in FIELDS]
+        for found, expected in pairs:
+            np.testing.assert_allclose(found, expected, rtol=0, atol=1e-9)
         assert belief.gated == slow.gated
         np.testing.assert_allclose(belief.innovations, slow.innovations, rtol=1e-6)
     return belief
 
 
-def assert_equal_run(mission, weights, ranged, power, gate):
-    slam = paper_filter(rays=ray_config(weights=weights, ranged=ranged, power=power), gate=gate)
+def assert_equal_run(kind, mission, power, gate, **rays):
+    slam = paper_filter(kind, rays=ray_config(power=power, **rays), gate=gate)
     belief = assert_equal_to_reference(slam, mission)
     assert (belief.gated > 0) == (gate < 1)
     return belief
 
 
-@pytest.mark.parametrize(("strategy", "weights", "ranged", "power", "gate"), FEW)
-def test_run_equals_the_slow_reference(strategy, weights, ranged, power, gate):
-    mission = paper_mission(strategy, frames=60, outliers=0.04)
-    belief = assert_equal_run(mission, weights, ranged, power, gate)
-    assert np.unique(belief.landmark).size > 8
+@pytest.mark.parametrize(("kind", "strategy", "weights", "ranged", "power", "gate"), FEW)
+def test_run_equals_the_slow_reference(kind, strategy, weights, ranged, power, gate):
+    invariant = kind is InvariantEkfSlam
+    frames, outliers = (24, 0.06) if invariant else (60, 0.04)
+    mission = paper_mission(strategy, frames=frames, outliers=outliers)
+    merge = 1.0 if invariant and weights == "aggregated" else 0.0
+    rays = {"weights": weights, "ranged": ranged, "merge": merge}
+    belief = assert_equal_run(kind, mission, power, gate, **rays)
+    assert np.unique(belief.landmark).size > (5 if invariant else 8)
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("strategy", "weights", "ranged", "power", "gate"), [*OPTIONS, FEW[0]])
+@pytest.mark.parametrize(
+    ("kind", "strategy", "weights", "ranged", "power", "gate"), [*OPTIONS, FEW[0]]
+)
 def test_whole_run_equals_the_slow_reference_with_every_option(
-    strategy, weights, ranged, power, gate
+    kind, strategy, weights, ranged, power, gate
 ):
     mission = paper_mission(strategy, outliers=0.02)
-    belief = assert_equal_run(mission, weights, ranged, power, gate)
+    belief = assert_equal_run(kind, mission, power, gate, weights=weights, ranged=ranged)
     assert np.unique(belief.landmark).size > 30
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("strategy", SENSING)
+def test_whole_run_of_the_invariant_filter_equals_the_slow_reference(strategy):
+    slam = paper_filter(InvariantEkfSlam)
+    belief = assert_equal_to_reference(slam, paper_mission(strategy))
+    assert np.unique(belief.landmark).size > 25
 
 
 rays = st.builds(
@@ -130,25 +160,28 @@ def test_short_runs_equal_the_slow_reference_with_any_ray(rays, seed, gate):
     assert_equal_to_reference(paper_filter(rays=rays, gate=gate), mission)
 
 
-def test_unicycle_that_stops_turns_and_reverses_equals_the_slow_reference():
+@pytest.mark.parametrize(("kind", "frames"), LENGTHS)
+def test_unicycle_that_stops_turns_and_reverses_equals_the_slow_reference(kind, frames):
     rng = np.random.default_rng(8)
     motion = Motion(model="unicycle", control_std=(0.1, 0.15), noise_at_rest=False)
-    controls = rng.uniform([-0.5, -1], [1, 1], size=(60, STEPS_PER_FRAME, 2))
+    controls = rng.uniform([-0.5, -1], [1, 1], size=(frames, STEPS_PER_FRAME, 2))
     controls[rng.random(controls.shape[:2]) < 0.3] = 0
     controls[rng.random(controls.shape[:2]) < 0.2, 1] = 0
     field = scattered(rng, 20, radius=10.0)
     mission = draw_mission(rng, motion, START, field, controls, beamwidth=2.0, hearing=10.0)
-    assert_equal_to_reference(paper_filter(motion=motion), mission)
+    assert_equal_to_reference(paper_filter(kind, motion=motion), mission)
 
 
+@pytest.mark.parametrize(("kind", "frames"), LENGTHS)
 @pytest.mark.parametrize("stated", [True, False])
-def test_a_drive_by_poses_equals_the_slow_reference(stated):
+def test_a_drive_by_poses_equals_the_slow_reference(stated, kind, frames):
     rng = np.random.default_rng(8)
     motion = replace(ANYONE, noise_at_rest=stated)
-    controls = wandering(rng, 60 * STEPS_PER_FRAME, stated=stated).reshape(60, STEPS_PER_FRAME, -1)
+    controls = wandering(rng, frames * STEPS_PER_FRAME, stated=stated)
+    controls = controls.reshape(frames, STEPS_PER_FRAME, -1)
     field = scattered(rng, 20, radius=10.0)
     mission = draw_mission(rng, motion, START, field, controls, beamwidth=2.0, hearing=10.0)
-    assert_equal_to_reference(paper_filter(motion=motion), mission)
+    assert_equal_to_reference(paper_filter(kind, motion=motion), mission)
 
 
 @pytest.mark.slow

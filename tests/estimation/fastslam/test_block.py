@@ -21,10 +21,12 @@ from pipistrelle.estimation.fastslam.block import (
     active_beyond,
     bearing_beyond,
     expect_bearing,
+    part_lanes,
     refine_by_active,
     refine_by_bearing,
+    scratch_for,
+    weigh_by_active,
 )
-from pipistrelle.estimation.fastslam.block_rays import part_lanes, scratch_for, weigh_by_active
 from pipistrelle.estimation.measurement import NEAREST, Row
 
 

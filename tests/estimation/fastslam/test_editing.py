@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from pipistrelle.estimation.beliefs import placed, some_of
-from pipistrelle.estimation.fastslam.poses import normalised
+from pipistrelle.estimation.fastslam.particles import normalised
 from reference.missions import START
 from reference.swarms import (
     assert_same,

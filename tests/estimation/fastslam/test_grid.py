@@ -9,7 +9,7 @@ import pytest
 
 from pipistrelle.config import RayConfig
 from pipistrelle.estimation.beliefs import Gaussian
-from pipistrelle.estimation.fastslam.poses import effective_particles, normalised
+from pipistrelle.estimation.fastslam.particles import effective_particles, normalised
 from pipistrelle.estimation.motion import Motion
 from reference.ekf_slam import ray_ranges
 from reference.grid import Posterior, drive

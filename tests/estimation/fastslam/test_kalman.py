@@ -13,7 +13,7 @@ from scipy.stats import chi2
 from pipistrelle.detection.scans import Scan
 from pipistrelle.estimation.beliefs import Gaussian
 from pipistrelle.estimation.fastslam.filter import SMALLEST_STD, FastSlam
-from pipistrelle.estimation.fastslam.poses import effective_particles, normalised
+from pipistrelle.estimation.fastslam.particles import effective_particles, normalised
 from pipistrelle.estimation.motion import Motion
 from pipistrelle.geometry import wrap
 from reference.missions import (

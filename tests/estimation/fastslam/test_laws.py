@@ -7,13 +7,12 @@ import pytest
 
 from pipistrelle.estimation.beliefs import Gaussian
 from pipistrelle.estimation.fastslam.filter import SMALLEST_STD
-from pipistrelle.estimation.fastslam.poses import normalised
+from pipistrelle.estimation.fastslam.particles import normalised
 from pipistrelle.geometry import wrap
 from reference.missions import START, STEP, scan_of
 from reference.swarms import (
     Drawn,
     all_members,
-    arrays_of,
     assert_same,
     began,
     drawing,
@@ -26,27 +25,6 @@ from reference.swarms import (
 )
 
 KNOWN_POSE = Gaussian(mean=np.zeros(3), covariance=np.zeros((3, 3)))
-
-
-def test_equal_generators_make_equal_missions_and_others_do_not():
-    slam, mission = swarm_filter(), small_mission("fused", frames=20)
-    *_, (one, _) = followed(slam, mission, drawing(1))
-    *_, (same, _) = followed(slam, mission, drawing(1))
-    *_, (other, _) = followed(slam, mission, drawing(2))
-    assert_same(one, same)
-    assert not np.array_equal(one.cloud(), other.cloud())
-
-
-def test_beliefs_given_are_never_changed():
-    seen = []
-    slam, mission = swarm_filter(), small_mission("fused", frames=40)
-    for belief, poses in followed(slam, mission, drawing()):
-        arrays = [*arrays_of(belief), poses.mean, poses.covariance]
-        seen.append((arrays, [array.copy() for array in arrays]))
-    for arrays, copies in seen:
-        for array, before in zip(arrays, copies, strict=True):
-            np.testing.assert_array_equal(array, before)
-    assert START.mean.tolist() == [0.0, -7.408, 0.0]
 
 
 def test_half_a_turn_of_the_world_turns_the_swarm():

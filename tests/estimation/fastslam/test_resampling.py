@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from pipistrelle.estimation.fastslam.poses import effective_particles, normalised, stratified
+from pipistrelle.estimation.fastslam.particles import effective_particles, normalised, stratified
 
 logs = st.lists(st.floats(-1e5, 1e5), min_size=1, max_size=30).map(np.array)
 unnormalised = st.lists(st.floats(0, 1) | st.just(0.0), min_size=1, max_size=30).filter(any)

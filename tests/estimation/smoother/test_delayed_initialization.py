@@ -9,9 +9,9 @@ import pytest
 from pipistrelle.estimation.beliefs import Gaussian, placed
 from pipistrelle.estimation.motion import Motion
 from pipistrelle.estimation.smoother.elimination import Places, Rows
-from pipistrelle.estimation.smoother.filter import Smoother
-from pipistrelle.estimation.smoother.initialization import (
+from pipistrelle.estimation.smoother.filter import (
     MIN_CROSSING_ANGLE,
+    Smoother,
     range_by_crossing,
 )
 from pipistrelle.experiments.drives import Drive

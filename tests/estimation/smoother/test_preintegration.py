@@ -4,9 +4,8 @@ import numpy as np
 import pytest
 
 from pipistrelle.estimation.beliefs import Gaussian
-from pipistrelle.estimation.motion import Motion
+from pipistrelle.estimation.motion import SMALLEST_STD, Motion
 from pipistrelle.estimation.smoother.preintegration import (
-    SMALLEST_STD,
     extended,
     no_odometry,
     placed,
@@ -21,17 +20,16 @@ from reference.odometry import as_motions, by_poses
 
 def leg_of(motion, controls, dt, before=None):
     """The odometry of control steps."""
-    return extended(before or no_odometry(), motion, np.array(controls, float), dt)
+    none = np.empty(0, np.int64)
+    return extended(before or no_odometry(), motion, np.array(controls, float), dt, none)
 
 
 def between(ends, joint, leg):
     """The poses after each step of a leg, when those at both ends are known."""
     noise = np.stack([np.zeros((3, 3)), leg.covariance[-1] + SMALLEST_STD**2 * np.eye(3)])
-    if not leg.moves():
-        noise[1] = 0.0
     rows = np.zeros((2, 2), np.int64)
     legs = np.stack([np.zeros(3), leg.mean[-1]]), noise, np.zeros(2), rows
-    legs = *legs, np.zeros((2, 3, 0)), np.zeros(1, np.int64)
+    legs = *legs, np.zeros((2, 3, 0)), 0
     count = np.array([[0, 0], [0, len(leg.mean)]])
     nodes = ends.copy(), np.stack([joint[:3, :3], joint[3:, 3:]])
     cross = np.stack([np.zeros((3, 3)), joint[3:, :3]])
@@ -128,17 +126,3 @@ def test_a_leg_without_noise_is_itself_between_any_ends():
     told, steps = between(ends, joint, leg), placed(A, leg)
     np.testing.assert_allclose(told.mean, steps.mean, rtol=0, atol=1e-12)
     np.testing.assert_allclose(told.covariance, steps.covariance, rtol=0, atol=2e-12)
-
-
-def test_a_leg_moves_unless_at_rest_without_noise():
-    standing = Motion(model="unicycle", control_std=(0.1, 0.1), noise_at_rest=False)
-    still = np.zeros((3, 2)), np.ones(3)
-    assert not no_odometry().moves()
-    assert not leg_of(standing, *still).moves()
-    restless = Motion(model="unicycle", control_std=(0.1, 0.1))
-    assert leg_of(restless, *still).moves()
-    assert leg_of(standing, np.array([[0.0, 0.3]]), np.ones(1)).moves()
-    told = np.zeros((3, 3))
-    assert leg_of(by_poses(restless), told, np.ones(3)).moves()
-    assert not leg_of(by_poses(standing), told, np.ones(3)).moves()
-    assert leg_of(by_poses(standing), told + 1e-9, np.ones(3)).moves()

@@ -189,7 +189,7 @@ class _Work:
         self.label = np.full(scan.landmark.size, UNLABELLED)
         self.labels, self.callers = memory.labels, dict(memory.callers)
         self.numbers, self.named = scan.numbers, np.full(scan.direct.size, UNLABELLED)
-        self.moves = {*scan.moving.tolist()}
+        self.moves = {*scan.moving_callers.tolist()}
         moving = [self.callers[number].label for number in self.moves & self.callers.keys()]
         self.moving = np.array(moving, np.int64)
         most = limits.bearing_std, limits.way_std, limits.birth_way_std

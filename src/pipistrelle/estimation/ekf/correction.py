@@ -39,21 +39,22 @@ from pipistrelle.estimation.ekf.gaussian import (
     APPLIED,
     BEYOND,
     GATED,
+    Covariance,
     Joint,
+    Labels,
+    Mean,
     State,
     bearing_variance,
     correct_active,
     correct_bearing,
     drop_members,
     flush,
-    gaussian_of,
     inflated,
     initialise,
     joint_of,
     point_rows,
 )
 from pipistrelle.estimation.ekf.tdoa import (
-    added_by_excess_path,
     correct_by_excess_path,
     placed_by_excess_path,
 )
@@ -334,7 +335,7 @@ def _take_in(
         if not known[m]:
             row, placed, moves = row_of(columns, m), False, False
             if paths is not None and moving is not None:
-                placed = added_by_excess_path(state, row, paths, params.robust)
+                placed = placed_by_excess_path(state, row, paths, params.robust, scratch)
                 moves = row.landmark in moving
             if not placed:
                 _add_new(state, row, params, moves)
@@ -348,9 +349,9 @@ def _take_in(
 
 @kernel
 def corrected(
-    old_mean: Float[np.ndarray, " d"],
-    old_covariance: Float[np.ndarray, "d d"],
-    old_landmark: Int[np.ndarray, " h"],
+    old_mean: Mean,
+    old_covariance: Covariance,
+    old_landmark: Labels,
     old_weight: Float[np.ndarray, " h"],
     columns: Columns,
     timings: Timings | None,
@@ -379,7 +380,7 @@ def corrected(
         paths, moving = excess_paths(columns, timings), timings[2]
         gated = _take_in(state, columns, known, paths, moving, params, scratch)
     joint.mean[2], members = wrap_angle(joint.mean[2]), state.members[0]
-    mean, covariance = gaussian_of(joint, 3 + 2 * members)
-    squared, degrees = scratch.innovations
+    size, (squared, degrees) = 3 + 2 * members, scratch.innovations
+    mean, covariance = joint.mean[:size].copy(), joint.covariance[:size, :size].copy()
     landmark, weight = landmark[:members].copy(), weight[:members].copy()
     return mean, covariance, landmark, weight, gated, squared, degrees

@@ -28,8 +28,20 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from pipistrelle.estimation.ekf.gaussian import Joint, State, flush, initialise, relative_covariance
-from pipistrelle.estimation.measurement import NEAREST, Row, observe
+from pipistrelle.estimation.ekf.gaussian import (
+    Joint,
+    Labels,
+    State,
+    flush,
+    initialise,
+    relative_covariance,
+)
+from pipistrelle.estimation.measurement import (
+    MAX_RELATIVE_RANGE_STD,
+    NEAREST,
+    Row,
+    observe,
+)
 from pipistrelle.estimation.rays import FITTED, UpdateParams
 from pipistrelle.jit import Whole, kernel, no_alloc
 
@@ -57,9 +69,7 @@ def scratch_for(members: Whole) -> Scratch:
 
 
 @no_alloc
-def members_of(
-    landmark: Int[np.ndarray, " h"], members: Whole, label: Whole
-) -> tuple[Whole, Whole]:
+def members_of(landmark: Labels, members: Whole, label: Whole) -> tuple[Whole, Whole]:
     """Return the index of a landmark's first hypothesis, and their number (0: not in the map)."""
     for first in range(members):
         if landmark[first] == label:
@@ -72,8 +82,6 @@ def members_of(
 
 WAITING_WEIGHT = -1.0
 """Weight that marks the two points of a stored bearing."""
-MAX_RELATIVE_RANGE_STD = 0.2
-"""Largest standard deviation of the range of a crossing, relative to the range."""
 PARALLEL_SINE = 1e-9
 """Sine of the angle below which two bearings count as parallel."""
 MIN_CROSSING_SINE = 0.35
@@ -121,94 +129,49 @@ def add_waiting_bearing(state: State, row: Row, params: UpdateParams) -> None:
 
 
 @no_alloc
-def _from_vehicle(
-    joint: Joint, i: Whole, direction: float
-) -> tuple[float, float, float, float, float]:
-    """Intersect a direction from the vehicle with the line through the points at i and i + 2.
-
-    Returns the line's normal (2), the sine of the angle, and r and t of the module docstring.
-    """
-    mean = joint.mean
-    x, y = mean[i + 2] - mean[i], mean[i + 3] - mean[i + 1]
-    length = math.sqrt(x * x + y * y)
-    nx, ny = -y / length, x / length
-    ux, uy = math.cos(direction), math.sin(direction)
-    sine = nx * ux + ny * uy
-    dx, dy = mean[i] - mean[0], mean[i + 1] - mean[1]
-    if abs(sine) < PARALLEL_SINE:
-        return nx, ny, sine, -1.0, -1.0
-    r = (nx * dx + ny * dy) / sine
-    return nx, ny, sine, r, ((r * ux - dx) * x + (r * uy - dy) * y) / (length * length)
-
-
-@no_alloc
-def _range_row(
-    joint: Joint, size: Whole, i: Whole, normal: tuple[float, float, float], t: float, lever: float
-) -> float:
-    """Write covariances of r with the state to W[0]; return its variance without the bearing's.
-
-    ``normal`` is n and n . u, ``lever`` the derivative of r by the direction.
-    """
-    P, w, (nx, ny, sine) = joint.covariance, joint.W[0], normal
-    turn = lever * joint.turns
-    for a in range(size):
-        along = nx * ((1.0 - t) * P[i, a] + t * P[i + 2, a] - P[0, a])
-        along += ny * ((1.0 - t) * P[i + 1, a] + t * P[i + 3, a] - P[1, a])
-        w[a] = along / sine + turn * P[2, a]
-    own = nx * ((1.0 - t) * w[i] + t * w[i + 2] - w[0])
-    own += ny * ((1.0 - t) * w[i + 1] + t * w[i + 3] - w[1])
-    return own / sine + turn * w[2]
-
-
-@no_alloc
 def place_at_crossing(state: State, first: Whole, row: Row, robust: bool) -> bool:
     """Initialise a landmark at the crossing of two bearings; return False if it is too uncertain.
 
     It replaces the first stored point; the caller drops the second. ``robust``: larger angles only.
     """
     joint, size, i = state.joint, 3 + 2 * state.members[0], 3 + 2 * first
-    mean, direction = joint.mean, joint.mean[2] + row.bearing
-    nx, ny, sine, r, t = _from_vehicle(joint, i, direction)
+    mean, P, turns = joint.mean, joint.covariance, joint.turns
+    direction, bearing_variance = mean[2] + row.bearing, row.bearing_variance
+    # The stored line through the points at i and i + 2, with normal n, and u from the vehicle.
+    along_x, along_y = mean[i + 2] - mean[i], mean[i + 3] - mean[i + 1]
+    length = math.sqrt(along_x * along_x + along_y * along_y)
+    nx, ny = -along_y / length, along_x / length
     ux, uy = math.cos(direction), math.sin(direction)
-    least = MIN_CROSSING_SINE if robust else PARALLEL_SINE
-    lever, most = (
-        r * (nx * uy - ny * ux) / sine,
-        MAX_RELATIVE_RANGE_STD * MAX_RELATIVE_RANGE_STD * r * r,
-    )
-    by_bearing = lever * lever * row.bearing_variance
-    if abs(sine) < least or r < NEAREST or t <= 0.0 or by_bearing > most:
+    sine = nx * ux + ny * uy
+    if abs(sine) < (MIN_CROSSING_SINE if robust else PARALLEL_SINE):
+        return False
+    dx, dy = mean[i] - mean[0], mean[i + 1] - mean[1]
+    r = (nx * dx + ny * dy) / sine
+    t = ((r * ux - dx) * along_x + (r * uy - dy) * along_y) / (length * length)
+    lever = r * (nx * uy - ny * ux) / sine  # dr = lever dphi
+    by_bearing = lever * lever * bearing_variance
+    most = MAX_RELATIVE_RANGE_STD * MAX_RELATIVE_RANGE_STD * r * r
+    if r < NEAREST or t <= 0.0 or by_bearing > most:
         return False
     flush(joint, size)
-    variance = _range_row(joint, size, i, (nx, ny, sine), t, lever)
+    # w: covariances of r with the state; its variance, without the bearing's.
+    w, x, y, turn = joint.W[0], joint.W[1], joint.W[2], lever * turns
+    for a in range(size):
+        along = nx * ((1.0 - t) * P[i, a] + t * P[i + 2, a] - P[0, a])
+        along += ny * ((1.0 - t) * P[i + 1, a] + t * P[i + 3, a] - P[1, a])
+        w[a] = along / sine + turn * P[2, a]
+    own = nx * ((1.0 - t) * w[i] + t * w[i + 2] - w[0])
+    own += ny * ((1.0 - t) * w[i + 1] + t * w[i + 3] - w[1])
+    variance = own / sine + turn * w[2]
     if variance + by_bearing > most:
         return False
-    _take_place(joint, size, i, (ux, uy, r, lever), variance, row.bearing_variance)
-    mean[i], mean[i + 1] = mean[0] + r * ux, mean[1] + r * uy
-    state.weight[first] = 1.0
-    return True
-
-
-@no_alloc
-def _take_place(
-    joint: Joint,
-    size: Whole,
-    i: Whole,
-    crossing: tuple[float, float, float, float],
-    range_variance: float,
-    bearing_variance: float,
-) -> None:
-    """Write the covariances of a landmark at p + r u over the first stored point, at index i.
-
-    They follow dl = dp + u dr + r u' (turns dtheta + dphi), with u' perpendicular to u.
-    """
-    P, (ux, uy, r, lever) = joint.covariance, crossing
-    w, x, y = joint.W[0], joint.W[1], joint.W[2]
-    gx, gy = -r * uy * joint.turns, r * ux * joint.turns
+    # dl = dp + u dr + r u' (turns dtheta + dphi), with u' perpendicular to u.
+    gx, gy = -r * uy * turns, r * ux * turns
     for a in range(size):
         x[a] = P[0, a] + ux * w[a] + gx * P[2, a]
         y[a] = P[1, a] + uy * w[a] + gy * P[2, a]
-    rx = w[0] + ux * range_variance + gx * w[2]  # covariance of r with the landmark
-    ry = w[1] + uy * range_variance + gy * w[2]
+    rx = w[0] + ux * variance + gx * w[2]  # covariance of r with the landmark
+    ry = w[1] + uy * variance + gy * w[2]
     bx, by = ux * lever - r * uy, uy * lever + r * ux
     xx = x[0] + ux * rx + gx * x[2] + bx * bx * bearing_variance
     yy = y[1] + uy * ry + gy * y[2] + by * by * bearing_variance
@@ -218,3 +181,6 @@ def _take_place(
         P[i + 1, a] = P[a, i + 1] = y[a]
     P[i, i], P[i + 1, i + 1] = xx, yy
     P[i, i + 1] = P[i + 1, i] = xy
+    mean[i], mean[i + 1] = mean[0] + r * ux, mean[1] + r * uy
+    state.weight[first] = 1.0
+    return True

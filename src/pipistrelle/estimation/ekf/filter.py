@@ -16,7 +16,7 @@ to `MERGED_STD`. With :math:`H = (\dots, I, \dots, -I, \dots)` and S = H P H^T +
           P \leftarrow P - W W^T ,
 
 and the second landmark is dropped. The invariant error has the same H, without a heading column. If
-d exceeds the gate (`FARTHEST`), a wrong association has displaced a landmark, and the second is
+d exceeds the gate (`MERGE_BOUND`), a wrong association has displaced a landmark, and the second is
 dropped without the update.
 
 **Moving callers** (`propagate_callers`) have a velocity in the state, under a separate label
@@ -58,6 +58,9 @@ from pipistrelle.estimation.ekf.delayed_initialization import WAITING_WEIGHT
 from pipistrelle.estimation.ekf.gaussian import (
     INVARIANT,
     LINEAR,
+    Covariance,
+    Labels,
+    Mean,
     linear_part,
     propagate,
     propagate_invariant,
@@ -66,13 +69,13 @@ from pipistrelle.estimation.ekf.gaussian import (
     shifted_covariance,
 )
 from pipistrelle.estimation.measurement import columns_of, timings_of
-from pipistrelle.estimation.motion import Motion, motion_numbers
+from pipistrelle.estimation.motion import Controls, Durations, Motion, Pose, motion_numbers
 from pipistrelle.estimation.rays import update_params
 from pipistrelle.estimation.recovery import Recoverable, recovering
-from pipistrelle.jit import Flag, Whole, kernel
+from pipistrelle.jit import Whole, kernel
 
-_NOBODY, _SUM = UNLABELLED, UNLABELLED - 1
-"""Largest label of no landmark; sum of the labels of a caller and of its velocity."""
+_SUM = UNLABELLED - 1
+"""Sum of the labels of a caller and of its velocity."""
 
 
 @kernel
@@ -85,21 +88,12 @@ def velocity_of(label: Whole) -> Whole:
     return _SUM - label
 
 
-def is_velocity(landmark: Int[np.ndarray, " h"]) -> Bool[np.ndarray, " h"]:
+def is_velocity(landmark: Labels) -> Bool[np.ndarray, " h"]:
     """Return which entries of a state are velocities."""
-    return landmark < _NOBODY
+    return landmark < UNLABELLED
 
 
-@kernel
-def has_velocities(landmark: Int[np.ndarray, " h"]) -> Flag:
-    """Return whether a state contains velocities."""
-    least = 0
-    for label in landmark:
-        least = min(least, label)
-    return least < _NOBODY
-
-
-def is_standing(landmark: Int[np.ndarray, " h"]) -> Bool[np.ndarray, " h"]:
+def is_standing(landmark: Labels) -> Bool[np.ndarray, " h"]:
     """Return which entries of a state are neither moving callers nor their velocities.
 
     >>> is_standing(np.array([4, 51, -53]))
@@ -111,30 +105,18 @@ def is_standing(landmark: Int[np.ndarray, " h"]) -> Bool[np.ndarray, " h"]:
     return ~velocity & ~np.isin(landmark, _SUM - landmark[velocity])
 
 
-def missing_velocities(
-    landmark: Int[np.ndarray, " h"], moving: Int[np.ndarray, " v"]
-) -> Int[np.ndarray, " n"]:
-    """Return the velocity labels that moving callers of a state still lack.
-
-    >>> missing_velocities(np.array([51, 52, -53]), np.array([52]))
-    array([-54])
-    """
-    velocity = _SUM - moving
-    return velocity[np.isin(moving, landmark) & ~np.isin(velocity, landmark)]
-
-
 @kernel
 def propagate_callers(
-    mean: Float[np.ndarray, " d"],
+    mean: Mean,
     covariance: Float[np.ndarray, "d room"],
-    landmark: Int[np.ndarray, " h"],
+    landmark: Labels,
     seconds: float,
     walk_std: float,
 ) -> None:
     """Predict moving callers over a time [s], in place; ``walk_std``: velocity std after 1 s."""
     q, size = walk_std * walk_std, mean.size
     for velocity in range(landmark.size):
-        if landmark[velocity] >= _NOBODY:
+        if landmark[velocity] >= UNLABELLED:
             continue
         label, iv = velocity_of(landmark[velocity]), 3 + 2 * velocity
         members = np.flatnonzero(landmark == label)
@@ -161,20 +143,12 @@ def propagate_callers(
 
 MERGED_STD = 1e-3
 """Standard deviation of the difference of merged landmarks along each axis [m]."""
-FARTHEST = 100.0
+MERGE_BOUND = 100.0
 """Largest squared distance of merged landmarks to update the state."""
-
-State = tuple[
-    Float[np.ndarray, " d"],
-    Float[np.ndarray, "d d"],
-    Int[np.ndarray, " h"],
-    Float[np.ndarray, " h"],
-]
-"""Mean, covariance, and each hypothesis' label and weight, as in `EkfBelief`."""
 
 
 @kernel
-def is_placed(landmark: Int[np.ndarray, " h"]) -> Bool[np.ndarray, " h"]:
+def is_placed(landmark: Labels) -> Bool[np.ndarray, " h"]:
     """Return which hypotheses are their landmark's or caller's only hypothesis.
 
     >>> is_placed(np.array([4, 7, 7, 51, -53]))
@@ -187,16 +161,18 @@ def is_placed(landmark: Int[np.ndarray, " h"]) -> Bool[np.ndarray, " h"]:
     return placed
 
 
-def removed(state: State, label: int) -> State:
-    """Remove a landmark's hypotheses from a state, with its velocity if it moves."""
-    return _left(*state, _present(state[2], label))
+def removed(belief: "EkfBelief", label: int) -> "EkfBelief":
+    """Remove a landmark's hypotheses, with its velocity if it moves."""
+    state = belief.mean, belief.covariance, belief.landmark, belief.weight
+    mean, covariance, landmark, weight = _left(*state, _present(belief, label))
+    return replace(belief, mean=mean, covariance=covariance, landmark=landmark, weight=weight)
 
 
 @kernel
 def _left(
-    mean: Float[np.ndarray, " d"],
-    covariance: Float[np.ndarray, "d d"],
-    landmark: Int[np.ndarray, " h"],
+    mean: Mean,
+    covariance: Covariance,
+    landmark: Labels,
     weight: Float[np.ndarray, " h"],
     label: Whole,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
@@ -213,14 +189,14 @@ def _left(
     return left, P, landmark[kept], weight[kept]
 
 
-def merged(state: State, kept: int, gone: int, error: float) -> State:
-    """Merge two fixed landmarks of a state under the label of the first.
+def merged(belief: "EkfBelief", kept: int, gone: int) -> "EkfBelief":
+    """Merge two fixed landmarks under the label of the first.
 
     An initialised landmark replaces a ray; of two rays the first remains.
     """
-    landmark = state[2]
+    landmark = belief.landmark
     standing = is_standing(landmark)
-    first, second = (landmark == _present(landmark, label) for label in (kept, gone))
+    first, second = (landmark == _present(belief, label) for label in (kept, gone))
     if kept == gone or not standing[first | second].all():
         raise InputError(
             f"association: found the landmarks {kept} and {gone} to merge; expected two that stand"
@@ -228,17 +204,18 @@ def merged(state: State, kept: int, gone: int, error: float) -> State:
     placed = is_placed(landmark)
     if placed[first].all() and placed[second].all():
         k, g = 3 + 2 * int(first.argmax()), 3 + 2 * int(second.argmax())
-        state = *_equated(*state[:2], k, g, error), *state[2:]
+        mean, covariance = _equated(belief.mean, belief.covariance, k, g, belief.error)
+        belief = replace(belief, mean=mean, covariance=covariance)
     elif placed[second].all():
-        mean, covariance, landmark, weight = removed(state, kept)
-        return mean, covariance, np.where(landmark == gone, kept, landmark), weight
-    return removed(state, gone)
+        belief = removed(belief, kept)
+        return replace(belief, landmark=np.where(belief.landmark == gone, kept, belief.landmark))
+    return removed(belief, gone)
 
 
 @kernel
 def _equated(
-    mean: Float[np.ndarray, " d"], P: Float[np.ndarray, "d d"], k: Whole, g: Whole, error: float
-) -> tuple[Float[np.ndarray, " d"], Float[np.ndarray, "d d"]]:
+    mean: Mean, P: Covariance, k: Whole, g: Whole, error: float
+) -> tuple[Mean, Covariance]:
     """Update mean and covariance by the constraint that two points coincide."""
     w0, w1 = P[:, k] - P[:, g], P[:, k + 1] - P[:, g + 1]
     a = math.sqrt(w0[k] - w0[g] + MERGED_STD * MERGED_STD)
@@ -246,7 +223,7 @@ def _equated(
     c = math.sqrt(w1[k + 1] - w1[g + 1] + MERGED_STD * MERGED_STD - b * b)
     e0 = -(mean[k] - mean[g]) / a
     e1 = (-(mean[k + 1] - mean[g + 1]) - b * e0) / c
-    if e0 * e0 + e1 * e1 > FARTHEST:
+    if e0 * e0 + e1 * e1 > MERGE_BOUND:
         return mean.copy(), P.copy()
     moved, left = mean.copy(), np.empty_like(P)
     w0 = w0 / a
@@ -261,9 +238,9 @@ def _equated(
     return moved, left
 
 
-def _present(landmark: Int[np.ndarray, " h"], label: int) -> int:
+def _present(belief: "EkfBelief", label: int) -> int:
     """Return a label that is on the map; raise InputError for others."""
-    if label < 0 or label not in landmark:
+    if label < 0 or label not in belief.landmark:
         raise InputError(f"association: found landmark {label} to change, which is not on the map")
     return label
 
@@ -276,11 +253,11 @@ class EkfBelief(Recoverable):
        :label: eq-9
     """
 
-    mean: Float[np.ndarray, " d"]
+    mean: Mean
     """(3 + 2h): x, y [m] from the origin, heading [rad]; then x, y [m] of each hypothesis."""
-    covariance: Float[np.ndarray, "d d"]
+    covariance: Covariance
     """Covariance of the error that `error` selects, in the same order."""
-    landmark: Int[np.ndarray, " h"]
+    landmark: Labels
     """Label of each hypothesis; a ray's are contiguous, near to far. A moving caller also has an
     entry for its velocity [m/s], with another label (`velocity_of`)."""
     weight: Float[np.ndarray, " h"]
@@ -324,7 +301,7 @@ class EkfBelief(Recoverable):
 
     def _linear(
         self, kept: Bool[np.ndarray, " h"], *, with_pose: bool
-    ) -> tuple[Float[np.ndarray, " k"], Float[np.ndarray, "k k"]]:
+    ) -> tuple[Durations, Float[np.ndarray, "k k"]]:
         """Return mean and covariance of the linear error of selected hypotheses (`linear_part`)."""
         invariant = self.error == INVARIANT
         return linear_part(self.mean, self.covariance, self.origin, kept, with_pose, invariant)
@@ -335,15 +312,14 @@ class EkfBelief(Recoverable):
 
     def edited(self, remove: Sequence[int], merge: Sequence[tuple[int, int]]) -> "EkfBelief":
         """Return the belief with landmarks removed and merged."""
-        state = (self.mean, self.covariance, self.landmark, self.weight)
+        belief = self
         for kept, gone in merge:
-            state = merged(state, kept, gone, self.error)
+            belief = merged(belief, kept, gone)
         for label in remove:
-            state = removed(state, label)
-        mean, covariance, landmark, weight = state
-        return replace(self, mean=mean, covariance=covariance, landmark=landmark, weight=weight)
+            belief = removed(belief, label)
+        return belief
 
-    def freed(self, pose: Float[np.ndarray, "3"], stds: Float[np.ndarray, "3"]) -> "EkfBelief":
+    def freed(self, pose: Pose, stds: Pose) -> "EkfBelief":
         """Move the vehicle to a pose, with an independent error added."""
         here = np.append(pose[:2] - self.origin, pose[2])
         mean, P = np.append(here, self.mean[3:]), self.covariance.copy()
@@ -360,10 +336,10 @@ class EkfBelief(Recoverable):
 
 
 def _map_of(
-    landmark: Int[np.ndarray, " h"],
+    landmark: Labels,
     weights: Float[np.ndarray, " h"],
     mean: Float[np.ndarray, "h 2"],
-    covariance: Float[np.ndarray, "d d"],
+    covariance: Covariance,
 ) -> Landmarks:
     """Return a map, one row per hypothesis, from the joint covariance (2h, 2h).
 
@@ -405,10 +381,11 @@ def _with_velocities(belief: EkfBelief, moving: Int[np.ndarray, " v"], std: floa
     """Add a velocity of 0, with a std [m/s] along each axis, for each moving caller without."""
     if moving.size == 0:
         return belief
-    labels = missing_velocities(belief.landmark, moving)
-    if labels.size == 0:
+    velocity = _SUM - moving
+    known = belief.landmark
+    labels = velocity[np.isin(moving, known) & ~np.isin(velocity, known)]
+    if (size := labels.size) == 0:
         return belief
-    size = labels.size
     unknown = Landmarks(
         landmark=labels,
         mean=np.zeros((size, 2)),
@@ -489,8 +466,8 @@ class EkfSlam:
     def predict(
         self,
         belief: EkfBelief,
-        controls: Float[np.ndarray, "k c"],
-        dt: Float[np.ndarray, " k"],
+        controls: Controls,
+        dt: Durations,
         rng: np.random.Generator | None = None,
     ) -> tuple[EkfBelief, Gaussian]:
         r"""Predict the belief through the control steps of a frame (Bradley & Abaid, Eq. (10)).
@@ -510,7 +487,7 @@ class EkfSlam:
         step = propagate if belief.error == LINEAR else propagate_invariant
         numbers = tuple(motion_numbers(self.motion))
         step(mean, covariance, controls, dt, numbers, means, covariances)
-        if has_velocities(belief.landmark):
+        if is_velocity(belief.landmark).any():
             propagate_callers(mean, covariance, belief.landmark, dt.sum(), self.walk_std)
         invariant = belief.error == INVARIANT
         if invariant:

@@ -55,9 +55,21 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from pipistrelle.estimation.measurement import HUBER_K, NEAREST, Row, observe
-from pipistrelle.estimation.motion import MotionNumbers, propagate_pose
+from pipistrelle.estimation.motion import (
+    Controls,
+    Durations,
+    MotionNumbers,
+    PoseCovariance,
+    propagate_pose,
+)
 from pipistrelle.geometry import wrap_angle
 from pipistrelle.jit import Whole, kernel, no_alloc
+
+Mean = Float[np.ndarray, " d"]
+"""x, y [m] and heading [rad], then two numbers for each point."""
+Covariance = Float[np.ndarray, "d d"]
+Labels = Int[np.ndarray, " h"]
+"""Label of each point; the hypotheses of a ray are contiguous."""
 
 
 def rotated_left(points: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, " m"]:
@@ -67,13 +79,13 @@ def rotated_left(points: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, " m"]:
 
 @kernel
 def linear_part(
-    mean: Float[np.ndarray, " d"],
-    covariance: Float[np.ndarray, "d d"],
+    mean: Mean,
+    covariance: Covariance,
     origin: Float[np.ndarray, "2"],
     kept: Bool[np.ndarray, " h"],
     with_pose: bool,
     invariant: bool,
-) -> tuple[Float[np.ndarray, " k"], Float[np.ndarray, "k k"]]:
+) -> tuple[Durations, Float[np.ndarray, "k k"]]:
     """Return mean and covariance of the linear error of selected hypotheses, or with the pose."""
     at, size = np.empty(mean.size, np.int64), 0
     for i in range(mean.size):
@@ -96,9 +108,7 @@ def linear_part(
 
 
 @no_alloc
-def shifted_covariance(
-    P: Float[np.ndarray, "d d"], x: float, y: float, shifted: Float[np.ndarray, "3 3"]
-) -> None:
+def shifted_covariance(P: Covariance, x: float, y: float, shifted: PoseCovariance) -> None:
     """Convert a pose's covariance from invariant to linear error, at (x, y).
 
     Writes M P M^T with M = [[1, 0, -y], [0, 1, x], [0, 0, 1]]; (-x, -y) converts back.
@@ -114,10 +124,10 @@ def shifted_covariance(
 
 @kernel
 def propagate_invariant(
-    mean: Float[np.ndarray, " d"],
-    covariance: Float[np.ndarray, "d d"],
-    controls: Float[np.ndarray, "k c"],
-    dt: Float[np.ndarray, " k"],
+    mean: Mean,
+    covariance: Covariance,
+    controls: Controls,
+    dt: Durations,
     motion: tuple[int, float, float, float, float, bool, float],
     pose_means: Float[np.ndarray, "k 3"],
     pose_covariances: Float[np.ndarray, "k 3 3"],
@@ -181,7 +191,7 @@ class State(NamedTuple):
     """The Gaussian that EKF-SLAM updates, and the labels of its points."""
 
     joint: Joint
-    landmark: Int[np.ndarray, " h"]
+    landmark: Labels
     """Label of each hypothesis; a ray's are contiguous, near to far."""
     weight: Float[np.ndarray, " h"]  # aggregated likelihood of each hypothesis within its landmark
     members: Int[np.ndarray, "1"]  # number of hypotheses; the arrays may be longer
@@ -202,9 +212,7 @@ def _on_cache_lines(rows: Whole, width: Whole) -> Float[np.ndarray, "rows width"
 
 
 @kernel
-def joint_of(
-    mean: Float[np.ndarray, " d"], covariance: Float[np.ndarray, "d d"], room: Whole, turns: float
-) -> Joint:
+def joint_of(mean: Mean, covariance: Covariance, room: Whole, turns: float) -> Joint:
     """Copy a mean (d) and a covariance (d, d) to a `Joint` with capacity ``room``."""
     size, width = mean.size, _lanes(mean.size)
     longer, wider = np.empty(room), _on_cache_lines(room, _lanes(room))
@@ -219,19 +227,6 @@ def joint_of(
         for k in range(MAX_WAITING):
             W[k, b] = 0.0
     return Joint(longer, wider, W, np.zeros(room, np.int64), turns)
-
-
-@kernel
-def gaussian_of(
-    joint: Joint, size: Whole
-) -> tuple[Float[np.ndarray, " d"], Float[np.ndarray, "d d"]]:
-    """Copy the mean (d) and covariance (d, d) from a `Joint` without deferred columns."""
-    mean, covariance = np.empty(size), np.empty((size, size))
-    for a in range(size):
-        mean[a] = joint.mean[a]
-        for b in range(size):
-            covariance[a, b] = joint.covariance[a, b]
-    return mean, covariance
 
 
 @no_alloc
@@ -311,10 +306,10 @@ def retract(
 
 @kernel
 def propagate(
-    mean: Float[np.ndarray, " d"],
-    covariance: Float[np.ndarray, "d d"],
-    controls: Float[np.ndarray, "k c"],
-    dt: Float[np.ndarray, " k"],
+    mean: Mean,
+    covariance: Covariance,
+    controls: Controls,
+    dt: Durations,
     motion: tuple[int, float, float, float, float, bool, float],
     pose_means: Float[np.ndarray, "k 3"],
     pose_covariances: Float[np.ndarray, "k 3 3"],
@@ -387,6 +382,7 @@ def correct_bearing(
     h0, h1, turns = s * k, -c * k, joint.turns
     p0, p1, p2 = joint.covariance[0], joint.covariance[1], joint.covariance[2]
     pi, pj = point_rows(joint, size, i)
+    # w = P H^T / sqrt(S), x += w nu / sqrt(S), P -= w w^T
     w0 = joint.W[joint.taken[WAITING]]
     for a in range(size):
         w0[a] = h0 * (p0[a] - pi[a]) + h1 * (p1[a] - pj[a]) - turns * p2[a]
@@ -425,6 +421,7 @@ def correct_active(
     h0, h1, turns = s * k, -c * k, joint.turns
     p0, p1, p2 = joint.covariance[0], joint.covariance[1], joint.covariance[2]
     pi, pj = point_rows(joint, size, i)
+    # W = P H^T L^-T with L L^T = S, e = L^-1 nu, x += W e, P -= W W^T
     w0, w1 = joint.W[joint.taken[WAITING]], joint.W[joint.taken[WAITING] + 1]
     for a in range(size):
         east, north = p0[a] - pi[a], p1[a] - pj[a]

@@ -18,7 +18,7 @@ caller, and :math:`e_p = -e_l - e_b`,
   correlates it with caller and vehicle (`place_by_excess_path`). Between vehicle and caller k
   vanishes and the range is undetermined, so its standard deviation must be at most a tenth of it,
   and the excess path clearly above 0 (`MIN_TDOA_SIGMAS`);
-- else it **weighs** the hypotheses of a ray (`weigh_by_excess_path`).
+- else it **weighs** the hypotheses of a ray (`correct_by_excess_path`).
 
 Between two rays an excess path is not used, as some pair of hypotheses fits any value.
 """
@@ -137,33 +137,6 @@ def correct_excess_path(
         retract(joint.mean, size, w, step, w, 0.0)
     defer(joint, size, w, joint.turns * step)
     return APPLIED
-
-
-@no_alloc
-def weigh_by_excess_path(
-    state: State,
-    ray: tuple[Whole, Whole],
-    other: Whole,
-    of_caller: Flag,
-    excess_path: float,
-    variance: float,
-    likelihood: Float[np.ndarray, " m"],
-) -> None:
-    """Write the log likelihood of an excess path for each hypothesis of a ray.
-
-    ``ray``: first hypothesis and number; ``other``: initialised end; ``of_caller``: a caller's ray.
-    """
-    joint, size = state.joint, 3 + 2 * state.members[0]
-    if joint.taken[WAITING] == MAX_WAITING:
-        flush(joint, size)
-    w, iy = joint.W[joint.taken[WAITING]], 3 + 2 * other
-    for j in range(ray[1]):
-        ix = 3 + 2 * (ray[0] + j)
-        i, ib = (iy, ix) if of_caller else (ix, iy)
-        expected, spread = _expected(joint, size, i, ib, w)
-        longer, wider = _bends(joint, size, i, ib)
-        off, S = excess_path - expected - longer, spread + wider + variance
-        likelihood[j] = log_likelihood(off, S, False)
 
 
 @no_alloc
@@ -303,88 +276,68 @@ def _surest(state: State, row: Row, paths: ExcessPaths, robust: bool) -> Whole:
 
 
 @no_alloc
-def _place(state: State, member: Whole, row: Row, paths: ExcessPaths, d: Whole) -> None:
-    """Initialise a landmark by excess path d and the bearing of its measurement."""
-    of_caller = paths.caller[d] == row.landmark
-    other = _single(state, paths.landmark[d] if of_caller else paths.caller[d])
-    measured = (paths.excess_path[d], paths.variance[d], row.bearing, row.bearing_variance)
-    size = 3 + 2 * state.members[0]
-    place_by_excess_path(state.joint, size, 3 + 2 * member, 3 + 2 * other, of_caller, measured)
-    paths.used[d] = True
-
-
-@no_alloc
 def placed_by_excess_path(
     state: State, row: Row, paths: ExcessPaths, robust: bool, scratch: Scratch
 ) -> bool:
-    """Initialise a ray or a stored bearing by an excess path; return whether this was possible."""
+    """Initialise a new landmark, a ray or a stored bearing by bearing and excess path, if possible.
+
+    Returns whether it was possible.
+    """
     first, count = members_of(state.landmark, state.members[0], row.landmark)
     if count == 1 or not math.isnan(row.range):
         return False
     d = _surest(state, row, paths, robust)
     if d < 0:
         return False
-    for j in range(count):
-        scratch.keep[j] = j == 0
-    drop_members(state, first, count, scratch.keep, scratch.source)
-    state.weight[first] = 1.0
-    _place(state, first, row, paths, d)
-    return True
-
-
-@no_alloc
-def added_by_excess_path(state: State, row: Row, paths: ExcessPaths, robust: bool) -> bool:
-    """Append a new landmark by bearing and excess path; return whether this was possible."""
-    d = _surest(state, row, paths, robust) if math.isnan(row.range) else -1
-    if d < 0:
-        return False
-    member = state.members[0]
-    state.landmark[member], state.weight[member] = row.landmark, 1.0
-    state.members[0] += 1
-    _place(state, member, row, paths, d)
-    return True
-
-
-@no_alloc
-def _weigh(
-    state: State,
-    paths: ExcessPaths,
-    d: Whole,
-    of_caller: Flag,
-    params: UpdateParams,
-    scratch: Scratch,
-) -> None:
-    """Weigh and prune the hypotheses of a ray by excess path d."""
-    label = paths.caller[d] if of_caller else paths.landmark[d]
-    other = _single(state, paths.landmark[d] if of_caller else paths.caller[d])
-    ray = members_of(state.landmark, state.members[0], label)
-    first, count = ray
-    if state.weight[first] == WAITING_WEIGHT:
-        return
-    weigh_by_excess_path(
-        state, ray, other, of_caller, paths.excess_path[d], paths.variance[d], scratch.likelihood
-    )
-    weight = state.weight[first:]
-    weigh_and_share(
-        scratch.likelihood, weight, count, params.power, params.aggregated, scratch.share
-    )
-    if survivors(weight, count, params.prune, scratch.keep) < count:
+    if count > 0:
+        for j in range(count):
+            scratch.keep[j] = j == 0
         drop_members(state, first, count, scratch.keep, scratch.source)
+    else:
+        state.landmark[first] = row.landmark
+        state.members[0] += 1
+    state.weight[first] = 1.0
+    of_caller = paths.caller[d] == row.landmark
+    other = _single(state, paths.landmark[d] if of_caller else paths.caller[d])
+    measured = (paths.excess_path[d], paths.variance[d], row.bearing, row.bearing_variance)
+    size = 3 + 2 * state.members[0]
+    place_by_excess_path(state.joint, size, 3 + 2 * first, 3 + 2 * other, of_caller, measured)
+    paths.used[d] = True
+    return True
 
 
 @no_alloc
 def correct_by_excess_path(
     state: State, paths: ExcessPaths, d: Whole, params: UpdateParams, scratch: Scratch
 ) -> Whole:
-    """Update landmark, caller and vehicle by excess path d, or weigh a ray; GATED or APPLIED."""
+    """Update landmark, caller and vehicle by excess path d; GATED or APPLIED.
+
+    If only one end is initialised, the hypotheses of the other are weighed and pruned.
+    """
     member, caller = _single(state, paths.landmark[d]), _single(state, paths.caller[d])
+    joint, size, likelihood = state.joint, 3 + 2 * state.members[0], scratch.likelihood
+    excess_path, variance = paths.excess_path[d], paths.variance[d]
     if member >= 0 and caller >= 0:
-        size, i, ib = 3 + 2 * state.members[0], 3 + 2 * member, 3 + 2 * caller
+        i, ib = 3 + 2 * member, 3 + 2 * caller
         return correct_excess_path(
-            state.joint, size, i, ib, paths.excess_path[d], paths.variance[d],
-            params.passive_bound, params.robust,
-        )  # fmt: skip
-    ray = paths.landmark[d] if caller >= 0 else paths.caller[d]
-    if (member >= 0 or caller >= 0) and members_of(state.landmark, state.members[0], ray)[1]:
-        _weigh(state, paths, d, bool(caller < 0), params, scratch)
+            joint, size, i, ib, excess_path, variance, params.passive_bound, params.robust
+        )
+    label = paths.landmark[d] if caller >= 0 else paths.caller[d]
+    first, count = members_of(state.landmark, state.members[0], label)
+    if (member < 0 and caller < 0) or count == 0 or state.weight[first] == WAITING_WEIGHT:
+        return APPLIED
+    if joint.taken[WAITING] == MAX_WAITING:
+        flush(joint, size)
+    w = joint.W[joint.taken[WAITING]]
+    for j in range(count):
+        ix = 3 + 2 * (first + j)
+        i, ib = (ix, 3 + 2 * caller) if caller >= 0 else (3 + 2 * member, ix)
+        expected, spread = _expected(joint, size, i, ib, w)
+        longer, wider = _bends(joint, size, i, ib)
+        off, S = excess_path - expected - longer, spread + wider + variance
+        likelihood[j] = log_likelihood(off, S, False)
+    weight = state.weight[first:]
+    weigh_and_share(likelihood, weight, count, params.power, params.aggregated, scratch.share)
+    if survivors(weight, count, params.prune, scratch.keep) < count:
+        drop_members(state, first, count, scratch.keep, scratch.source)
     return APPLIED

@@ -1,5 +1,5 @@
 """FastSLAM 2.0: particles, each with a sampled path and a map.
 
-`filter` is the estimator. The kernels: `particles` iterates over blocks of 32 particles, `block`
-and `block_rays` update poses and landmarks, `poses` predicts, summarises and resamples.
+`filter` is the estimator. The kernels: `particles` predicts, updates and resamples all particles,
+`block` updates poses and landmarks of a block of 32.
 """

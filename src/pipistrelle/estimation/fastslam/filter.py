@@ -34,7 +34,7 @@ The update by a frame has five steps; frames without measurements only extend th
       :label: eq-13
 3. **Correct** the landmarks from the sampled pose; weigh, share and prune the rays (`rays`).
 4. **Place** new landmarks from the sampled pose.
-5. **Resample** if too few particles are effective (`poses`). The hypotheses of a ray keep their
+5. **Resample** if too few particles are effective (`particles`). The hypotheses of a ray keep their
    weights, or get equal weights with ``resampled_rays = "restart"``.
 
 ``mixture = "federated"``, as in the paper, updates every hypothesis of a ray with the noise R /
@@ -51,7 +51,7 @@ independent Gaussian for each landmark.
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -71,23 +71,19 @@ from pipistrelle.estimation.fastslam.block import LANES, MEMBER
 from pipistrelle.estimation.fastslam.particles import (
     Arrays,
     correct_particles,
+    effective_particles,
     gated_by_all,
     innovations_of,
     mean_full,
-    particle_map,
-    resample_into,
-    restart_rays,
-)
-from pipistrelle.estimation.fastslam.poses import (
-    SMALLEST_STD,
-    effective_particles,
     normalised,
     propagate,
+    resample_into,
+    restart_rays,
     stratified,
     summarise,
 )
 from pipistrelle.estimation.measurement import columns_of
-from pipistrelle.estimation.motion import Motion, motion_numbers
+from pipistrelle.estimation.motion import SMALLEST_STD, Controls, Durations, Motion, motion_numbers
 from pipistrelle.estimation.rays import UpdateParams, update_params
 from pipistrelle.geometry import wrap
 
@@ -220,8 +216,8 @@ class FastSlam:
     def predict(
         self,
         belief: FastSlamBelief,
-        controls: Float[np.ndarray, "k c"],
-        dt: Float[np.ndarray, " k"],
+        controls: Controls,
+        dt: Durations,
         rng: np.random.Generator | None = None,
     ) -> tuple[FastSlamBelief, Gaussian]:
         """Predict every particle's pose and covariance through a frame's control steps (Eq. (10)).
@@ -265,7 +261,8 @@ class FastSlam:
         weight = normalised(belief.log_weight + gained)
         best = int(np.argmax(weight))
         mean, covariance = summarise(poses, self._estimating(weight, best))
-        best_count, best_member = particle_map(count, member, best)
+        block, lane = divmod(best, LANES)
+        rows = member[block].reshape(-1, MEMBER // LANES, LANES)[..., lane].copy()
         after = FastSlamBelief(
             poses=poses,
             log_weight=np.log(weight, where=weight > 0.0, out=np.full(particles, -np.inf)),
@@ -274,8 +271,8 @@ class FastSlam:
             count=count,
             member=member,
             estimate=Gaussian(mean=mean, covariance=covariance),
-            best_count=best_count,
-            best_member=best_member,
+            best_count=count[block, :, lane].copy(),
+            best_member=rows,
             full=mean_full(count, weight),
             gated=belief.gated + gated,
             innovations=belief.innovations.plus(*off),
@@ -339,25 +336,22 @@ def _rows(
     )
 
 
-class _Placed(NamedTuple):
-    """Landmarks that most particles have initialised, for p particles and k landmarks."""
+def _placed_by_most(
+    belief: FastSlamBelief,
+) -> tuple[
+    Int[np.ndarray, " k"],
+    Float[np.ndarray, " p"],
+    Bool[np.ndarray, "p k"],
+    Float[np.ndarray, "p k 6"],
+    Float[np.ndarray, "p k"],
+    Float[np.ndarray, "k 2"],
+]:
+    """Return the k landmarks that most of the p particles, by weight, have initialised.
 
-    there: Int[np.ndarray, " k"]
-    """Indices of the landmarks."""
-    weight: Float[np.ndarray, " p"]
-    """Weight of each particle."""
-    placed: Bool[np.ndarray, "p k"]
-    """Whether each particle has initialised the landmark."""
-    members: Float[np.ndarray, "p k 6"]
-    """Position, covariance and log weight in each particle."""
-    share: Float[np.ndarray, "p k"]
-    """Weight of each particle among the particles with the landmark initialised."""
-    spots: Float[np.ndarray, "k 2"]
-    """Mean position [m]."""
-
-
-def _placed_by_most(belief: FastSlamBelief) -> _Placed:
-    """Return the landmarks that most particles, by weight, have initialised."""
+    Returns their indices, the weight of each particle, whether it has the landmark initialised,
+    position, covariance and log weight in each, the weight among the particles that have it, and
+    its mean position [m].
+    """
     particles = belief.log_weight.size
     weight = np.exp(belief.log_weight - belief.log_weight.max())
     weight /= weight.sum()
@@ -366,8 +360,8 @@ def _placed_by_most(belief: FastSlamBelief) -> _Placed:
     members = _numbers(belief.member[:, belief.first[there]], 6)[:particles]
     counting = weight[:, np.newaxis] * placed[:, there]
     share = counting / counting.sum(axis=0)
-    spots = np.einsum("pn,pne->ne", share, members[..., :2])
-    return _Placed(there, weight, placed[:, there], members, share, spots)
+    places = np.einsum("pn,pne->ne", share, members[..., :2])
+    return there, weight, placed[:, there], members, share, places
 
 
 def mixture_map(belief: FastSlamBelief) -> Landmarks:
@@ -379,15 +373,15 @@ def mixture_map(belief: FastSlamBelief) -> Landmarks:
     A landmark is fully initialised if it is so in most particles, by weight. Others are copied from
     the heaviest particle that has them as a ray.
     """
-    of = _placed_by_most(belief)
-    off = of.members[..., :2] - of.spots
-    spread = np.einsum("pn,pna,pnb->nab", of.share, off, off)
-    own = np.einsum("pn,pne->ne", of.share, of.members[..., 2:5])[:, [0, 1, 1, 2]]
-    numbers, rows = [of.there], [of.spots]
-    spreads, weights = [spread + own.reshape(-1, 2, 2)], [np.ones(of.there.size)]
-    count = _lanes(belief.count)[: of.weight.size]
-    for n in np.setdiff1d(np.arange(belief.landmark.size), of.there).tolist():
-        best = int(np.argmax(np.where(count[:, n] > 1, of.weight, -1.0)))
+    there, weight, _, members, share, places = _placed_by_most(belief)
+    off = members[..., :2] - places
+    spread = np.einsum("pn,pna,pnb->nab", share, off, off)
+    own = np.einsum("pn,pne->ne", share, members[..., 2:5])[:, [0, 1, 1, 2]]
+    numbers, rows = [there], [places]
+    spreads, weights = [spread + own.reshape(-1, 2, 2)], [np.ones(there.size)]
+    count = _lanes(belief.count)[: weight.size]
+    for n in np.setdiff1d(np.arange(belief.landmark.size), there).tolist():
+        best = int(np.argmax(np.where(count[:, n] > 1, weight, -1.0)))
         first, size = belief.first[n], count[best, n]
         lane = belief.member[best // LANES, first : first + size]
         members = lane.reshape(size, 6, LANES)[..., best % LANES]
@@ -414,14 +408,15 @@ def joint_of(belief: FastSlamBelief) -> JointGaussian:
     with each particle's covariances :math:`P_i` of pose and landmarks. Only landmarks that most
     particles have initialised are included; in the other particles they have the mean position.
     """
-    there, weight, placed, members, share, spots = _placed_by_most(belief)
+    there, weight, placed, members, share, places = _placed_by_most(belief)
     rows = _numbers(belief.poses, 9)[: weight.size]
     rows[:, 2] = belief.estimate.mean[2] + wrap(rows[:, 2] - belief.estimate.mean[2])
-    mean = np.append(np.einsum("p,pe->e", weight, rows[:, :3]), spots.ravel())
-    points = np.where(placed[..., np.newaxis], members[..., :2], spots)
+    mean = np.append(np.einsum("p,pe->e", weight, rows[:, :3]), places.ravel())
+    points = np.where(placed[..., np.newaxis], members[..., :2], places)
     off = np.hstack([rows[:, :3], points.reshape(weight.size, 2 * there.size)]) - mean
     covariance = np.einsum("p,pd,pe->de", weight, off, off, optimize=True)
-    covariance[:3, :3] += _packed(np.einsum("p,pe->e", weight, rows[:, 3:9]))
+    xx, xy, yy, xh, yh, hh = np.einsum("p,pe->e", weight, rows[:, 3:9])
+    covariance[:3, :3] += np.array([[xx, xy, xh], [xy, yy, yh], [xh, yh, hh]])
     own = np.einsum("pn,pne->ne", share, members[..., 2:5])
     for n, (xx, xy, yy) in enumerate(own.tolist()):
         covariance[3 + 2 * n : 5 + 2 * n, 3 + 2 * n : 5 + 2 * n] += [[xx, xy], [xy, yy]]
@@ -438,12 +433,6 @@ def _numbers(blocks: np.ndarray, count: int) -> np.ndarray:
 def _lanes(count: np.ndarray) -> np.ndarray:
     """Convert counts by block, landmark and lane to counts by particle and landmark."""
     return np.swapaxes(count, 1, 2).reshape(len(count) * LANES, count.shape[1])
-
-
-def _packed(numbers: Float[np.ndarray, "6"]) -> Float[np.ndarray, "3 3"]:
-    """Convert xx, xy, yy, xh, yh and hh to a 3 x 3 covariance."""
-    xx, xy, yy, xh, yh, hh = numbers
-    return np.array([[xx, xy, xh], [xy, yy, yh], [xh, yh, hh]])
 
 
 def edits(

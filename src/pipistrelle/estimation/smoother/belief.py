@@ -10,12 +10,13 @@ from jaxtyping import Bool, Float, Int
 from pipistrelle.config import InputError, RayConfig
 from pipistrelle.detection.scans import BEARING, BEARING_STD
 from pipistrelle.estimation.beliefs import Gaussian, JointGaussian, Landmarks
+from pipistrelle.estimation.motion import Pose
 from pipistrelle.estimation.rays import ray_members
 from pipistrelle.estimation.recovery import Recoverable
+from pipistrelle.estimation.smoother.elimination import joint
 from pipistrelle.estimation.smoother.history import NEVER, History
 from pipistrelle.estimation.smoother.preintegration import Odometry, placed, poses_between
-from pipistrelle.estimation.smoother.records import CALLER, POSE, NoiseModel, Stack
-from pipistrelle.estimation.smoother.solution import joint
+from pipistrelle.estimation.smoother.records import CALLER, POSE, ChainState, NoiseModel, Stack
 from pipistrelle.estimation.smoother.sweep import (
     Smoothed,
     Solution,
@@ -154,7 +155,7 @@ class SmootherBelief(Recoverable):
             self.found["smoothed"] = smoothed(self.best(), self.history)
         return self.found["smoothed"]
 
-    def guess(self) -> Float[np.ndarray, " d"]:
+    def guess(self) -> ChainState:
         """Predict the chain's state: current pose and moving callers."""
         state = self.solution.state.copy()
         state[:POSE] = self.ahead.mean
@@ -254,7 +255,7 @@ class SmootherBelief(Recoverable):
         ahead = Gaussian(mean=poses.mean[-1], covariance=poses.covariance[-1])
         return replace(belief, ahead=ahead)
 
-    def freed(self, pose: Float[np.ndarray, "3"], stds: Float[np.ndarray, "3"]) -> "SmootherBelief":
+    def freed(self, pose: Pose, stds: Pose) -> "SmootherBelief":
         """Move the pose and add an error, both spread over the steps since the last node."""
         if not len(self.odometry.mean):
             return self
@@ -339,33 +340,22 @@ def _placed(
     if not parameters:
         return placed(at, odometry, first)
     estimate = solution.border[1 : 1 + parameters] + solution.beta[1 : 1 + parameters]
-    poses = placed(at, _corrected(odometry, estimate), first)
+    led = replace(odometry, mean=odometry.mean + (odometry.slopes * estimate).sum(axis=-1))
+    poses, slopes = placed(at, led, first), odometry.slopes[first:]
     d, n = len(solution.state), solution.beta.size
     by_chain, by_border = np.zeros((3 + parameters, d)), np.zeros((3 + parameters, n))
     by_chain[:3, :3], by_border[3:, 1 : 1 + parameters] = np.eye(3), np.eye(parameters)
     about = joint(solution.front, solution.factor, n, by_chain, by_border)
-    more = _by_parameters(poses.mean, at.mean, odometry.slopes[first:], about)
-    return replace(poses, covariance=poses.covariance + more)
-
-
-def _corrected(odometry: Odometry, parameters: Float[np.ndarray, " q"]) -> Odometry:
-    """Correct odometry by estimated parameters."""
-    return replace(odometry, mean=odometry.mean + (odometry.slopes * parameters).sum(axis=-1))
-
-
-def _by_parameters(
-    poses: Float[np.ndarray, "m 3"],
-    start: Float[np.ndarray, "3"],
-    slopes: Float[np.ndarray, "m 3 q"],
-    about: Float[np.ndarray, "e e"],
-) -> Float[np.ndarray, "m 3 3"]:
-    """Return the covariance of poses due to parameters; ``about``: of start pose and parameters."""
-    c, s, count = np.cos(start[2]), np.sin(start[2]), len(poses)
-    by_start, by = np.tile(np.eye(3), (count, 1, 1)), slopes.copy()
-    by_start[:, 0, 2], by_start[:, 1, 2] = start[1] - poses[:, 1], poses[:, 0] - start[0]
+    # The poses' covariance due to the parameters, and to their correlation with the start.
+    (x, y, heading) = at.mean
+    c, s = np.cos(heading), np.sin(heading)
+    by_start, by = np.tile(np.eye(3), (len(slopes), 1, 1)), slopes.copy()
+    by_start[:, 0, 2], by_start[:, 1, 2] = y - poses.mean[:, 1], poses.mean[:, 0] - x
     by[:, 0], by[:, 1] = c * slopes[:, 0] - s * slopes[:, 1], s * slopes[:, 0] + c * slopes[:, 1]
     mixed = np.einsum("mae,ef,mbf->mab", by, about[3:, :3], by_start)
-    return mixed + np.swapaxes(mixed, 1, 2) + np.einsum("mae,ef,mbf->mab", by, about[3:, 3:], by)
+    own = np.einsum("mae,ef,mbf->mab", by, about[3:, 3:], by)
+    more = mixed + np.swapaxes(mixed, 1, 2) + own
+    return replace(poses, covariance=poses.covariance + more)
 
 
 def _map_of(rows: Sequence[MapRow]) -> Landmarks:

@@ -3,7 +3,7 @@
 The smoother keeps every measurement, and eliminates the normal equations along the chain of poses
 (`elimination`): a frame adds a node, and unknowns that moved are relinearised (`chain`). Nodes are
 the times of scans (`preintegration` has the control steps between). Landmarks and callers are
-initialised by a range, a precise excess path, or crossing bearings (`initialization`), with all
+initialised by a range, a precise excess path, or crossing bearings (`entering_places`), with all
 their measurements so far; until then they are partially initialised. An excess path counts once its
 landmark and its caller are initialised. A moving caller has a position and a velocity at each node,
 and is no landmark.
@@ -12,15 +12,24 @@ and is no landmark.
 distribution are discarded: bearing and range jointly, an excess path separately, as an error such
 as a wrong direct call affects only it. The belief at a frame is the solution there; trajectory,
 caller tracks and map are the optimum of all measurements so far (`belief`).
+
+**Initialisation** is delayed until the range is certain. A measured range initialises at once.
+Otherwise an excess path gives the range along the bearing: of a landmark if the caller is
+initialised, of a caller if the landmark is (`estimation.measurement`). It is strongly nonlinear
+near the line from vehicle to caller, so its uncertainty is an unscented transform of offset,
+bearing and excess path (eight sigma points at two standard deviations; Julier & Uhlmann 1997),
+unknown if a sigma point has no range. Without it, a landmark is initialised where its newest
+bearing clearly crosses an earlier bearing; the standard deviation along the newest combines both
+lines over the sine of their angle. Moving callers' bearings are not crossed.
 """
 
 import math
 from dataclasses import dataclass, replace
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
-from pipistrelle.config import RayConfig
+from pipistrelle.config import FARTHEST, RayConfig
 from pipistrelle.detection.scans import (
     BEARING,
     BEARING_STD,
@@ -40,11 +49,18 @@ from pipistrelle.estimation.checking import (
     usable_pose,
     usable_scan,
 )
-from pipistrelle.estimation.measurement import HUBER_K, observe
-from pipistrelle.estimation.motion import Motion
+from pipistrelle.estimation.measurement import (
+    HUBER_K,
+    MAX_RELATIVE_RANGE_STD,
+    MIN_TDOA_SIGMAS,
+    observe,
+    range_by_excess_path,
+)
+from pipistrelle.estimation.motion import SMALLEST_STD, Controls, Durations, Motion
 from pipistrelle.estimation.rays import gate_bounds
 from pipistrelle.estimation.recovery import recovering
 from pipistrelle.estimation.smoother.belief import SmootherBelief
+from pipistrelle.estimation.smoother.elimination import joint
 from pipistrelle.estimation.smoother.history import (
     NEVER,
     STRETCH,
@@ -56,11 +72,10 @@ from pipistrelle.estimation.smoother.history import (
     with_leaving,
     with_places,
 )
-from pipistrelle.estimation.smoother.initialization import entering_places
 from pipistrelle.estimation.smoother.observations import (
-    Point,
     View,
     bearing_of,
+    direction_of,
     point_of,
     view_of,
     write_bearing,
@@ -69,23 +84,26 @@ from pipistrelle.estimation.smoother.observations import (
 )
 from pipistrelle.estimation.smoother.preintegration import (
     NOTHING,
-    SMALLEST_STD,
     Calibration,
     extended,
     no_odometry,
 )
 from pipistrelle.estimation.smoother.records import (
     Arrays,
+    Border,
+    ChainState,
+    Factor,
     Front,
     NoiseModel,
     Places,
     PointArrays,
     Rows,
+    Span,
     Stack,
     Work,
+    cholesky,
     work_of,
 )
-from pipistrelle.estimation.smoother.solution import joint
 from pipistrelle.estimation.smoother.sweep import (
     Points,
     Solution,
@@ -96,17 +114,174 @@ from pipistrelle.estimation.smoother.sweep import (
     stepped,
 )
 from pipistrelle.geometry import wrap_angle
-from pipistrelle.jit import Whole, kernel, no_alloc
+from pipistrelle.jit import Whole, kernel, no_alloc, optimised_once
+
+
+@kernel
+def excess_path_range(
+    rows: Rows,
+    heard: Span,
+    view: View,
+    k: Whole,
+    places: Places,
+    estimate: PointArrays,
+    front: Front,
+    R: Factor,
+) -> float:
+    """Return the range of a landmark or caller from its most precise excess path, or NaN."""
+    m, first, last = heard
+    slot, scale = rows.ends[m, 0], view.scale
+    angle, across = direction_of(view, rows.numbers[m]), rows.numbers[m, BEARING_STD]
+    spread, way, best, other = np.zeros((4, 4)), np.zeros(4), math.inf, -1
+    clue, caller = -1, False
+    for e in range(first, last):
+        asked, ends = rows.ends[e, 1] == slot, (rows.ends[e, 0], rows.ends[e, 1])
+        if ends[1] < 0 or not (asked or ends[0] == slot):
+            continue
+        i, x, y = point_of(ends[0] if asked else ends[1], k, places, estimate)
+        if i == 0:
+            continue
+        way[0], way[1], way[2] = x - view.x, y - view.y, angle
+        way[3] = scale * rows.numbers[e, EXCESS_PATH]
+        spread[2, 2], spread[3, 3] = across * across, rows.numbers[e, EXCESS_PATH_STD] ** 2
+        share = unscented_range(way, spread, asked)[1]
+        if share < best:
+            best, other, clue, caller = share, ends[0] if asked else ends[1], e, asked
+    if best > MAX_RELATIVE_RANGE_STD:
+        return math.nan
+    i, x, y = point_of(other, k, places, estimate)
+    way[0], way[1] = x - view.x, y - view.y
+    way[3] = scale * rows.numbers[clue, EXCESS_PATH]
+    # The covariance of the offset to the other end (2) and of the heading.
+    by_chain, by_border = np.zeros((3, front.P.shape[0])), np.zeros((3, R.shape[0]))
+    for a in range(2):
+        by_chain[a, a] = -1.0
+        if i > 0:
+            by_border[a, i + a] = 1.0
+        else:
+            by_chain[a, a - i] = 1.0
+    by_chain[2, 2] = 1.0
+    known = joint(front, R, R.shape[0], by_chain, by_border)
+    for a in range(3):
+        for b in range(3):
+            spread[a, b] = known[a, b]
+    spread[2, 2] += across * across
+    spread[3, 3] = rows.numbers[clue, EXCESS_PATH_STD] ** 2
+    found, share = unscented_range(way, spread, caller)
+    return found if share <= MAX_RELATIVE_RANGE_STD else math.nan
+
+
+@kernel
+def unscented_range(
+    way: Float[np.ndarray, "4"], spread: Float[np.ndarray, "4 4"], caller: bool
+) -> tuple[float, float]:
+    """Return a range from an excess path, and its relative std (infinite if unknown).
+
+    ``way`` (4) is the offset to the other point (2), the direction of the unknown point, and the
+    excess path; ``spread`` (4, 4) is their covariance. ``caller`` selects the range of the caller.
+    In the example the landmark is at (3, 4), then between the two, and the caller at (6, 0).
+
+    >>> way, spread = np.array([6.0, 0.0, np.arctan2(4.0, 3.0), 4.0]), np.diag([0, 0, 0, 0.01])
+    >>> [round(float(number), 3) for number in unscented_range(way, spread, False)]
+    [5.0, 0.016]
+    >>> unscented_range(np.array([6.0, 0.0, 0.0, 0.0]), spread, False)[1]
+    inf
+    """
+    if way[3] <= MIN_TDOA_SIGMAS * math.sqrt(spread[3, 3]):
+        return math.nan, math.inf
+    L, at, total = np.zeros((4, 4)), np.empty(4), 0.0
+    cholesky(spread, L)
+    first = _range(way, caller)
+    for e in range(4):
+        for side in (-2.0, 2.0):
+            for a in range(4):
+                at[a] = way[a] + side * L[a, e]
+            other = _range(at, caller)
+            if not (0.0 < other < FARTHEST):
+                return math.nan, math.inf
+            total += (other - first) ** 2
+    if not (0.0 < first < FARTHEST):
+        return math.nan, math.inf
+    return first, math.sqrt(total / 8.0) / first
+
+
+@no_alloc
+def _range(way: Float[np.ndarray, "4"], caller: bool) -> float:
+    """Return the range of a landmark or of a caller from an excess path."""
+    c, s = math.cos(way[2]), math.sin(way[2])
+    return range_by_excess_path(way[3], way[0], way[1], c, s, caller)
+
+
+MIN_CROSSING_ANGLE = 0.5
+"""Least angle [rad] between bearings that initialise a landmark."""
+MAX_RELATIVE_PLACE_STD = 0.5
+"""Largest standard deviation of a crossing, relative to the range."""
+
+
+@optimised_once
+def entering_places(
+    rows: Arrays,
+    span: Span,
+    moves: Int[np.ndarray, " s"],
+    places: Arrays,
+    estimate: PointArrays,
+    front: Arrays,
+    R: Factor,
+) -> Float[np.ndarray, "m 2"]:
+    """Return initial positions for a frame's landmarks and callers, NaN if still uncertain."""
+    rows, places, front = Rows(*rows), Places(*places), Front(*front)
+    (k, first, last), found = span, np.full((span[2] - span[1], 2), np.nan)
+    view = view_of(estimate[0][k], estimate[1], places, k)
+    for m in range(first, last):
+        slot, numbers = rows.ends[m, 0], rows.numbers[m]
+        if places.index[slot] != 0 or math.isnan(numbers[BEARING]):
+            continue
+        away = numbers[RANGE] * view.scale
+        if math.isnan(away):
+            heard = m, first, last
+            away = excess_path_range(rows, heard, view, k, places, estimate, front, R)
+        if math.isnan(away) and not moves[slot]:
+            away = range_by_crossing(rows, m, estimate, places)
+        angle = direction_of(view, numbers)
+        found[m - first, 0] = view.x + away * math.cos(angle)
+        found[m - first, 1] = view.y + away * math.sin(angle)
+    return found
+
+
+@no_alloc
+def range_by_crossing(rows: Rows, m: Whole, estimate: PointArrays, places: Places) -> float:
+    """Return the range where a bearing clearly crosses an earlier bearing, or NaN."""
+    numbers, (poses, border) = rows.numbers[m], estimate
+    k = rows.ends[m, 2]
+    view = view_of(poses[k], border, places, k)
+    angle, best, found = direction_of(view, numbers), math.sin(MIN_CROSSING_ANGLE), math.nan
+    earlier = rows.ends[m, 3]
+    while earlier >= 0:
+        k = rows.ends[earlier, 2]
+        there = view_of(poses[k], border, places, k)
+        other = direction_of(there, rows.numbers[earlier])
+        sine = math.sin(other - angle)
+        if abs(sine) >= best:
+            dx, dy = there.x - view.x, there.y - view.y
+            near = (dx * math.sin(other) - dy * math.cos(other)) / sine
+            far = (dx * math.sin(angle) - dy * math.cos(angle)) / sine
+            along = far * rows.numbers[earlier, BEARING_STD]
+            across = near * numbers[BEARING_STD]
+            off = math.sqrt(along * along + across * across)
+            if near > 0.0 and far > 0.0 and off <= MAX_RELATIVE_PLACE_STD * near * abs(sine):
+                best, found = abs(sine), near
+        earlier = rows.ends[earlier, 3]
+    return found
 
 
 @kernel
 def drop_outside(
     rows: Arrays,
-    span: tuple[Whole, Whole, Whole],
+    span: Span,
     places: Arrays,
     estimate: PointArrays,
     front: Arrays,
-    R: Float[np.ndarray, "n n"],
+    R: Factor,
     bounds: tuple[float, float],
 ) -> tuple[Whole, float, float]:
     """Replace gated bearings and ranges by NaN, and gated excess paths by no caller, in place.
@@ -135,7 +310,21 @@ def drop_outside(
                     dropped += 1
         if math.isnan(numbers[BEARING]):
             continue
-        off, size = _surprise_of_direction(work, numbers, view, point, front, R)
+        (i, px, py), size = point, 1 if math.isnan(numbers[RANGE]) else 2
+        seen = observe(view.x, view.y, view.heading, px, py)
+        by_chain, by_border = np.zeros((size, d)), np.zeros((size, n))
+        _part(work, write_bearing(work, view, seen, numbers[SLOPE], i), by_chain[0], by_border[0])
+        if size == 2:
+            _part(work, write_range(work, view, seen, i), by_chain[1], by_border[1])
+        S = joint(front, R, n, by_chain, by_border)
+        turn = wrap_angle(numbers[BEARING] - bearing_of(view, seen, numbers[SLOPE]))
+        bb = S[0, 0] + numbers[BEARING_STD] * numbers[BEARING_STD]
+        if size == 1:
+            off = turn * turn / bb
+        else:
+            rr, far = S[1, 1] + numbers[RANGE_STD] ** 2, numbers[RANGE] - seen[0] / view.scale
+            off = rr * turn * turn - 2.0 * S[1, 0] * turn * far + bb * far * far
+            off /= bb * rr - S[1, 0] * S[1, 0]
         if off > bounds[size - 1]:
             numbers[BEARING] = numbers[RANGE] = np.nan
             dropped += 1
@@ -147,10 +336,7 @@ def drop_outside(
 
 @no_alloc
 def _part(
-    work: Work,
-    written: tuple[Whole, Whole],
-    by_chain: Float[np.ndarray, " d"],
-    by_border: Float[np.ndarray, " n"],
+    work: Work, written: tuple[Whole, Whole], by_chain: ChainState, by_border: Border
 ) -> None:
     """Split a Jacobian row into derivatives by the chain and by the separator."""
     chain, size = written
@@ -158,33 +344,6 @@ def _part(
         by_chain[work.at[e]] += work.slope[e]
     for e in range(chain, size):
         by_border[work.at[e]] += work.slope[e]
-
-
-@kernel
-def _surprise_of_direction(
-    work: Work,
-    numbers: Float[np.ndarray, " 8"],
-    view: View,
-    point: Point,
-    front: Front,
-    R: Float[np.ndarray, "n n"],
-) -> tuple[float, Whole]:
-    """Return the squared innovation of a bearing, and its range if measured, and its dimension."""
-    (i, px, py), d, n = point, front.P.shape[0], R.shape[0]
-    seen = observe(view.x, view.y, view.heading, px, py)
-    off = wrap_angle(numbers[BEARING] - bearing_of(view, seen, numbers[SLOPE]))
-    size = 1 if math.isnan(numbers[RANGE]) else 2
-    by_chain, by_border = np.zeros((size, d)), np.zeros((size, n))
-    _part(work, write_bearing(work, view, seen, numbers[SLOPE], i), by_chain[0], by_border[0])
-    if size == 2:
-        _part(work, write_range(work, view, seen, i), by_chain[1], by_border[1])
-    S = joint(front, R, n, by_chain, by_border)
-    bb = S[0, 0] + numbers[BEARING_STD] * numbers[BEARING_STD]
-    if size == 1:
-        return off * off / bb, 1
-    rr, far = S[1, 1] + numbers[RANGE_STD] ** 2, numbers[RANGE] - seen[0] / view.scale
-    det = bb * rr - S[1, 0] * S[1, 0]
-    return (rr * off * off - 2.0 * S[1, 0] * off * far + bb * far * far) / det, 2
 
 
 PRIOR_STD, PRIOR_SHARE = 20.0, 0.1
@@ -262,8 +421,8 @@ class Smoother:
     def predict(
         self,
         belief: SmootherBelief,
-        controls: Float[np.ndarray, "k c"],
-        dt: Float[np.ndarray, " k"],
+        controls: Controls,
+        dt: Durations,
         rng: np.random.Generator | None = None,
     ) -> tuple[SmootherBelief, Gaussian]:
         """Predict the belief through control steps; return it, and the pose after each step."""

@@ -15,14 +15,14 @@ from jaxtyping import Bool, Float, Int
 from pipistrelle.detection.scans import BEARING, NUMBERS, RANGE, Scan
 from pipistrelle.estimation.beliefs import Gaussian
 from pipistrelle.estimation.measurement import caller_labels
+from pipistrelle.estimation.motion import SMALLEST_STD
 from pipistrelle.estimation.smoother.preintegration import (
     NOTHING,
-    SMALLEST_STD,
     Calibration,
     Led,
     Odometry,
 )
-from pipistrelle.estimation.smoother.records import CALLER, POSE, Arrays, Stack
+from pipistrelle.estimation.smoother.records import CALLER, POSE, Arrays, PlainLegs, Stack
 from pipistrelle.jit import Whole, optimised_once
 
 STRETCH = 64
@@ -79,7 +79,7 @@ class History:
         return POSE + CALLER * len(self.callers)
 
     @property
-    def motion(self) -> Arrays:
+    def motion(self) -> PlainLegs:
         """Motion to each node, as `records.Legs`.
 
         If the speed scale is the only source of absolute size, the motion residual is taken at the

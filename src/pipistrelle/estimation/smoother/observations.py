@@ -30,15 +30,19 @@ from pipistrelle.detection.scans import (
     SLOPE,
 )
 from pipistrelle.estimation.measurement import NEAREST, excess_path_slopes, observe
+from pipistrelle.estimation.motion import SMALLEST_STD
 from pipistrelle.estimation.smoother.records import (
     CALLER,
     POSE,
     Arrays,
+    Border,
+    ChainState,
     Front,
     NoiseModel,
     Places,
     PointArrays,
     Rows,
+    Span,
     Work,
     add_multiple,
     work_of,
@@ -73,9 +77,7 @@ class View(NamedTuple):
 
 
 @no_alloc
-def view_of(
-    pose: Float[np.ndarray, " d"], border: Float[np.ndarray, " n"], places: Places, k: Whole
-) -> View:
+def view_of(pose: ChainState, border: Border, places: Places, k: Whole) -> View:
     """Return the sensor's view from node k at a vehicle pose."""
     sensor = places.sensor
     sound, turned, place, clock = sensor[0], sensor[1], sensor[2], sensor[3]
@@ -222,18 +224,12 @@ def _write_point(
     return chain + 2, size + 2
 
 
-Off = tuple[Float[np.ndarray, " d"], Float[np.ndarray, " n"]]
+Off = tuple[ChainState, Border]
 """Deviation of a node's state and of the separator from their linearisation points."""
 
 
 @optimised_once
-def nonlinearity(
-    rows: Arrays,
-    span: tuple[Whole, Whole, Whole],
-    places: Arrays,
-    points: PointArrays,
-    off: Off,
-) -> float:
+def nonlinearity(rows: Arrays, span: Span, places: Arrays, points: PointArrays, off: Off) -> float:
     """Return the largest linearisation error of a node's measurements at the estimate [std]."""
     rows, places, (k, first, last), most = Rows(*rows), Places(*places), span, 0.0
     work, border = work_of(off[0].size, 1, 0), points[1].copy()
@@ -290,8 +286,6 @@ def _along(work: Work, written: tuple[Whole, Whole], off: Off) -> float:
     return total
 
 
-LEAST_DEVIATION = 1e-6
-"""Least standard deviation of a measurement [rad, m]."""
 ALONE_ABOVE = 1e4
 """Measured over prior information above which updates are individual: batches cost a tenth, but
 lose the square of this ratio in precision."""
@@ -301,7 +295,7 @@ lose the square of this ratio in precision."""
 def hear(
     work: Work,
     front: Front,
-    span: tuple[Whole, Whole, Whole],
+    span: Span,
     rows: Rows,
     places: Places,
     points: PointArrays,
@@ -326,7 +320,7 @@ def hear(
             caller = point_of(rows.ends[m, 1], k, places, points)
             if caller[0] != 0:
                 path, chain, size = write_excess_path(work, view, (landmark, caller))
-                sure = 1.0 / max(numbers[EXCESS_PATH_STD], LEAST_DEVIATION)
+                sure = 1.0 / max(numbers[EXCESS_PATH_STD], SMALLEST_STD)
                 off = (path - numbers[EXCESS_PATH]) * sure
                 less, loss = _huber(off * off, believed)
                 _add(work, front, chain, size, (less * sure, less * off))
@@ -346,10 +340,10 @@ def _hear_direction(
     """Add a bearing, and its range if measured; return twice their cost."""
     i, px, py = point
     seen = observe(view.x, view.y, view.heading, px, py)
-    across = 1.0 / max(numbers[BEARING_STD], LEAST_DEVIATION)
+    across = 1.0 / max(numbers[BEARING_STD], SMALLEST_STD)
     off = wrap_angle(bearing_of(view, seen, numbers[SLOPE]) - numbers[BEARING]) * across
     ranged = not math.isnan(numbers[RANGE])
-    along = 1.0 / max(numbers[RANGE_STD], LEAST_DEVIATION) if ranged else 0.0
+    along = 1.0 / max(numbers[RANGE_STD], SMALLEST_STD) if ranged else 0.0
     far = (seen[0] / view.scale - numbers[RANGE]) * along if ranged else 0.0
     less, cost = _huber(off * off + far * far, believed)
     if i > 0 and not work.alone[0] and view.known:
@@ -465,12 +459,7 @@ def _correct_by_row(work: Work, front: Front, chain: Whole, size: Whole) -> None
 
 @no_alloc
 def _is_sure(
-    front: Front,
-    span: tuple[Whole, Whole, Whole],
-    rows: Rows,
-    places: Places,
-    points: PointArrays,
-    damping: float,
+    front: Front, span: Span, rows: Rows, places: Places, points: PointArrays, damping: float
 ) -> bool:
     """Return whether a node's measurements are far more precise than its prior (`ALONE_ABOVE`)."""
     (k, begin, end), x, y = span, points[0][span[0], 0], points[0][span[0], 1]
@@ -478,12 +467,12 @@ def _is_sure(
     for m in range(begin, end):
         numbers, (i, px, py) = rows.numbers[m], point_of(rows.ends[m, 0], k, places, points)
         if i != 0 and not math.isnan(numbers[BEARING]):
-            sure = 1.0 / max(numbers[BEARING_STD], LEAST_DEVIATION) ** 2
+            sure = 1.0 / max(numbers[BEARING_STD], SMALLEST_STD) ** 2
             turns += sure
             moves += sure / max((px - x) ** 2 + (py - y) ** 2, NEAREST * NEAREST)
             if not math.isnan(numbers[RANGE]):
-                moves += 1.0 / max(numbers[RANGE_STD], LEAST_DEVIATION) ** 2
+                moves += 1.0 / max(numbers[RANGE_STD], SMALLEST_STD) ** 2
         if i != 0 and rows.ends[m, 1] >= 0:
-            moves += 4.0 / max(numbers[EXCESS_PATH_STD], LEAST_DEVIATION) ** 2
+            moves += 4.0 / max(numbers[EXCESS_PATH_STD], SMALLEST_STD) ** 2
     P = front.P
     return turns * P[2, 2] > ALONE_ABOVE or moves * (P[0, 0] + P[1, 1]) > ALONE_ABOVE

@@ -26,8 +26,12 @@ from pipistrelle.estimation.beliefs import Gaussian
 from pipistrelle.estimation.motion import (
     ACKERMANN,
     BY_POSES,
+    Controls,
+    Durations,
     Motion,
     MotionNumbers,
+    Pose,
+    PoseCovariance,
     motion_increment,
     motion_numbers,
     propagate_pose,
@@ -35,6 +39,7 @@ from pipistrelle.estimation.motion import (
 from pipistrelle.estimation.smoother.records import (
     Arrays,
     Legs,
+    PlainLegs,
     add,
     add_product,
     cholesky,
@@ -133,9 +138,6 @@ NOTHING = calibration_of(Config(), Motion(model="unicycle", control_std=(0.0, 0.
 """Calibration without parameters."""
 
 
-SMALLEST_STD = 1e-6
-"""Added in quadrature to the start and each motion [m, rad], so that no prior is exact."""
-
 Steps = tuple[Float[np.ndarray, "s 3"], Float[np.ndarray, "s 3 3"]]
 """Means and covariances of control steps relative to the node before."""
 Led = tuple[Float[np.ndarray, "s 3"], Float[np.ndarray, "s 3 3"], Float[np.ndarray, "s 3 q"]]
@@ -164,8 +166,8 @@ def no_odometry(parameters: int = 0) -> Odometry:
 def extended(
     odometry: Odometry,
     motion: Motion,
-    controls: Float[np.ndarray, "k c"],
-    dt: Float[np.ndarray, " k"],
+    controls: Controls,
+    dt: Durations,
     parameters: Int[np.ndarray, " q"],
 ) -> Odometry:
     """Append control steps to odometry; ``parameters``: codes of `OF_ODOMETRY`."""
@@ -184,7 +186,7 @@ def placed(start: Gaussian, odometry: Odometry, first: int = 0) -> Gaussian:
 
 
 @optimised_once
-def _placed(start: tuple[Float[np.ndarray, "3"], Float[np.ndarray, "3 3"]], steps: Steps) -> Steps:
+def _placed(start: tuple[Pose, PoseCovariance], steps: Steps) -> Steps:
     """Convert relative steps to world poses with covariances."""
     poses, spreads = np.empty(steps[0].shape), np.empty(steps[1].shape)
     for k in range(len(poses)):
@@ -195,8 +197,8 @@ def _placed(start: tuple[Float[np.ndarray, "3"], Float[np.ndarray, "3 3"]], step
 @optimised_once
 def _extended(
     steps: Led,
-    controls: Float[np.ndarray, "k c"],
-    dt: Float[np.ndarray, " k"],
+    controls: Controls,
+    dt: Durations,
     motion: MotionNumbers,
     parameters: Int[np.ndarray, " q"],
 ) -> Led:
@@ -225,7 +227,7 @@ def _extended(
 @no_alloc
 def _lead_on(
     J: Float[np.ndarray, "3 q"],
-    pose: Float[np.ndarray, "3"],
+    pose: Pose,
     control: tuple[Float[np.ndarray, " c"], float],
     motion: MotionNumbers,
     parameters: Int[np.ndarray, " q"],
@@ -253,11 +255,11 @@ def _lead_on(
 
 @no_alloc
 def place(
-    start: tuple[Float[np.ndarray, "3"], Float[np.ndarray, "3 3"]],
-    relative: Float[np.ndarray, "3"],
-    P: Float[np.ndarray, "3 3"],
-    pose: Float[np.ndarray, "3"],
-    covariance: Float[np.ndarray, "3 3"],
+    start: tuple[Pose, PoseCovariance],
+    relative: Pose,
+    P: PoseCovariance,
+    pose: Pose,
+    covariance: PoseCovariance,
 ) -> None:
     """Write a world pose and its covariance F C F^T + R P R^T from a pose relative to ``start``."""
     (x, y, heading), C = start[0], start[1]
@@ -280,7 +282,7 @@ def place(
 
 @optimised_once
 def poses_between(
-    legs: Arrays,
+    legs: PlainLegs,
     ends: Float[np.ndarray, "k 2"],
     steps: Arrays,
     nodes: Steps,
@@ -290,81 +292,55 @@ def poses_between(
     legs, count = Legs(*legs), ends[-1, 1]
     mean, covariance = np.empty((1 + count, 3)), np.empty((1 + count, 3, 3))
     mean[0], covariance[0] = nodes[0][0], nodes[1][0]
-    work = np.zeros((6, 3, 3))
+    by_a, by_b, total, G, R, L = np.zeros((6, 3, 3))
     for k in range(1, ends.shape[0]):
+        a, b, way, N = nodes[0][k - 1], nodes[0][k], legs.mean[k], legs.noise[k]
+        c, s = math.cos(a[2]), math.sin(a[2])
+        dx, dy, turn = b[0] - a[0], b[1] - a[1], wrap_angle(b[2] - a[2] - way[2])
+        ahead, aside = c * dx + s * dy - way[0], c * dy - s * dx - way[1]
         for j in range(ends[k, 0], ends[k, 1]):
-            for a in range(3):
-                mean[1 + j, a] = nodes[0][k, a]
-            write(nodes[1][k], covariance[1 + j])
-            if legs.noise[k, 2, 2] > 0.0 and j + 1 < ends[k, 1]:
-                step = steps[0][j], steps[1][j]
-                poses = nodes[0][k - 1], nodes[0][k]
-                _place_between(poses, (legs.mean[k], legs.noise[k]), step, mean[1 + j], work)
-                spreads = nodes[1][k - 1], nodes[1][k], cross[k]
-                _spread_between(spreads, work, covariance[1 + j])
+            pose, spread, d, P = mean[1 + j], covariance[1 + j], steps[0][j], steps[1][j]
+            for e in range(3):
+                pose[e] = b[e]
+            write(nodes[1][k], spread)
+            if N[2, 2] <= 0.0 or j + 1 >= ends[k, 1]:
+                continue
+            write(P, G)  # G = P Phi^T N^-1
+            for e in range(3):
+                G[e, 0] -= (way[1] - d[1]) * P[e, 2]
+                G[e, 1] += (way[0] - d[0]) * P[e, 2]
+            cholesky(N, L)
+            for e in range(3):
+                solve_with(L, G[e])
+            x = d[0] + G[0, 0] * ahead + G[0, 1] * aside + G[0, 2] * turn
+            y = d[1] + G[1, 0] * ahead + G[1, 1] * aside + G[1, 2] * turn
+            h = d[2] + G[2, 0] * ahead + G[2, 1] * aside + G[2, 2] * turn
+            x, y = c * x - s * y, s * x + c * y
+            pose[0], pose[1], pose[2] = a[0] + x, a[1] + y, wrap_angle(a[2] + h)
+            write(P, by_a)
+            multiply(G, N, L)
+            transpose(G, by_b)
+            add_product(L, by_b, by_a, -1.0)  # P - G N G^T
+            write_identity(R)
+            R[0, 0], R[0, 1], R[1, 0], R[1, 1] = c, -s, s, c
+            multiply(R, by_a, L)
+            transpose(R, by_b)
+            multiply(L, by_b, total)
+            multiply(R, G, L)
+            multiply(L, by_b, R)
+            write(R, by_b)  # the Jacobians by a and b
+            write_identity(by_a)
+            add(by_b, by_a, -1.0)
+            for e in range(3):
+                by_a[e, 2] += by_b[e, 0] * dy - by_b[e, 1] * dx
+            by_a[0, 2] -= y
+            by_a[1, 2] += x
+            congruent(by_a, nodes[1][k - 1], L, total)
+            congruent(by_b, nodes[1][k], L, total)
+            transpose(by_a, G)
+            multiply(by_b, cross[k], L)
+            multiply(L, G, R)
+            for e in range(3):
+                for f in range(3):
+                    spread[e, f] = 0.5 * (total[e, f] + total[f, e]) + (R[e, f] + R[f, e])
     return mean, covariance
-
-
-@no_alloc
-def _place_between(
-    poses: tuple[Float[np.ndarray, "3"], Float[np.ndarray, "3"]],
-    leg: tuple[Float[np.ndarray, "3"], Float[np.ndarray, "3 3"]],
-    step: tuple[Float[np.ndarray, "3"], Float[np.ndarray, "3 3"]],
-    pose: Float[np.ndarray, "3"],
-    work: Float[np.ndarray, "6 3 3"],
-) -> None:
-    """Write a pose between nodes a and b, and to ``work`` its Jacobians and covariance."""
-    (a, b), (way, N), (d, P) = poses, leg, step
-    by_a, by_b, left, G, R, L = work[0], work[1], work[2], work[3], work[4], work[5]
-    c, s = math.cos(a[2]), math.sin(a[2])
-    dx, dy, turn = b[0] - a[0], b[1] - a[1], wrap_angle(b[2] - a[2] - way[2])
-    ahead, aside = c * dx + s * dy - way[0], c * dy - s * dx - way[1]
-    write(P, G)  # G = P Phi^T N^-1
-    for e in range(3):
-        G[e, 0] -= (way[1] - d[1]) * P[e, 2]
-        G[e, 1] += (way[0] - d[0]) * P[e, 2]
-    cholesky(N, L)
-    for e in range(3):
-        solve_with(L, G[e])
-    x = d[0] + G[0, 0] * ahead + G[0, 1] * aside + G[0, 2] * turn
-    y = d[1] + G[1, 0] * ahead + G[1, 1] * aside + G[1, 2] * turn
-    h = d[2] + G[2, 0] * ahead + G[2, 1] * aside + G[2, 2] * turn
-    x, y = c * x - s * y, s * x + c * y
-    pose[0], pose[1], pose[2] = a[0] + x, a[1] + y, wrap_angle(a[2] + h)
-    write(P, by_a)
-    multiply(G, N, L)
-    transpose(G, by_b)
-    add_product(L, by_b, by_a, -1.0)  # P - G N G^T
-    write_identity(R)
-    R[0, 0], R[0, 1], R[1, 0], R[1, 1] = c, -s, s, c
-    multiply(R, by_a, L)
-    transpose(R, by_b)
-    multiply(L, by_b, left)
-    multiply(R, G, L)
-    multiply(L, by_b, R)
-    write(R, by_b)
-    write_identity(by_a)
-    add(by_b, by_a, -1.0)
-    for e in range(3):
-        by_a[e, 2] += by_b[e, 0] * dy - by_b[e, 1] * dx
-    by_a[0, 2] -= y
-    by_a[1, 2] += x
-
-
-@no_alloc
-def _spread_between(
-    spreads: tuple[Float[np.ndarray, "3 3"], Float[np.ndarray, "3 3"], Float[np.ndarray, "3 3"]],
-    work: Float[np.ndarray, "6 3 3"],
-    covariance: Float[np.ndarray, "3 3"],
-) -> None:
-    """Write the covariance of a pose between two nodes, from theirs and their cross-covariance."""
-    (own_a, own_b, both), by_a, by_b, left = spreads, work[0], work[1], work[2]
-    turned, half, cross = work[3], work[4], work[5]
-    congruent(by_a, own_a, half, left)
-    congruent(by_b, own_b, half, left)
-    transpose(by_a, turned)
-    multiply(by_b, both, half)
-    multiply(half, turned, cross)
-    for a in range(3):
-        for b in range(3):
-            covariance[a, b] = 0.5 * (left[a, b] + left[b, a]) + (cross[a, b] + cross[b, a])

@@ -1,13 +1,12 @@
 """Array records, shared stacks and small-matrix routines of the smoother's kernels.
 
-The *separator* (`border`) holds the landmarks and parameters that all poses share. A `span` is a
-node, its first measurement and the end of its range. The matrix routines are loops with a fixed
-order of additions, so that results are reproducible.
+The *separator* (`border`) holds the landmarks and parameters that all poses share. The matrix
+routines are loops with a fixed order of additions, so that results are reproducible.
 """
 
 import math
 from dataclasses import dataclass, field
-from typing import NamedTuple, Self
+from typing import Any, NamedTuple, Self
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -238,6 +237,18 @@ def posterior(
             M[a, b] = M[b, a] = total
 
 
+Span = tuple[Whole, Whole, Whole]
+"""A node, its first measurement and the end of its range."""
+ChainState = Float[np.ndarray, " d"]
+"""A state of the chain: pose, then position and velocity of each moving caller."""
+Square = Float[np.ndarray, "d d"]
+"""A matrix by two states of the chain."""
+Border = Float[np.ndarray, " n"]
+"""The separator; its first number is unused, or 1."""
+Factor = Float[np.ndarray, "n n"]
+"""Information of the separator or its factor, a lower triangle."""
+Slopes = Float[np.ndarray, "d n"]
+"""Derivatives of a state of the chain by the separator."""
 POSE = 3
 """Size of the pose in a state of the chain."""
 CALLER = 4
@@ -326,6 +337,8 @@ class Work(NamedTuple):
 
 Arrays = tuple[np.ndarray, ...]
 """A record as a plain tuple, which kernels take without overhead."""
+PlainLegs = tuple[Any, ...]
+"""`Legs` as a plain tuple."""
 PointArrays = tuple[Float[np.ndarray, "k d"], Float[np.ndarray, " n"]]
 """Linearisation points: states of the chain, and the separator (its first number is unused)."""
 

@@ -13,25 +13,33 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Float, Int
 
-from pipistrelle.estimation.smoother.elimination import begin, eliminate, enter, leave, step_to
+from pipistrelle.estimation.smoother.elimination import (
+    Left,
+    begin,
+    border_covariance,
+    eliminate,
+    enter,
+    leave,
+    places_left,
+    solve,
+    spread_back,
+    spread_left,
+    step_to,
+    trace_back,
+)
 from pipistrelle.estimation.smoother.history import STRETCH, History, in_hindsight
 from pipistrelle.estimation.smoother.observations import nonlinearity
 from pipistrelle.estimation.smoother.records import (
     CALLER,
     POSE,
     Arrays,
+    Border,
+    ChainState,
+    Factor,
     NoiseModel,
+    Square,
     Stack,
     multiply,
-)
-from pipistrelle.estimation.smoother.solution import (
-    Left,
-    border_covariance,
-    places_left,
-    solve,
-    spread_back,
-    spread_left,
-    trace_back,
 )
 from pipistrelle.jit import optimised_once
 
@@ -89,11 +97,11 @@ class Solution:
     stretches: tuple[Stretch, ...]
     front: Arrays
     """`records.Front` of the last node."""
-    factor: Float[np.ndarray, "n n"]
-    beta: Float[np.ndarray, " n"]
-    state: Float[np.ndarray, " d"]
+    factor: Factor
+    beta: Border
+    state: ChainState
     """State of the last node: pose, then position and velocity of each moving caller."""
-    covariance: Float[np.ndarray, "d d"]
+    covariance: Square
     cost: float
     """Twice the cost at the linearisation points, if all are current."""
     places: Arrays
@@ -358,9 +366,7 @@ def eliminated(
     return sweep.solved()
 
 
-def stepped(
-    solution: Solution, history: History, noise: NoiseModel, guess: Float[np.ndarray, " d"]
-) -> Sweep:
+def stepped(solution: Solution, history: History, noise: NoiseModel, guess: ChainState) -> Sweep:
     """Return the chain extended by a node linearised at a guess, before the node's measurements."""
     at = solution.points.at.extended(1)
     at.arrays[0][history.nodes - 1] = guess
@@ -491,7 +497,7 @@ def solved_points(solution: Solution, history: History, still: float) -> tuple[P
 
 def _earliest(
     entering: Int[np.ndarray, " l"], moved: Float[np.ndarray, "l 2"],
-    among: Int[np.ndarray, " g"], still: float, first: int,
+    among: Int[np.ndarray, " g"], still: float, first: int
 ) -> int:  # fmt: skip
     """Return the entry segment of the earliest moved landmark, at most ``first``."""
     far = among[np.any(np.abs(moved[among]) > still, axis=1)]

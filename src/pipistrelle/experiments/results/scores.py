@@ -208,14 +208,14 @@ def with_association(
     Landmarks are compared with the true ones by position after the rigid motion `motion`.
     """
     away = out_of_place(landmarks, found, *truth.landmarks, motion) if truth.landmarks else ()
-    counts = map_counts(landmarks, found, away)
+    missed, false, twice = map_counts(landmarks, found, away)
     scores = replace(
         scores,
         associated_right=found.right,
         associated_found=found.found,
-        landmarks_missed=counts.missed,
-        landmarks_false=counts.false,
-        landmarks_twice=counts.twice,
+        landmarks_missed=missed,
+        landmarks_false=false,
+        landmarks_twice=twice,
     )
     if truth.landmarks is None:
         return scores

@@ -236,7 +236,8 @@ def with_moving(
     moving = np.array([*drive.moving])
     if not known:
         numbers = np.flatnonzero(np.isin(drive.callers, moving))
-        return [replace(scan, moving=numbers) if scan.direct.size else scan for scan in scans]
+        unlabelled = {"moving_callers": numbers}
+        return [replace(scan, **unlabelled) if scan.direct.size else scan for scan in scans]
     if follows:
         return [replace(scan, moving=moving) for scan in scans]
     return [rows_of(scan, ~np.isin(scan.landmark, moving)) for scan in scans]
@@ -358,8 +359,7 @@ def _steps_of(scans: Sequence[Scan], time: Float[np.ndarray, " t"]) -> list[int]
 
 def _check_known(drive: Drive, scans: Sequence[Scan]) -> None:
     """Raise if landmarks known beforehand move."""
-    labelled = (scan for scan in scans if not scan.direct.size)
-    moving = {*drive.moving, *(label for scan in labelled for label in scan.moving.tolist())}
+    moving = {*drive.moving, *(label for scan in scans for label in scan.moving.tolist())}
     if roving := sorted(moving.intersection(drive.known.landmark.tolist())):
         raise InputError(
             f"landmarks known beforehand: found {roving}, which move; expected some that stand"
@@ -377,7 +377,7 @@ def _move(session: Session[B], drive: Drive, first: int, last: int, path: Gaussi
 
 def _follow(callers: dict[int, Gaussian], scan: Scan, belief: Belief, at: tuple[int, int]) -> None:
     """Store the positions of moving callers in sight at step k."""
-    if not scan.moving.size:
+    if not (scan.moving.size or scan.moving_callers.size):
         return
     moving, (k, steps) = in_sight(completed(belief, Belief).moving()), at
     for row in range(moving.landmark.size):
