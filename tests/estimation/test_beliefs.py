@@ -50,7 +50,7 @@ class Heir(Belief):
 
 
 @pytest.mark.parametrize("kind", [Noted, Heir])
-def test_a_belief_of_an_outside_class_has_defaults_for_what_it_lacks(kind):
+def test_a_belief_of_an_outside_class_has_defaults_for_missing_methods(kind):
     belief = completed(kind(), Belief)
     assert (belief.pose(), belief.landmarks().landmark.tolist()) == (START, [5])
     assert (belief.path(), belief.tracks(), belief.cloud(), belief.labels()) == (None,) * 4
@@ -65,7 +65,7 @@ def test_a_belief_of_an_outside_class_has_defaults_for_what_it_lacks(kind):
         belief.edited((5,), ())
 
 
-def test_an_association_of_an_outside_class_has_defaults_for_what_it_lacks():
+def test_an_association_of_an_outside_class_has_defaults_for_missing_methods():
     association = completed(Noted(), Association)
     assert association.knowing("memory", no_landmarks(), ()) == "memory"
     assert [*association.tentative("memory")] == []

@@ -54,7 +54,7 @@ def test_a_peak_between_two_arrivals_is_caused_by_the_louder_one(oracles):
     assert label(oracles.label_by_cause, between, fainter) == [9]
 
 
-def test_a_peak_is_caused_by_the_arrival_in_its_beam_not_by_an_equal_one_beside_it(oracles):
+def test_a_peak_is_caused_by_the_arrival_in_its_beam(oracles):
     equal = arrivals([0.03, 0.03], [0.0, 0.5], [10.0, 10.0])
     assert label(oracles.label_by_cause, detection(0.02), equal) == [7]
     assert label(oracles.label_by_cause, detection(0.48), equal) == [9]

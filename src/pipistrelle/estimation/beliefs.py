@@ -250,7 +250,7 @@ class Completed:
 
 
 def completed(part: Any, base: type[T]) -> T:
-    """Return an object with a base class's defaults for the methods that its own class lacks."""
+    """Return an object with the defaults of a base class for methods that its class lacks."""
     return part if isinstance(part, base) else cast(T, Completed(part, base))
 
 

@@ -367,7 +367,7 @@ def _present(belief: Any, labels: Sequence[int]) -> list[int]:
 
 
 def _without(belief: B, labels: Sequence[int]) -> B:
-    """Remove those of some labels that a belief contains."""
+    """Remove landmarks from a belief by label, ignoring labels that it does not contain."""
     return _edited(belief, remove=_present(belief, labels))
 
 
