@@ -88,7 +88,7 @@ def test_where_the_paper_is_right_a_sentence_holds_by_every_yardstick(study, num
     assert [rows(study)[number][name] for name in YARDSTICKS] == [True, True, True]
 
 
-def test_a_difference_within_the_bands_fails_by_means_alone(study):
+def test_a_difference_within_the_bands_fails_by_means_but_not_by_bands(study):
     worse = changed(study, ("fastslam", "fused"), POSITION, lambda error: error - 0.12)
     row = rows(worse)[13]
     assert (row["by_means"], row["by_bands"]) == (False, True)

@@ -32,6 +32,7 @@ from pipistrelle.report.charts import Figure, answers, study_charts
 from pipistrelle.report.claims import CLAIMS, FILTERS, WITHOUT, Claim, papers_cases, tally
 from pipistrelle.report.effects import HEADLINE, OTHERWISE, Effect, effects_of, measures_of
 from pipistrelle.report.models import model_charts
+from pipistrelle.report.sentences import judge_sentences
 from pipistrelle.report.study import (
     ONLINE_POSITION,
     RULES,
@@ -133,6 +134,7 @@ def summary(result: Answered) -> dict[str, Any]:
         "effects": changes.record(result.effects, result.rule),
         "cases": tables.case_rows(selection),
         "claims": [paper.record(claim) for claim in result.claims],
+        "sentences": judge_sentences(selection) if result.papers else [],
         "exclusion_rules": dict(RULES),
         "exclusions": exclusions,
         "trials_failed": sum(row["failed"] for row in exclusions),

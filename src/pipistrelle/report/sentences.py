@@ -1,4 +1,4 @@
-r"""The 26 sentences in which the paper states its results, each judged in three ways.
+r"""The 26 sentences of the paper that state results, each judged in three ways.
 
 Bradley & Abaid state results in Secs. V-A to V-D and Appendix A. Each sentence is a list of
 comparisons: a statistic over worlds that the sentence says is above 0, or within a margin of 0.
@@ -59,7 +59,7 @@ ACTIVE, FUSED, PASSIVE = STRATEGIES
 
 
 class Comparison(NamedTuple):
-    """A statistic over worlds that a sentence says is above 0, or within a margin of 0."""
+    """A statistic over worlds, to be above 0 or within a margin of 0."""
 
     label: str
     sample: Worlds
@@ -68,9 +68,9 @@ class Comparison(NamedTuple):
     """Sum of the standard deviations over worlds of the two numbers compared; 0 if the statistic is
     no difference of two means."""
     margin: float | None = None
-    """Bound of the absolute value; None: the statistic is said to be above 0."""
+    """Bound of the absolute value; None: the statistic exceeds `least`."""
     least: float = 0.0
-    """Value that the statistic is said to exceed."""
+    """Bound from below."""
 
     def by_means(self) -> bool:
         """Return whether the mean has the stated sign or size."""
@@ -98,7 +98,7 @@ Comparisons = Callable[[Selection], Iterable[Comparison]]
 
 
 class Most(NamedTuple):
-    """Comparisons of which more than half must hold."""
+    """A part of a sentence that holds if more than half of its comparisons do."""
 
     make: Comparisons
 
@@ -238,7 +238,7 @@ def _near(score: str, *pairs: tuple[Way, Way], **beams: float) -> Comparisons:
 
 
 def _more_spread(score: str, *pairs: tuple[Way, Way]) -> Comparisons:
-    """Compare standard deviations over worlds: that of the first of each pair is larger."""
+    """Compare standard deviations over worlds: the first of each pair has the larger."""
 
     def made(selection: Selection) -> Iterator[Comparison]:
         for pair in pairs:
@@ -398,7 +398,7 @@ def _consistent_when_narrow(selection: Selection) -> Iterator[Comparison]:
 
 
 def _fused_anees_largest(selection: Selection) -> Iterator[Comparison]:
-    """Compare FastSLAM's largest ANEES: fused's is above that of active and of passive."""
+    """Compare FastSLAM's largest ANEES: fused sensing is above active and passive sensing."""
     for strategy in (ACTIVE, PASSIVE):
         pair = curves(selection, [("fastslam", FUSED), ("fastslam", strategy)])
         if pair is not None and len(pair[0]) > 1:
