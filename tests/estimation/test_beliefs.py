@@ -28,7 +28,7 @@ def test_nothing_is_placed_in_an_empty_map():
 
 
 class Noted:
-    """A belief that does not inherit from `Belief`."""
+    """A belief without a base class."""
 
     gated, innovations = 3, Innovations(4.0, 2.0)
 

@@ -53,7 +53,7 @@ class Assignment:
 class Association(ABC, Generic[M]):
     """A method of data association, which assigns each measurement of a scan to a landmark.
 
-    A class that does not inherit from it works as well (`beliefs.completed`).
+    A class need not inherit from it (`beliefs.completed`).
     """
 
     __slots__ = ()

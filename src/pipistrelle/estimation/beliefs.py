@@ -176,9 +176,9 @@ def at_steps(track: Track, steps: Int[np.ndarray, " k"]) -> Track:
 
 @dataclass(frozen=True, kw_only=True)
 class Belief(ABC):
-    """State of an estimator; immutable. All but its pose, its map and `gated` is optional.
+    """State of an estimator; immutable. Pose, map and `gated` are required, the rest is optional.
 
-    A class that does not inherit from it works as well: `completed` adds the defaults.
+    A class need not inherit from it: `completed` adds the defaults.
     """
 
     gated: int = 0
@@ -232,7 +232,7 @@ class Belief(ABC):
 
 
 def revises_path(belief: Belief) -> bool:
-    """Return whether a belief has a `Belief.path` of its estimator."""
+    """Return whether a belief has a smoothed trajectory (`Belief.path`)."""
     return getattr(type(belief), "path", Belief.path) is not Belief.path
 
 

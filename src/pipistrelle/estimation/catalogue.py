@@ -283,7 +283,7 @@ def check_distinct(names: Iterable[str], where: str = "filter") -> None:
 
 
 Options = Callable[[Config, "Motion"], dict[str, Any]]
-"""Function that returns an estimator's own arguments from the settings."""
+"""Function that returns an estimator's special arguments from the settings."""
 
 
 def _builder(name: str, where: str, options: Options) -> "Callable[[Config, Motion], Estimator]":

@@ -29,8 +29,8 @@ ACKERMANN = MOTION_MODELS.index("ackermann")
 MOVED = 3
 """Size of a relative motion; its covariance follows: xx, xy, xh, yy, yh, hh."""
 SMALLEST_STD = 1e-6
-"""Standard deviation [m, rad] added in quadrature to what would be exact: a start, a step without
-noise, particles at one place. In the smoother also the least one of a measurement."""
+"""Standard deviation [m, rad] added in quadrature to an exact start, a step without noise and the
+pose of particles; in the smoother also the least standard deviation of a measurement."""
 Pose = Float[np.ndarray, "3"]
 """x, y [m] and heading [rad]."""
 PoseCovariance = Float[np.ndarray, "3 3"]

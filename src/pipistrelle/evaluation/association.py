@@ -174,7 +174,7 @@ def out_of_place(
     true_position: Float[np.ndarray, "k 2"],
     motion: Float[np.ndarray, "3"] = STAY,
 ) -> frozenset[int]:
-    """Return the labels of initialised landmarks that, after a motion, are not near a true one."""
+    """Return the labels of initialised landmarks that are far from all true ones after a motion."""
     full, known = placed(landmarks), {*true_landmark.tolist()}
     labels, points = landmarks.landmark[full].tolist(), moved(landmarks.mean[full], motion)
     return frozenset(
@@ -207,9 +207,9 @@ def map_counts(
 ) -> tuple[int, int, int]:
     """Count missed, false and duplicate landmarks among the initialised ones of a map.
 
-    `away`: labels of landmarks near no true one, which count as false (`out_of_place`). Missed are
-    landmarks that were measured often, false also what clutter caused, and duplicate what is on the
-    map under another label.
+    `away`: labels of landmarks far from all true ones, which count as false (`out_of_place`), as do
+    landmarks caused by clutter. Missed landmarks were measured often; duplicates are on the map
+    under another label.
     """
     labels = landmarks.landmark[placed(landmarks)].tolist()
     named = [UNLABELLED if n in away else found.names.get(n, UNLABELLED) for n in labels]

@@ -312,7 +312,7 @@ def correct_by_excess_path(
 ) -> Whole:
     """Update landmark, caller and vehicle by excess path d; GATED or APPLIED.
 
-    If only one end is initialised, the hypotheses of the other are weighed and pruned.
+    If the other end is a ray, its hypotheses are weighed and pruned.
     """
     member, caller = _single(state, paths.landmark[d]), _single(state, paths.caller[d])
     joint, size, likelihood = state.joint, 3 + 2 * state.members[0], scratch.likelihood

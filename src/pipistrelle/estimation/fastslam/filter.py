@@ -324,7 +324,7 @@ def _rows(
     count: Int[np.ndarray, " n"],
     member: Float[np.ndarray, "c 6"],
 ) -> Landmarks:
-    """Return a particle's map, one row per hypothesis."""
+    """Return a particle's map, a row per hypothesis."""
     label = np.repeat(landmark, count)
     offset = np.arange(label.size) - np.repeat(np.cumsum(count) - count, count)
     rows = member[np.repeat(first[:-1], count) + offset]
