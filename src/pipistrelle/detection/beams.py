@@ -19,7 +19,7 @@ probability
 
 .. math:: P \le e^{-h} \left(1 + \sqrt{\frac{h}{\pi}} \int \sqrt{\kappa}\, d\phi \right), \qquad
           \kappa(\phi) = \left(\frac{2\pi f}{c}\right)^2 \sum_m w_m^2
-                         \left(p_m \cdot u' - \overline{p \cdot u'}\right)^2 ,
+                         \Bigl(p_m \cdot u' - \sum_n w_n^2 \, p_n \cdot u'\Bigr)^2 ,
 
 from the mean number of upcrossings of h around the circle: the factor of :math:`e^{-h}` is the
 number of independent looks. It can also not exceed the energy of all N microphones, which is

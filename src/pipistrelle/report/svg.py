@@ -33,7 +33,7 @@ def panel_svg(panel: Panel) -> Markup:
     --------
     >>> axis = Axis(label="", limits=(0.0, 1.0), ticks=())
     >>> str(panel_svg(Panel(title="<EKF>", x=axis, y=axis, series=())))[25:61]
-    'viewBox="0 0 400 280" role="img" tab'
+    'img" tabindex="0" viewBox="0 0 400 2'
     """
     _, _, top, bottom = _box(panel)
     svg = Element("svg", {"class": "panel", "role": "img", "tabindex": "0"})
