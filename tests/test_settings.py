@@ -224,7 +224,7 @@ def test_text_and_lists_in_the_environment_are_spelled_as_in_files():
         from_environment(
             {
                 "PIPISTRELLE_RAYS__WEIGHTS": "aggregated",
-                "PIPISTRELLE_RAYS__RANGED": '"heaviest"',
+                "PIPISTRELLE_RAYS__RANGED": '"moved"',
                 "PIPISTRELLE_RAYS__RANGE_BOUNDS": "[1, 15.5]",
                 "PIPISTRELLE_SEED": "11",
                 "PIPISTRELLE_DATA": "/somewhere",
@@ -232,7 +232,7 @@ def test_text_and_lists_in_the_environment_are_spelled_as_in_files():
             }
         )
     )
-    assert config.rays == RayConfig(weights="aggregated", ranged="heaviest", range_bounds=(1, 15.5))
+    assert config.rays == RayConfig(weights="aggregated", ranged="moved", range_bounds=(1, 15.5))
     assert config.seed == 11
 
 

@@ -51,7 +51,6 @@ FILTER: dict[str, dict[str, Any]] = {
     "n = 3": {"rays.power": 3.0},
     "n = 8": {"rays.power": 8.0},
     "aggregated weights": {"rays.weights": "aggregated"},
-    "heaviest member kept": {"rays.ranged": "heaviest"},
     "R: 0.05 rad": {"filter.bearing_std": 0.05},
     "R: 0.3 rad": {"filter.bearing_std": 0.3},
     "R: 0.1 m": {"filter.range_std": 0.1},

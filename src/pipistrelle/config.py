@@ -646,9 +646,9 @@ class RayConfig(Section):
     initialization of bearings too precise for such members (EKFs only)."""
     merge: Annotated[float, Field(ge=0, le=10)] = 0.0
     """Distance in standard deviations below which neighbours of a ray are merged; 0: never."""
-    ranged: Literal["anew", "heaviest", "reset", "corrected", "bearing", "others", "moved"] = "anew"
-    """Update of a ray by a range: `anew` initialises the landmark at range and bearing;
-    `estimation.rays` describes the others."""
+    ranged: Literal["anew", "bearing", "moved"] = "anew"
+    """Update of a ray by a range: `anew` initialises the landmark at range and bearing, `bearing`
+    ignores the range, `moved` moves the heaviest member to it."""
 
     @model_validator(mode="after")
     def _ordered(self) -> "RayConfig":

@@ -9,6 +9,8 @@ from pipistrelle.estimation.rays import RANGED
 from pipistrelle.experiments.studies.plan import find_plan, read_plan
 
 TABLE = Path(__file__).parents[2] / "papers/bradley_abaid/readings.csv"
+DROPPED = ("heaviest", "reset", "corrected", "others")
+"""Readings of a range that lose most worlds, which the package no longer has."""
 READ_AS = {
     ("snapshots", "maxima"): {"detection.snapshots": "maxima", "detection.peak_db": -8.0},
     ("snapshots", "run, strongest"): {"detection.snapshots": "runs", "detection.peak_db": 0.0},
@@ -20,7 +22,7 @@ READ_AS = {
     ("likelihood", "printed"): {"rays.likelihood": "printed"},
     ("weights", "marginal"): {"fastslam.weights": "marginal"},
     ("weights", "sampled"): {"fastslam.weights": "sampled"},
-    **{("ranged", name): {"rays.ranged": name} for name in RANGED},
+    **{("ranged", name): {"rays.ranged": name} for name in (*RANGED, *DROPPED)},
     **{("resampled", name): {"fastslam.resampled_rays": name} for name in ("kept", "restart")},
 }
 FACTORS = ("snapshots", "off_axis", "likelihood", "weights", "ranged", "resampled")

@@ -462,36 +462,9 @@ class SlowEkfSlam:
         heaviest = max(members, key=self.aggregated.__getitem__)
         if ranged == "anew":
             self.place_again(label, distance, bearing)
-        elif ranged == "others":
-            self.drop([heaviest])
-            left = self.members(label)
-            self.aggregated.update(zip(left, self.renormalised(left), strict=True))
-            self.measure_ray(label, bearing)
         elif ranged == "moved":
             self.move(heaviest, distance)
             self.measure_ray(label, bearing)
-        else:
-            self.drop([b for b in members if b != heaviest])
-            self.aggregated[heaviest] = 1.0
-            self.range_heaviest(label, heaviest, distance, bearing)
-
-    def range_heaviest(self, label, heaviest, distance, bearing):
-        """Set the range of the only remaining hypothesis, then update it with the bearing."""
-        known = math.nan
-        if self.rays.ranged == "corrected":
-            known = distance
-        elif self.rays.ranged == "heaviest":
-            self.move(heaviest, distance)
-        elif self.rays.ranged == "reset":
-            _, expected, _ = self.predicted(heaviest)
-            heaviest = self.place_again(label, distance, expected)
-        if not self.too_near(heaviest):
-            self.correct(heaviest, *self.innovation(heaviest, known, bearing))
-
-    def renormalised(self, members):
-        """Weights that sum to 1; equal if all have underflowed."""
-        total = sum(self.aggregated[block] for block in members)
-        return [self.aggregated[b] / total if total > 0 else 1 / len(members) for b in members]
 
     def place_again(self, label, distance, bearing):
         """Initialise a partial landmark again, at the index of its first hypothesis."""

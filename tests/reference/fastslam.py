@@ -247,7 +247,7 @@ class SlowFastSlam:
 
     def by_bearing(self, distance):
         """Return whether a ray uses only a measurement's bearing."""
-        return math.isnan(distance) or self.rays.ranged in ("bearing", "others", "moved")
+        return math.isnan(distance) or self.rays.ranged in ("bearing", "moved")
 
     def refine(self, p, members, distance, bearing):
         if self.settings.weights == "marginal":
@@ -326,21 +326,8 @@ class SlowFastSlam:
             return [self.placed(pose, distance, bearing)]
         if ranged == "bearing":
             return self.correct_ray(pose, members, bearing)
-        if ranged == "others":
-            left = [m for m in members if m is not best]
-            total = sum(m.weight for m in left)
-            left = [Member(m.mean, m.covariance, m.weight / total) for m in left]
-            return self.correct_ray(pose, left, bearing)
-        if ranged == "moved":
-            moved = [Member(at, m.covariance, m.weight) if m is best else m for m in members]
-            return self.correct_ray(pose, moved, bearing)
-        if ranged == "corrected":
-            return [self.corrected(pose, Member(best.mean, best.covariance), distance, bearing)]
-        kept = Member(at, best.covariance)
-        if ranged == "reset":
-            expected = math.atan2(offset[1], offset[0]) - pose[2]
-            kept = self.placed(pose, distance, expected)
-        return [self.corrected(pose, kept, math.nan, bearing)]
+        moved = [Member(at, m.covariance, m.weight) if m is best else m for m in members]
+        return self.correct_ray(pose, moved, bearing)
 
     def corrected(self, pose, member, distance, bearing, inflation=1.0):
         if self.too_near(pose, member):

@@ -50,14 +50,13 @@ the measured range is taken as the true range, and the bearing and correspondenc
 usual"). ``ranged`` selects the reading:
 
 - ``anew``: replace the ray by a new landmark at range and bearing;
-- ``heaviest``: keep only the heaviest hypothesis, moved to the measured range with its covariance,
-  and update it with the bearing;
-- ``reset``: as ``heaviest``, with the covariance of a new landmark there;
-- ``corrected``: keep only the heaviest, updated with range and bearing;
 - ``bearing``: ignore the range, and treat the bearing as above;
-- ``others``: to the letter, remove the heaviest, and treat the bearing as above for the others;
 - ``moved``: move the heaviest to the measured range, keep the others, and treat the bearing as
   above for all.
+
+Readings that remove members by a single range (only the heaviest stays, moved, reset or updated;
+or, to the letter, all but the heaviest) lose most worlds, as the members of a young ray have nearly
+equal weights.
 
 ``paper`` settings reproduce the paper. ``aggregated`` weights, or a power n of 3 to 8, are far more
 consistent, as wrong hypotheses no longer pull the vehicle.
@@ -90,7 +89,7 @@ SMALLEST_AGGREGATED_SHARE = 0.05
 SMALLEST_SHARE = 1e-12
 UNDERFLOW = 1e-200
 FEDERATED, AS_PRINTED, EXACT, FITTED = range(4)
-ANEW, HEAVIEST, RESET, CORRECTED, BEARING, OTHERS, MOVED = range(7)
+ANEW, BEARING, MOVED = range(3)
 RANGED = {name: k for k, name in enumerate(get_args(RayConfig.model_fields["ranged"].annotation))}
 """Codes of the values of ``rays.ranged``, in their order; a ray stays a ray from BEARING on."""
 _SHARING = {
@@ -187,16 +186,6 @@ def heaviest_member(weights: Float[np.ndarray, " h"], count: Whole) -> Whole:
         if weights[j] > weights[best]:
             best = j
     return best
-
-
-@no_alloc
-def renormalise(weights: Float[np.ndarray, " h"], count: Whole) -> None:
-    """Normalise the first weights to sum 1; equal weights if their sum has underflown."""
-    total = 0.0
-    for j in range(count):
-        total += weights[j]
-    for j in range(count):
-        weights[j] = weights[j] / total if total > 0.0 else 1.0 / count
 
 
 @no_alloc

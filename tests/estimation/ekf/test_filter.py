@@ -41,13 +41,13 @@ WEIGHTS = ("instantaneous", "aggregated")
 OPTIONS = [
     (EkfSlam, *options)
     for options in itertools.product(
-        ("fused", "passive"), WEIGHTS, ("anew", "heaviest", "bearing"), (1.0, 3.0), (1.0, 0.999)
+        ("fused", "passive"), WEIGHTS, ("anew", "moved", "bearing"), (1.0, 3.0), (1.0, 0.999)
     )
 ]
 FEW = [
     (EkfSlam, "active", "instantaneous", "anew", 1.0, 0.999),
     (EkfSlam, "fused", "instantaneous", "anew", 1.0, 1.0),
-    (EkfSlam, "fused", "aggregated", "heaviest", 3.0, 0.999),
+    (EkfSlam, "fused", "aggregated", "moved", 3.0, 0.999),
     (EkfSlam, "passive", "instantaneous", "anew", 3.0, 0.999),
     *((EkfSlam, "fused", "instantaneous", name, 2.0, 1.0) for name in RANGED if name != "anew"),
     *(

@@ -155,23 +155,6 @@ def test_a_range_replaces_a_partial_landmark():
     np.testing.assert_allclose(after.covariance, fresh.covariance, rtol=0, atol=1e-14)
 
 
-def test_a_range_moves_the_heaviest_member_if_so_configured():
-    slam = paper_filter(rays=ray_config(ranged="heaviest"))
-    *_, before = seen_along_a_line(slam, frames=2)
-    heaviest = np.argmax(np.where(before.landmark == 7, before.weight, 0))
-    offset = before.mean[3:].reshape(-1, 2)[heaviest] - before.mean[:2]
-    bearing = wrap(np.arctan2(offset[1], offset[0]) - before.mean[2])
-    after = slam.update(before, scan_of((7, 4.0, bearing)))
-    assert after.landmark.tolist() == [1, 7]
-    np.testing.assert_allclose(after.mean[:5], before.mean[:5], rtol=0, atol=1e-14)
-    moved = before.mean[:2] + 4.0 * offset / np.hypot(*offset)
-    np.testing.assert_allclose(after.mean[5:], moved, rtol=0, atol=1e-13)
-    rows = [2 * heaviest + 3, 2 * heaviest + 4]
-    spread = np.linalg.eigvalsh(before.covariance[np.ix_(rows, rows)] - after.covariance[5:, 5:])
-    assert spread[0] == pytest.approx(0, abs=1e-14)
-    assert spread[1] > 0
-
-
 @pytest.mark.parametrize("kind", KINDS)
 def test_members_that_agree_become_the_mixture_of_the_two(kind):
     """One member or several: mean and covariance of the landmark, with all else, are the same."""

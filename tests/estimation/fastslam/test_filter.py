@@ -46,7 +46,7 @@ OPTIONS = list(
     itertools.product(
         ("fused",),
         ("instantaneous", "aggregated"),
-        ("anew", "heaviest", "bearing"),
+        ("anew", "moved", "bearing"),
         ("federated", "exact"),
         (1.0, 3.0),
         (1.0,),
@@ -55,9 +55,9 @@ OPTIONS = list(
 FEW = [
     ("active", "instantaneous", "anew", "federated", 1.0, 0.999),
     ("fused", "instantaneous", "anew", "federated", 2.0, 1.0),
-    ("fused", "aggregated", "heaviest", "exact", 3.0, 0.999),
+    ("fused", "aggregated", "moved", "exact", 3.0, 0.999),
     ("passive", "instantaneous", "anew", "exact", 1.0, 0.999),
-    ("passive", "aggregated", "heaviest", "federated", 3.0, 1.0),
+    ("passive", "aggregated", "moved", "federated", 3.0, 1.0),
 ]
 
 

@@ -3,7 +3,6 @@
 from dataclasses import replace
 
 import numpy as np
-import pytest
 
 from reference.missions import START, STEP, ray_config, scan_of
 from reference.swarms import (
@@ -34,17 +33,15 @@ def test_frames_with_only_new_landmarks_leave_the_weights_equal():
     np.testing.assert_allclose(particles_of(belief).member[:, 0, :2], place, rtol=0, atol=1e-14)
 
 
-@pytest.mark.parametrize("ranged", ["anew", "heaviest"])
-def test_a_range_initialises_a_partial_landmark_without_changing_weights(ranged):
-    slam = swarm_filter(30, rays=ray_config(ranged=ranged))
+def test_a_range_initialises_a_partial_landmark_without_changing_weights():
+    slam = swarm_filter(30)
     belief = began(slam, (1, 5.0, 0.3), (2, np.nan, 1.0))
     belief, _ = slam.predict(belief, np.tile([0.75, 0.2], (4, 1)), np.full(4, STEP))
     after = slam.update(belief, scan_of((2, 3.0, 1.2)), drawing(3))
     np.testing.assert_allclose(after.log_weight, belief.log_weight, rtol=1e-14)
     np.testing.assert_array_equal(particles_of(after).count, 1)
     distance = np.hypot(*(particles_of(after).member[:, 1, :2] - after.cloud()[:, :2]).T)
-    # The bearing that follows the range moves the heaviest member along its own ellipse.
-    np.testing.assert_allclose(distance, 3.0, atol=1e-12 if ranged == "anew" else 0.3)
+    np.testing.assert_allclose(distance, 3.0, atol=1e-12)
 
 
 def test_landmark_heard_once_is_not_full():

@@ -214,7 +214,7 @@ OTHERS = {
     "prior.sensor_place_std": 0.5, "prior.time_offset_std": 0.01,
     "rays.ratio": 0.2, "rays.density": 2.0, "rays.range_bounds": [1.0, 15.0], "rays.prune": 0.3,
     "rays.power": 4.0, "rays.weights": "aggregated", "rays.likelihood": "printed",
-    "rays.spacing": "auto", "rays.ranged": "heaviest", "rays.merge": 2.0,
+    "rays.spacing": "auto", "rays.ranged": "moved", "rays.merge": 2.0,
     "fastslam.particles": 30, "fastslam.resample_below": 1.0, "fastslam.mixture": "exact",
     "fastslam.weights": "sampled", "fastslam.resampled_rays": "restart",
     "fastslam.estimate": "mixture",

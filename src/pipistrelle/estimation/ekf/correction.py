@@ -40,7 +40,6 @@ from pipistrelle.estimation.ekf.gaussian import (
     BEYOND,
     GATED,
     Covariance,
-    Joint,
     Labels,
     Mean,
     State,
@@ -69,17 +68,12 @@ from pipistrelle.estimation.measurement import (
     rows_with_bearing,
 )
 from pipistrelle.estimation.rays import (
-    ANEW,
     AS_PRINTED,
     BEARING,
-    CORRECTED,
     MOVED,
-    OTHERS,
-    RESET,
     UpdateParams,
     heaviest_member,
     log_likelihood,
-    renormalise,
     survivors,
     weigh_and_share,
 )
@@ -164,59 +158,23 @@ def _correct_ray(
 
 
 @no_alloc
-def _leave_one(
-    state: State, first: Whole, count: Whole, row: Row, params: UpdateParams, scratch: Scratch
-) -> None:
-    """Reduce a ray to a single hypothesis by its first range, as ``rays.ranged`` selects."""
-    left = 0 if params.ranged == ANEW else heaviest_member(state.weight[first:], count)
-    for j in range(count):
-        scratch.keep[j] = j == left
-    drop_members(state, first, count, scratch.keep, scratch.source)
-    state.weight[first] = 1.0
-    distance, bearing, variance = row.range, row.bearing, row.bearing_variance
-    joint, size, i = state.joint, 3 + 2 * state.members[0], 3 + 2 * first
-    if params.ranged == ANEW:
-        initialise(joint, size, i, distance, bearing, row.range_variance, variance)
-        return
-    if params.ranged == CORRECTED:
-        correct_active(joint, size, i, distance, bearing, row.range_variance, variance, np.inf)
-        return
-    if params.ranged == RESET:
-        mean = joint.mean
-        _, expected, _, _, _ = observe(mean[0], mean[1], mean[2], mean[i], mean[i + 1])
-        initialise(joint, size, i, distance, expected, row.range_variance, variance)
-    else:
-        _move_to_range(joint, i, distance)
-    correct_bearing(joint, size, i, bearing, variance, np.inf)
-
-
-@no_alloc
-def _move_to_range(joint: Joint, i: Whole, distance: float) -> None:
-    """Move the hypothesis at state index i to a range, keeping its bearing."""
-    mean = joint.mean
-    _, _, c, s, _ = observe(mean[0], mean[1], mean[2], mean[i], mean[i + 1])
-    mean[i], mean[i + 1] = mean[0] + distance * c, mean[1] + distance * s
-
-
-@no_alloc
 def _correct_ranged_ray(
     state: State, first: Whole, count: Whole, row: Row, params: UpdateParams, scratch: Scratch
 ) -> Whole:
     """Update a ray with range and bearing as ``rays.ranged`` selects; return GATED or APPLIED."""
-    if params.ranged < BEARING:
-        _leave_one(state, first, count, row, params, scratch)
-        return APPLIED
-    weight = state.weight[first:]
-    heaviest = heaviest_member(weight, count)
+    joint, distance = state.joint, row.range
     if params.ranged == MOVED:
-        _move_to_range(state.joint, 3 + 2 * (first + heaviest), row.range)
-    if params.ranged == OTHERS:
-        for j in range(count):
-            scratch.keep[j] = j != heaviest
-        drop_members(state, first, count, scratch.keep, scratch.source)
-        count -= 1
-        renormalise(weight, count)
-    return _correct_partial(state, first, count, row, params, scratch)
+        i, mean = 3 + 2 * (first + heaviest_member(state.weight[first:], count)), joint.mean
+        _, _, c, s, _ = observe(mean[0], mean[1], mean[2], mean[i], mean[i + 1])
+        mean[i], mean[i + 1] = mean[0] + distance * c, mean[1] + distance * s
+        return _correct_partial(state, first, count, row, params, scratch)
+    for j in range(count):
+        scratch.keep[j] = j == 0
+    drop_members(state, first, count, scratch.keep, scratch.source)
+    state.weight[first] = 1.0
+    size, i = 3 + 2 * state.members[0], 3 + 2 * first
+    initialise(joint, size, i, distance, row.bearing, row.range_variance, row.bearing_variance)
+    return APPLIED
 
 
 @no_alloc

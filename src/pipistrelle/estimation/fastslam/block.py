@@ -632,43 +632,6 @@ def correct_ray(
         _merge_members(rows, count, params.merge)
 
 
-@inlined
-def _heaviest(rows: Members, count: Counts, i: Whole) -> Whole:
-    """Return the index of the heaviest hypothesis in a lane, the first of equals."""
-    best = 0
-    for j in range(1, count[i]):
-        best = j if rows[j, LOG_WEIGHT + i] > rows[best, LOG_WEIGHT + i] else best
-    return best
-
-
-@no_alloc
-def keep_heaviest(rows: Members, count: Counts) -> None:
-    """Reduce each lane to its heaviest hypothesis."""
-    for i in range(LANES):
-        best = _heaviest(rows, count, i)
-        for k in range(i, MEMBER, LANES):
-            rows[0, k] = rows[best, k]
-        rows[0, LOG_WEIGHT + i], count[i] = 0.0, 1
-
-
-@no_alloc
-def drop_heaviest(rows: Members, count: Counts) -> None:
-    """Remove the heaviest hypothesis of a ray from each particle that has several."""
-    for i in range(LANES):
-        if count[i] == 1:
-            continue
-        best, total = _heaviest(rows, count, i), 0.0
-        for j in range(best, count[i] - 1):
-            for k in range(i, MEMBER, LANES):
-                rows[j, k] = rows[j + 1, k]
-        count[i] -= 1
-        second = rows[_heaviest(rows, count, i), LOG_WEIGHT + i]
-        for j in range(count[i]):
-            total += math.exp(rows[j, LOG_WEIGHT + i] - second)
-        for j in range(count[i]):
-            rows[j, LOG_WEIGHT + i] -= second + math.log(total)
-
-
 @no_alloc
 def heaviest_to_range(
     pose: Poses, rows: Members, count: Counts, distance: float, turn: Lanes
@@ -676,23 +639,13 @@ def heaviest_to_range(
     """Move the heaviest hypothesis to a range, keeping its bearing and covariance."""
     for i in range(LANES):
         if turn[i] > 0.0:
-            member = rows[_heaviest(rows, count, i)]
+            best = 0
+            for j in range(1, count[i]):
+                best = j if rows[j, LOG_WEIGHT + i] > rows[best, LOG_WEIGHT + i] else best
+            member = rows[best]
             dx, dy = member[X + i] - pose[X + i], member[Y + i] - pose[Y + i]
             scale = distance / max(math.sqrt(dx * dx + dy * dy), 1e-12)
             member[X + i], member[Y + i] = pose[X + i] + dx * scale, pose[Y + i] + dy * scale
-
-
-@no_alloc
-def reset_member(pose: Poses, member: Member, row: Row, turn: Lanes) -> None:
-    """Reset the covariance of a hypothesis as if initialised at its position."""
-    for i in range(LANES):
-        if turn[i] > 0.0:
-            dx, dy = member[X + i] - pose[X + i], member[Y + i] - pose[Y + i]
-            squared = max(dx * dx + dy * dy, NEAREST * NEAREST)
-            along, across = row.range_variance / squared, row.bearing_variance
-            member[XX + i] = along * dx * dx + across * dy * dy
-            member[XY + i] = (along - across) * dx * dy
-            member[YY + i] = along * dy * dy + across * dx * dx
 
 
 @no_alloc

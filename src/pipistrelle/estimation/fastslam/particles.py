@@ -42,17 +42,13 @@ from pipistrelle.estimation.fastslam.block import (
     active_beyond,
     bearing_beyond,
     correct_by_active,
-    correct_by_bearing,
     correct_ray,
-    drop_heaviest,
     heaviest_to_range,
     initialise_member,
-    keep_heaviest,
     most_members,
     part_lanes,
     refine_by_active,
     refine_by_ray,
-    reset_member,
     sample_pose,
     scratch_for,
     squared_innovation,
@@ -72,7 +68,7 @@ from pipistrelle.estimation.motion import (
     motion_increment,
     relative_noise,
 )
-from pipistrelle.estimation.rays import ANEW, BEARING, CORRECTED, MOVED, OTHERS, RESET, UpdateParams
+from pipistrelle.estimation.rays import ANEW, MOVED, UpdateParams
 from pipistrelle.jit import Whole, kernel, no_alloc, no_alloc_inlined
 
 
@@ -158,28 +154,17 @@ def _correct_by_range(
     pose: Poses, rows: Members, count: Counts, row: Row, params: UpdateParams, scratch: Scratch
 ) -> None:
     """Update a landmark by range and bearing, a ray as ``rays.ranged`` selects, in place."""
-    ranged = params.ranged
-    if ranged == CORRECTED:
-        keep_heaviest(rows, count)
     part_lanes(count, scratch)
     correct_by_active(pose, rows[0], row, count)
     if most_members(count) == 1:
         return
-    if ranged == ANEW:
+    if params.ranged == ANEW:
         initialise_member(pose, rows[0], row, 0.0, count)
         count[:] = 1
-    elif ranged < BEARING:
-        keep_heaviest(rows, count)
+        return
+    if params.ranged == MOVED:
         heaviest_to_range(pose, rows, count, row.range, scratch.ray)
-        if ranged == RESET:
-            reset_member(pose, rows[0], row, scratch.ray)
-        correct_by_bearing(pose, rows[0], row, scratch.ray)
-    else:
-        if ranged == MOVED:
-            heaviest_to_range(pose, rows, count, row.range, scratch.ray)
-        elif ranged == OTHERS:
-            drop_heaviest(rows, count)
-        correct_ray(pose, rows, count, row, params, scratch.ray, scratch)
+    correct_ray(pose, rows, count, row, params, scratch.ray, scratch)
 
 
 @no_alloc
@@ -202,7 +187,7 @@ def _refine(
             continue
         if most_members(count) > 1:
             part_lanes(count, scratch)
-            if params.ranged >= BEARING:
+            if params.ranged != ANEW:
                 refine_by_ray(pose, rows, count, row, params, scratch.ray, scratch, gained)
             else:
                 weigh_by_active(pose, rows, row, count, scratch.ray, scratch, gained)
@@ -232,9 +217,9 @@ def _weigh_at_sample(
             weigh_by_bearing(pose, rows, count, row, whole, scratch, gained)
             continue
         part_lanes(count, scratch)
-        by_range = scratch.alone if params.ranged >= BEARING else scratch.whole
+        by_range = scratch.alone if params.ranged != ANEW else scratch.whole
         weigh_by_active(pose, rows, row, count, by_range, scratch, gained)
-        if params.ranged >= BEARING and most_members(count) > 1:
+        if params.ranged != ANEW and most_members(count) > 1:
             weigh_by_bearing(pose, rows, count, row, scratch.ray, scratch, gained)
 
 
