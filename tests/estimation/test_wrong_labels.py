@@ -36,7 +36,7 @@ def farthest(name, robust, share, seed):
     return np.hypot(*(np.array(found) - mission.path[1:, :2]).T)[75:].max()
 
 
-@pytest.mark.parametrize("name", ["iekf", "smoother"])
+@pytest.mark.parametrize("name", ["iekf", pytest.param("smoother", marks=pytest.mark.slow)])
 def test_hubers_loss_limits_the_error_from_wrong_labels(name):
     """Of four drives the median is 0.7 m by the invariant EKF, 1.2 m by the smoother; 12 m."""
     robust, trusting = (

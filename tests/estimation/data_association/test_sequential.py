@@ -189,11 +189,19 @@ def test_a_scan_without_rows_is_accepted():
     assert session.labels[0].size == 0
 
 
-@pytest.mark.parametrize(("name", "missed"), [("ekf", 8), ("fastslam", 16)])
-def test_a_filter_with_constant_noise_finds_its_caller_by_measured_noise(name, missed):
+@pytest.mark.parametrize(
+    ("name", "steps", "missed"),
+    [
+        ("ekf", 200, 12),
+        pytest.param("ekf", 480, 8, marks=pytest.mark.slow),
+        pytest.param("fastslam", 480, 16, marks=pytest.mark.slow),
+    ],
+)
+def test_a_filter_with_constant_noise_finds_its_caller_by_measured_noise(name, steps, missed):
     """Of 20 rows of a frame 0.15 rad and 0.4 m say little, and an association has no use for it."""
-    settings = BEST | {"scenario": {"steps": 480}, "seed": 7, "association": {"method": "marginal"}}
-    config = Config.model_validate(settings | {"filter": {"noise": "constant", "robust": "huber"}})
+    settings = BEST | {"scenario": {"steps": steps}, "seed": 7}
+    noise = {"filter": {"noise": "constant", "robust": "huber"}}
+    config = Config.model_validate(settings | noise | {"association": {"method": "marginal"}})
     (trial,) = run_mission(config, ["fused"], [name]).trials
     assert len({label for scan in trial.scans for label in scan.callers.tolist()}) == 2
     assert trial.scores.associated_right > 0.95

@@ -83,12 +83,13 @@ def test_the_closed_forms_give_back_the_ranges_that_made_the_excess_path(vehicle
 # Against the references
 
 
-ONE_OR_THREE = [pytest.param((1,), marks=pytest.mark.slow), (1, 2, 3)]
+LENGTHS = [
+    ((1, 2, 3), 24),
+    *(pytest.param(callers, 60, marks=pytest.mark.slow) for callers in ((1,), (1, 2, 3))),
+]
 
 
-def check_reference(
-    kind, reference, strategy, *, callers=(1,), frames=60, gate=1.0, robust=False, **rays
-):
+def check_reference(kind, reference, strategy, callers, frames, *, gate=1.0, robust=False, **rays):
     mission = paper_mission(strategy, frames=frames, range_std=0.1, bearing_std=0.05)
     mission = timed(mission, callers, np.random.default_rng(5), **SOME)
     known = {"range_std": 0.2, "bearing_std": 0.15}
@@ -111,16 +112,20 @@ def check_reference(
 
 @pytest.mark.parametrize(("kind", "reference"), PAIRS)
 @pytest.mark.parametrize("strategy", ["fused", "passive"])
-@pytest.mark.parametrize("callers", ONE_OR_THREE)
-def test_a_run_with_excess_paths_equals_the_slow_reference(kind, reference, strategy, callers):
-    check_reference(kind, reference, strategy, callers=callers)
+@pytest.mark.parametrize(("callers", "frames"), LENGTHS)
+def test_a_run_with_excess_paths_equals_the_slow_reference(
+    kind, reference, strategy, callers, frames
+):
+    check_reference(kind, reference, strategy, callers, frames)
 
 
 @pytest.mark.parametrize(("kind", "reference"), PAIRS)
-@pytest.mark.parametrize("callers", ONE_OR_THREE)
-def test_a_robust_gated_run_with_excess_paths_equals_the_slow_reference(kind, reference, callers):
-    known = {"callers": callers, "robust": True, "weights": "aggregated"}
-    check_reference(kind, reference, "fused", gate=0.99, **known)
+@pytest.mark.parametrize(("callers", "frames"), LENGTHS)
+def test_a_robust_gated_run_with_excess_paths_equals_the_slow_reference(
+    kind, reference, callers, frames
+):
+    known = {"gate": 0.99, "robust": True, "weights": "aggregated"}
+    check_reference(kind, reference, "fused", callers, frames, **known)
 
 
 # What it is for

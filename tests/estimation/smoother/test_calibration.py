@@ -85,7 +85,7 @@ def mission_of(strategy, seed=4, frames=30, callers=(13, 45), std=1.0, controls=
 )
 def test_the_optimum_matches_dense_normal_equations(strategy, names):
     slam = smoother(*names)
-    *_, (belief, _) = followed(slam, mission_of(strategy, frames=10))
+    *_, (belief, _) = followed(slam, mission_of(strategy, frames=8))
     history = in_hindsight(belief.history)
     ours = converged(belief.solution, belief.history, belief.noise)
     for _ in range(30):

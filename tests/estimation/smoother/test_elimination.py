@@ -65,14 +65,14 @@ def assert_gtsam_agrees(belief, within=1e-6):
 @pytest.mark.parametrize("strategy", SENSING)
 @pytest.mark.parametrize("robust", [False, True])
 def test_the_optimum_matches_a_general_solver(strategy, robust):
-    assert_gtsam_agrees(last_belief(strategy, 5, frames=120 if robust else 60, robust=robust))
+    assert_gtsam_agrees(last_belief(strategy, 5, frames=60 if robust else 30, robust=robust))
 
 
 @pytest.mark.parametrize("strategy", SENSING)
 @pytest.mark.parametrize("callers", [(), (13, 45)], ids=["without timing", "with timing"])
 def test_the_optimum_matches_dense_normal_equations(strategy, callers):
     """A step that no longer lowers the cost by what can be told is not taken: landmarks show it."""
-    belief = last_belief(strategy, 4, frames=20, callers=callers)
+    belief = last_belief(strategy, 4, frames=12, callers=callers)
     ours = settled(belief)
     poses, places, _, cost = dense_smoothing.solved(belief)
     off = poses_of(ours) - poses
@@ -87,7 +87,7 @@ def test_the_optimum_matches_dense_normal_equations(strategy, callers):
 
 @pytest.mark.parametrize("strategy", ["passive", "fused"])
 def test_the_optimum_with_excess_paths_matches_a_general_solver(strategy):
-    assert_gtsam_agrees(last_belief(strategy, 4, frames=30, callers=(13, 45)))
+    assert_gtsam_agrees(last_belief(strategy, 4, frames=20, callers=(13, 45)))
 
 
 def test_the_optimum_with_a_moving_caller_matches_a_general_solver():

@@ -32,9 +32,9 @@ def solved(belief, drive):
 
 
 def test_a_log_of_precise_bearings_is_mapped_to_centimetres():
-    """Aligned RMSE of seeds 0 to 3: smoothed 0.03 to 0.05 m, as believed online 0.04 to 0.07 m."""
+    """Aligned RMSE of seeds 0 to 2: smoothed 0.03 to 0.05 m, as believed online 0.04 to 0.07 m."""
     errors = []
-    for seed in range(4):
+    for seed in range(3):
         drive, track, belief = mapped(seed)
         errors.append([aligned(track.pose, drive), aligned(track.online, drive)])
         best, other = solved(belief, drive)
