@@ -84,14 +84,16 @@ def foreign(
     sound = noise * np.random.default_rng(seed).standard_normal((time.size, 16))
     centre = np.hypot(*place)
     for begin in calls:
-        sound[:, :] += leak * _pulse(time - begin / rate, frequency, duration)[:, None]
-        for number, x, y, face in rows:
+        here, pulse = _within(time, begin / rate, duration, _pulse, frequency)
+        sound[here] += leak * pulse[:, None]
+        for number, x, y, face in rows if amplitude else ():
             turn = (face - 1) * np.pi / 2
             if faces and np.cos(turn) * place[0] + np.sin(turn) * place[1] < 0.0:
                 continue  # behind the face
             ahead = (x * place[0] + y * place[1]) / centre
             late = begin / rate + (2.0 * centre - ahead) / 340.0
-            sound[:, number - 1] += amplitude * _pulse(time - late, frequency, duration)
+            here, pulse = _within(time, late, duration, _pulse, frequency)
+            sound[here, number - 1] += amplitude * pulse
     sound *= np.ones(16) if gain is None else gain
     soundfile.write(folder / "tape.wav", sound.astype(np.float32), rate, subtype="FLOAT")
     lines = [f"{channel},{float(x)!r},{float(y)!r},{face}" for channel, x, y, face in rows]
@@ -116,7 +118,13 @@ def write_beside(folder, frequency, duration, speed, array, calls, *, until):
     (folder / "odometry.csv").write_text(f"time,velocity,angular_rate\n{rest}")
 
 
-def _pulse(time, frequency, duration):
+def _within(time, begin, duration, call, *more):
+    """Return the samples about a call that begins at a time [s], and the call in them."""
+    first, last = np.searchsorted(time, [begin - 1e-4, begin + duration + 1e-4])
+    return slice(first, last), call(time[first:last] - begin, duration, *more)
+
+
+def _pulse(time, duration, frequency):
     """Return a tone burst at times since its start [s]."""
     inside = (time >= 0.0) & (time < duration)
     return np.where(inside, np.cos(2.0 * np.pi * frequency * time), 0.0)
@@ -137,12 +145,13 @@ def swept(folder, late, *, deaf=3e-3, faint=10e-3, period=0.05, rate=96_000, lou
     time = np.arange(begin[-1] + step) / rate
     sound = 1e-3 * np.random.default_rng(seed).standard_normal((time.size, 8))
     for first, delay in zip(begin, late, strict=True):
-        sound += 0.5 * _swept(time - first / rate, duration)[:, None]
+        here, call = _within(time, first / rate, duration, _swept)
+        sound[here] += 0.5 * call[:, None]
         for level, after, toward in ((loud, delay, place[:, 0]), (0.02, faint, place[:, 1])):
             for m in range(8):
-                sound[:, m] += level * _swept(
-                    time - first / rate - after + toward[m] / 340, duration
-                )
+                begun = first / rate + after - toward[m] / 340
+                here, call = _within(time, begun, duration, _swept)
+                sound[here, m] += level * call
     folder.mkdir(exist_ok=True)
     soundfile.write(folder / "tape.wav", sound.astype(np.float32), rate, subtype="FLOAT")
     rows = [f"{m + 1},{x!r},{y!r}" for m, (x, y) in enumerate(place.tolist())]

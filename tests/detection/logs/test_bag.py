@@ -94,7 +94,7 @@ def test_a_log_written_as_a_bag_is_solved_as_the_log_is(tmp_path, kind, name):
 
 
 @pytest.mark.parametrize(
-    "seconds", [pytest.param(20, id="short"), pytest.param(187.5, marks=pytest.mark.slow)]
+    "seconds", [pytest.param(8, id="short"), pytest.param(187.5, marks=pytest.mark.slow)]
 )
 def test_a_bag_of_the_papers_mission_is_solved_as_its_log_is(tmp_path, seconds):
     line = ["run", "--settings", "paper", "--strategy", "active", "--quiet", "-o"]
@@ -716,14 +716,14 @@ def test_compressed_parts_that_unpack_to_too_much_are_refused(tmp_path, monkeypa
 
 
 @pytest.mark.parametrize("form", ["zstd", "lz4"])
-def test_a_chunk_of_a_few_bytes_that_unpacks_to_gigabytes_takes_little_memory(form):
+def test_a_small_chunk_that_unpacks_beyond_the_limit_is_refused(form):
     from importlib import import_module
 
     from rosbags.rosbag2 import reader
     from rosbags.rosbag2.storage_mcap import DECOMPRESSORS
 
     pack = reader.zstd if form == "zstd" else import_module("lz4.frame")
-    bomb, sound = pack.compress(bytes(2**30)), pack.compress(b"sound")
+    bomb, sound = pack.compress(bytes(2**28)), pack.compress(b"sound")
     with bounded_unpacking():
         unpack = DECOMPRESSORS[form]
         with pytest.raises(ValueError, match="unpack to more than 128000000"):

@@ -721,7 +721,7 @@ def drives(draw):
 
 
 @given(log=drives())
-@settings(max_examples=50, deadline=None)
+@settings(max_examples=20, deadline=None)
 def test_any_log_survives_being_written(tmp_path_factory, log):
     folder = tmp_path_factory.mktemp("logs") / log.name
     write_log(folder, log)
