@@ -3,12 +3,14 @@
 from dataclasses import dataclass, replace
 
 import numpy as np
+from hypothesis import strategies as st
 
 from pipistrelle.config import RayConfig
 from pipistrelle.detection.scans import Scan, make_scan, with_columns
 from pipistrelle.estimation.beliefs import Gaussian, Landmarks
 from pipistrelle.estimation.ekf.filter import EkfSlam, InvariantEkfSlam
 from pipistrelle.estimation.motion import Motion, motion_step
+from pipistrelle.estimation.rays import RANGED
 from pipistrelle.geometry import range_and_bearing, wrap
 
 STEP = 0.125
@@ -18,6 +20,10 @@ START = Gaussian(
     mean=np.array([0.0, -7.408, 0.0]), covariance=np.diag([0.05**2, 0.05**2, 0.0436**2])
 )
 CIRCLE = (0.75, 0.027)
+STEADY = Motion(model="bicycle", control_std=(0.05, 0.005), wheelbase=0.2)
+SURE = Gaussian(mean=START.mean, covariance=np.diag([0.02**2, 0.02**2, 0.01**2]))
+NOISE = {"range_std": 0.05, "bearing_std": 0.01}
+"""Motion, start and noise that are small enough for a consistent linearised filter."""
 SENSING = {
     "active": {"beamwidth": np.pi},
     "fused": {"beamwidth": np.radians(33), "hearing": 18.0},
@@ -132,6 +138,20 @@ def ray_config(**changes):
     return RayConfig(**({"prune": 1e-3, "power": 1.0} | changes))
 
 
+ANY_RAYS = st.builds(
+    RayConfig,
+    ratio=st.floats(0.1, 0.5),
+    density=st.floats(1.5, 4),
+    range_bounds=st.tuples(st.floats(0.2, 2), st.floats(3, 40)),
+    prune=st.floats(0, 0.3),
+    power=st.floats(0.5, 8),
+    weights=st.sampled_from(["instantaneous", "aggregated"]),
+    ranged=st.sampled_from([*RANGED]),
+    likelihood=st.sampled_from(["normal", "printed"]),
+    merge=st.sampled_from([0.0, 0.5, 2.0]),
+)
+
+
 def assuming(kind):
     """Derive a filter class that assumes the paper's noise for all scans."""
 
@@ -161,6 +181,20 @@ def paper_mission(strategy, frames=375, seed=3, **changes):
     field = scattered(rng, 50)
     known = SENSING[strategy] | changes
     return draw_mission(rng, BICYCLE, START, field, steady(CIRCLE, frames), **known)
+
+
+def active_mission(run):
+    """Draw ten seconds of active sensing with `NOISE`; return the random stream and mission."""
+    rng = np.random.default_rng([11, run])
+    field, drive = scattered(rng, 10, radius=12.0), steady(CIRCLE, 20)
+    return rng, draw_mission(rng, STEADY, SURE, field, drive, beamwidth=7.0, reach=40.0, **NOISE)
+
+
+def nees_of(error, covariance):
+    """Return the normalised squared error of a pose, or of a pose and positions."""
+    error = np.array(error)
+    error[2] = wrap(error[2])
+    return error @ np.linalg.solve(covariance, error)
 
 
 def followed(slam, mission, start=START):

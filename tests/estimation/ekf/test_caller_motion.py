@@ -18,6 +18,8 @@ from reference.missions import (
     BICYCLE,
     CIRCLE,
     START,
+    STEADY,
+    SURE,
     draw_mission,
     followed,
     paper_filter,
@@ -147,10 +149,6 @@ def test_the_invariant_filter_commutes_with_turning_and_shifting_the_mission():
 # How sure it is
 
 
-STEADY = Motion(model="bicycle", control_std=(0.05, 0.005), wheelbase=0.2)
-
-
-SURE = Gaussian(mean=START.mean, covariance=np.diag([0.02, 0.02, 0.01]) ** 2)
 NOISE, WALK_STD = {"range_std": 0.05, "bearing_std": 0.02}, 0.3
 
 

@@ -9,7 +9,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.stats import chi2
 
-from pipistrelle.config import RayConfig
 from pipistrelle.estimation.beliefs import Gaussian
 from pipistrelle.estimation.ekf.filter import EkfSlam, InvariantEkfSlam
 from pipistrelle.estimation.motion import Motion
@@ -18,15 +17,21 @@ from pipistrelle.geometry import range_and_bearing, wrap
 from reference.ekf_slam import SlowEkfSlam
 from reference.invariant_ekf import SlowInvariantEkfSlam
 from reference.missions import (
+    ANY_RAYS,
     BICYCLE,
     CIRCLE,
     KINDS,
+    NOISE,
     SENSING,
     START,
+    STEADY,
     STEP,
     STEPS_PER_FRAME,
+    SURE,
+    active_mission,
     draw_mission,
     followed,
+    nees_of,
     paper_filter,
     paper_mission,
     ray_config,
@@ -129,20 +134,6 @@ def test_whole_run_of_the_invariant_filter_equals_the_slow_reference(strategy):
     assert np.unique(belief.landmark).size > 25
 
 
-rays = st.builds(
-    RayConfig,
-    ratio=st.floats(0.1, 0.5),
-    density=st.floats(1.5, 4),
-    range_bounds=st.tuples(st.floats(0.2, 2), st.floats(3, 40)),
-    prune=st.floats(0, 0.3),
-    power=st.floats(0.5, 8),
-    weights=st.sampled_from(["instantaneous", "aggregated"]),
-    ranged=st.sampled_from([*RANGED]),
-    likelihood=st.sampled_from(["normal", "printed"]),
-    merge=st.sampled_from([0.0, 0.5, 2.0]),
-)
-
-
 @pytest.mark.parametrize("weights", ["instantaneous", "aggregated"])
 def test_rays_weighed_by_the_printed_likelihood_equal_the_slow_reference(weights):
     rays = ray_config(weights=weights, power=2.0, likelihood="printed")
@@ -150,7 +141,7 @@ def test_rays_weighed_by_the_printed_likelihood_equal_the_slow_reference(weights
 
 
 @settings(max_examples=10)
-@given(rays, st.integers(0, 2**32), st.sampled_from([0.9, 1.0]))
+@given(ANY_RAYS, st.integers(0, 2**32), st.sampled_from([0.9, 1.0]))
 def test_short_runs_equal_the_slow_reference_with_any_ray(rays, seed, gate):
     rng = np.random.default_rng(seed)
     field, drive = scattered(rng, 8, radius=10.0), steady(CIRCLE, 12)
@@ -283,53 +274,23 @@ def test_standing_vehicle_divides_the_measurement_noise_by_the_number_of_scans(s
 # Statistics
 
 
-STEADY = Motion(model="bicycle", control_std=(0.05, 0.005), wheelbase=0.2)
-SURE = Gaussian(mean=START.mean, covariance=np.diag([0.02**2, 0.02**2, 0.01**2]))
-NOISE = {"range_std": 0.05, "bearing_std": 0.01}
-
-
-@pytest.fixture(scope="module")
-def active_missions():
-    """A hundred drives of ten seconds by active sensing, of the noise `NOISE`."""
-    missions = []
-    for run in range(100):
-        rng = np.random.default_rng([11, run])
-        field, drive = scattered(rng, 10, radius=12.0), steady(CIRCLE, 20)
-        beam = {"beamwidth": 7.0, "reach": 40.0}
-        missions.append(draw_mission(rng, STEADY, SURE, field, drive, **beam, **NOISE))
-    return missions
-
-
-def final_nees(missions, assumed):
-    """NEES of the pose and of the whole state at the end of each mission, (runs, 2)."""
-    slam = paper_filter(motion=STEADY, **{name: assumed * std for name, std in NOISE.items()})
-    values = []
-    for mission in missions:
-        *_, (belief, _) = followed(slam, mission, SURE)
-        truth = np.concatenate([mission.path[-1], mission.landmarks[belief.landmark - 1].ravel()])
-        error = belief.mean - truth
-        error[2] = wrap(error[2])
-        values.append(
-            [
-                part @ np.linalg.solve(belief.covariance[: part.size, : part.size], part)
-                for part in (error[:3], error)
-            ]
-        )
-    return np.array(values)
-
-
 def within_chi_square_bounds(nees, freedom, confidence=0.99):
     tails = (1 - confidence) / 2, (1 + confidence) / 2
     low, high = chi2.ppf(tails, freedom * nees.size) / nees.size
     return low < nees.mean() < high
 
 
-def test_filter_is_consistent_with_the_noise_it_assumes_and_not_with_a_quarter_of_it(
-    active_missions,
-):
-    nees = final_nees(active_missions, assumed=1.0)
-    assert within_chi_square_bounds(nees[:, 0], 3)
-    assert within_chi_square_bounds(nees[:, 1], 23)
-    overconfident = final_nees(active_missions, assumed=0.5)
-    assert not within_chi_square_bounds(overconfident[:, 0], 3)
-    assert not within_chi_square_bounds(overconfident[:, 1], 23)
+def test_filter_is_consistent_with_the_noise_it_assumes_and_not_with_a_quarter_of_it():
+    """NEES of the pose and of the whole state after a hundred drives of ten seconds."""
+    missions = [active_mission(run)[1] for run in range(100)]
+    for assumed, consistent in ((1.0, True), (0.5, False)):
+        slam = paper_filter(motion=STEADY, **{name: assumed * std for name, std in NOISE.items()})
+        pose, whole = [], []
+        for mission in missions:
+            *_, (belief, _) = followed(slam, mission, SURE)
+            places = mission.landmarks[belief.landmark - 1].ravel()
+            error = belief.mean - np.concatenate([mission.path[-1], places])
+            pose.append(nees_of(error[:3], belief.covariance[:3, :3]))
+            whole.append(nees_of(error, belief.covariance))
+        assert within_chi_square_bounds(np.array(pose), 3) == consistent
+        assert within_chi_square_bounds(np.array(whole), 23) == consistent

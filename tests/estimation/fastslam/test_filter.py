@@ -9,12 +9,12 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from pipistrelle.config import RayConfig
 from pipistrelle.detection.scans import with_columns
 from pipistrelle.estimation.beliefs import Gaussian
 from pipistrelle.estimation.motion import Motion
 from pipistrelle.estimation.rays import RANGED
 from reference.missions import (
+    ANY_RAYS,
     CIRCLE,
     START,
     STEP,
@@ -185,23 +185,9 @@ def test_every_weight_with_every_likelihood_equals_the_slow_reference(
     assert_equal_to_reference(slam, small_mission("fused", frames=frames))
 
 
-rays = st.builds(
-    RayConfig,
-    ratio=st.floats(0.1, 0.5),
-    density=st.floats(1.5, 4),
-    range_bounds=st.tuples(st.floats(0.2, 2), st.floats(3, 40)),
-    prune=st.floats(0, 0.3),
-    power=st.floats(0.5, 8),
-    weights=st.sampled_from(["instantaneous", "aggregated"]),
-    ranged=st.sampled_from([*RANGED]),
-    likelihood=st.sampled_from(["normal", "printed"]),
-    merge=st.sampled_from([0.0, 0.5, 2.0]),
-)
-
-
 @settings(max_examples=8)
 @given(
-    rays,
+    ANY_RAYS,
     st.integers(0, 2**32),
     st.sampled_from([0.9, 1.0]),
     st.sampled_from(["federated", "exact"]),

@@ -15,13 +15,15 @@ from pipistrelle.estimation.beliefs import Gaussian
 from pipistrelle.estimation.fastslam.filter import SMALLEST_STD, FastSlam
 from pipistrelle.estimation.fastslam.particles import effective_particles, normalised
 from pipistrelle.estimation.motion import Motion
-from pipistrelle.geometry import wrap
 from reference.missions import (
-    CIRCLE,
-    START,
+    NOISE,
+    STEADY,
     STEP,
     STEPS_PER_FRAME,
+    SURE,
+    active_mission,
     draw_mission,
+    nees_of,
     paper_filter,
     scan_of,
     scattered,
@@ -234,23 +236,13 @@ def test_weight_at_the_sample_without_the_proposal_is_not_right():
 
 def final_nees(assumed, particles, runs=100):
     """Mean NEES of the pose after ten seconds of active sensing."""
-    motion = Motion(model="bicycle", control_std=(0.05, 0.005), wheelbase=0.2)
-    start = Gaussian(mean=START.mean, covariance=np.diag([0.02**2, 0.02**2, 0.01**2]))
-    true = {"range_std": 0.05, "bearing_std": 0.01}
-    slam = swarm_filter(
-        particles, motion=motion, **{name: assumed * std for name, std in true.items()}
-    )
-    values = []
+    assumed_noise = {name: assumed * std for name, std in NOISE.items()}
+    slam, values = swarm_filter(particles, motion=STEADY, **assumed_noise), []
     for run in range(runs):
-        rng = np.random.default_rng([11, run])
-        mission = draw_mission(
-            rng, motion, start, scattered(rng, 10, radius=12.0), steady(CIRCLE, 20),
-            beamwidth=7.0, reach=40.0, **true,
-        )  # fmt: skip
-        *_, (belief, _) = followed(slam, mission, rng, start)
-        error = belief.pose().mean - mission.path[-1]
-        error[2] = wrap(error[2])
-        values.append(error @ np.linalg.solve(belief.pose().covariance, error))
+        rng, mission = active_mission(run)
+        *_, (belief, _) = followed(slam, mission, rng, SURE)
+        pose = belief.pose()
+        values.append(nees_of(pose.mean - mission.path[-1], pose.covariance))
     return np.mean(values)
 
 
