@@ -5,6 +5,7 @@ import numpy as np
 from pipistrelle.detection.scans import make_scan, with_columns
 from pipistrelle.estimation.beliefs import Gaussian
 from pipistrelle.estimation.motion import Motion, motion_step
+from pipistrelle.evaluation.accuracy import alignment, moved, position_error, rmse
 from pipistrelle.experiments.drives import Drive, Truth
 from pipistrelle.geometry import range_and_bearing, wrap
 
@@ -43,6 +44,11 @@ def turn_and_drive(seed, looks=300, landmarks=60, bearing_std=0.003, gross=0.0):
         truth=Truth(time=time, path=np.array(path), landmarks=true),
     )
     return drive, [with_gross_errors(rng, scan, gross) for scan in scans] if gross else scans
+
+
+def aligned_rmse(points, true):
+    """Return the RMSE of positions after their best rigid motion [m]."""
+    return rmse(position_error(moved(points, alignment(points, true)), true))
 
 
 def with_gross_errors(rng, scan, share):

@@ -117,7 +117,7 @@ CASES = {
 
 
 @pytest.mark.parametrize(
-    "case", [pytest.param(c, marks=() if c in ("sweep", "file") else SLOW) for c in CASES]
+    "case", [pytest.param(case, marks=() if case == "file" else SLOW) for case in CASES]
 )
 def test_detections_of_a_recorded_call_equal_the_runs(tmp_path, monkeypatch, case):
     monkeypatch.chdir(tmp_path)
@@ -167,7 +167,7 @@ def test_the_log_of_a_recording_holds_its_detections(own, tmp_path):
 
 @pytest.mark.parametrize(
     ("settings", "limit"),
-    [pytest.param({}, 0.01, id="tone"), pytest.param(SWEEP, 0.03, id="sweep", marks=SLOW)],
+    [pytest.param({}, 0.01, id="tone", marks=SLOW), pytest.param(SWEEP, 0.03, id="sweep")],
 )
 def test_slam_on_a_recording_repeats_the_run(tmp_path, settings, limit):
     record(tmp_path / "tape", *UNLABELLED, "--filter.noise", "measured", *words(settings))
@@ -297,11 +297,11 @@ def test_leaks_are_the_loudest_around_as_if_each_were_compared_with_all():
         assert _loudest_around(sample, level, apart).tolist() == expected
 
 
-def test_leaks_of_hours_of_a_loud_tone_are_found_in_seconds():
-    sample = np.arange(400_000) * 700.0
+def test_leaks_of_a_long_loud_tone_are_found_in_seconds():
+    sample = np.arange(100_000) * 700.0
     begin = time.perf_counter()
     assert _loudest_around(sample, np.ones(sample.size), 700).sum() == 1
-    assert time.perf_counter() - begin < 60.0, "each with all took hours"
+    assert time.perf_counter() - begin < 15.0, "each with all takes many minutes"
 
 
 def test_hear_refuses_more_calls_of_a_period_than_memory_holds(tmp_path):

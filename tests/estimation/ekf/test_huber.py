@@ -8,9 +8,9 @@ import pytest
 from pipistrelle.config import RayConfig
 from pipistrelle.estimation.beliefs import Gaussian
 from pipistrelle.estimation.ekf.filter import EkfSlam, InvariantEkfSlam
-from pipistrelle.evaluation.accuracy import alignment, moved, position_error, rmse
+from pipistrelle.evaluation.accuracy import position_error, rmse
 from pipistrelle.experiments.runs.trial import run_filter
-from reference.drives import turn_and_drive
+from reference.drives import aligned_rmse, turn_and_drive
 from reference.ekf_slam import SlowEkfSlam
 from reference.invariant_ekf import SlowInvariantEkfSlam
 from reference.missions import (
@@ -228,8 +228,7 @@ def aligned_error(kind, robust, seed, gross):
     drive, scans = turn_and_drive(seed, gross=gross)
     rays = RayConfig(spacing="auto", range_bounds=(0.2, 8.0))
     track = run_filter(kind(motion=drive.motion, rays=rays, robust=robust), drive, scans, None)
-    path, true = track.pose.mean[:, :2], drive.truth.path[:, :2]
-    return rmse(position_error(moved(path, alignment(path, true)), true))
+    return aligned_rmse(track.pose.mean[:, :2], drive.truth.path[:, :2])
 
 
 @pytest.mark.parametrize("drives", [5, pytest.param(30, marks=pytest.mark.slow)])

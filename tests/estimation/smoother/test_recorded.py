@@ -5,9 +5,8 @@ import pytest
 
 from pipistrelle.config import RayConfig
 from pipistrelle.estimation.smoother.filter import Smoother
-from pipistrelle.evaluation.accuracy import alignment, moved, position_error, rmse
 from pipistrelle.experiments.runs.trial import run_filter
-from reference.drives import turn_and_drive
+from reference.drives import aligned_rmse, turn_and_drive
 from reference.optimum import from_the_truth, poses_of
 
 
@@ -21,8 +20,7 @@ def mapped(seed, *, gross=0.0, robust=False, looks=300):
 
 def aligned(path, drive):
     """RMSE of the path after its best rigid motion [m]."""
-    true, points = drive.truth.path[:, :2], path.mean[:, :2]
-    return rmse(position_error(moved(points, alignment(points, true)), true))
+    return aligned_rmse(path.mean[:, :2], drive.truth.path[:, :2])
 
 
 def solved(belief, drive):
