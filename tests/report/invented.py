@@ -190,9 +190,10 @@ def with_third(study, name):
 
 
 def write_store(
-    folder: Path, study: Study, *, iterations=None, seed=3, failed=(), grid="", name="invented"
-):
-    """Write a study into a folder as `pipistrelle study` does.
+    folder: Path, study: Study, *, iterations=None, seed=3, failed=(), grid="", name="invented",
+    radii=RADII,
+):  # fmt: skip
+    """Write a study at some of its radii into a folder as `pipistrelle study` does.
 
     `failed` holds pairs of a world's row and a case's number, `grid` further lines of the plan's
     grid, each combination of which then holds the same results. Returns the plan and, by world and
@@ -202,7 +203,7 @@ def write_store(
     text = folder.parent / f"{folder.name}.toml"
     settings = find_plan("paper").read_text().split("[config]\n")[1].split("\n\n")[0]
     worlds = max(iterations or 0, study.planned)
-    plan = PLAN.format(iterations=worlds, radii=list(RADII), settings=settings) + grid
+    plan = PLAN.format(iterations=worlds, radii=list(radii), settings=settings) + grid
     text.write_text(plan.replace("invented", name))
     plan = read_plan(text, iterations=iterations or len(study.worlds))
     open_store(folder, plan)

@@ -4,8 +4,11 @@ import csv
 import json
 import re
 import shutil
+from contextlib import redirect_stdout
 from dataclasses import replace
 from html.parser import HTMLParser
+from io import StringIO
+from pathlib import Path
 
 import numpy as np
 import polars as pl
@@ -21,7 +24,16 @@ from pipistrelle.report.page import write_report
 from pipistrelle.report.study import RULES, read_study
 from pipistrelle.report.variables import setting_variable
 from report.drawing import draw_only
-from report.invented import PLAN, RADII, STRATEGIES, invent, narrowed, with_third, write_store
+from report.invented import (
+    PLAN,
+    RADII,
+    STRATEGIES,
+    invent,
+    narrowed,
+    only,
+    with_third,
+    write_store,
+)  # fmt: skip
 
 FIGURES = [
     "anees_ekf", "anees_fastslam", "example_map", "gain", "heading_rmse", "landmarks", "map_rmse",
@@ -69,16 +81,28 @@ def store(tmp_path_factory):
 
 
 @pytest.fixture(scope="module")
-def reported(store):
-    """What `pipistrelle report` writes of a partial study with a failed trial."""
-    assert main(["report", str(store), "--quiet"]) == 0
-    return store / "report"
+def printed(store):
+    """What `pipistrelle report` prints of a partial study with a failed trial."""
+    with pytest.MonkeyPatch.context() as patch, redirect_stdout(StringIO()) as out:
+        draw_only(patch, "gain")
+        assert main(["report", str(store), "-o", str(store.parent / "out")]) == 0
+    return out.getvalue().splitlines()
+
+
+@pytest.fixture(scope="module")
+def reported(store, printed):
+    """What it writes, with one of the figures drawn."""
+    return store.parent / "out"
+
+
+def few(worlds):
+    """Worlds at two of their beamwidths by one filter: a page that is soon written."""
+    return narrowed(only(invent(worlds), [("ekf", way) for way in STRATEGIES]), [0, 11])
 
 
 @pytest.fixture(scope="module")
 def small():
-    """Two worlds at two of their beamwidths: a page that is soon written."""
-    return narrowed(invent(2), [0, 11])
+    return few(2)
 
 
 @pytest.fixture
@@ -92,6 +116,7 @@ def test_everything_is_there(reported):
     ]  # fmt: skip
     names = sorted(path.name for path in (reported / "figures").iterdir())
     assert names == sorted(f"{name}.{kind}" for name in FIGURES for kind in ("csv", "pdf", "png"))
+    assert all((reported / "figures" / f"gain.{kind}").stat().st_size for kind in ("pdf", "png"))
 
 
 @pytest.mark.parametrize("name", ["index.html", "summary.json", "figures/gain.csv"])
@@ -113,15 +138,6 @@ def test_a_users_file_in_the_place_of_the_reports_is_refused_by_name(
     assert (site / "figures" / "other.png").exists()
 
 
-def test_a_report_replaces_an_earlier_report(small, tmp_path, undrawn):
-    write_report(small, tmp_path / "report")
-    before = sorted((tmp_path / "report").rglob("*"))
-    (tmp_path / "report" / "notes.txt").write_text("mine")
-    write_report(small, tmp_path / "report")
-    after = sorted((tmp_path / "report").rglob("*"))
-    assert after == sorted([*before, tmp_path / "report" / "notes.txt"])
-
-
 def assert_same_bytes(reported, again, kinds):
     """Files of some kinds are the same in both folders; there are some."""
     found = [path for path in sorted(reported.rglob("*")) if path.suffix in kinds]
@@ -130,15 +146,27 @@ def assert_same_bytes(reported, again, kinds):
         assert path.read_bytes() == (again / path.relative_to(reported)).read_bytes(), path.name
 
 
-def test_the_same_folder_gives_the_same_page_and_numbers(store, reported, tmp_path, undrawn):
+def test_the_same_folder_gives_the_same_page_in_place_of_an_earlier_page(
+    store, reported, tmp_path, undrawn
+):
+    OwnFiles(tmp_path, REPORT).replace({"index.html": "earlier", "figures/other.png": "earlier"})
+    (tmp_path / "notes.txt").write_text("mine")
     write_report(read_study(store), tmp_path)
     assert_same_bytes(reported, tmp_path, {".html", ".json", ".csv"})
+    whole = {path.relative_to(reported) for path in reported.rglob("*")}
+    assert {path.relative_to(tmp_path) for path in tmp_path.rglob("*")} == whole | {
+        Path("notes.txt")
+    }
 
 
 @pytest.mark.slow
-def test_the_same_folder_gives_the_same_figures(store, reported, tmp_path):
-    write_report(read_study(store), tmp_path)
-    assert_same_bytes(reported, tmp_path, {".png", ".pdf"})
+def test_the_same_folder_gives_the_same_figures(store, tmp_path):
+    for name in "ab":
+        write_report(read_study(store), tmp_path / name)
+    assert_same_bytes(tmp_path / "a", tmp_path / "b", {".png", ".pdf"})
+    sizes = [path.stat().st_size for path in (tmp_path / "a" / "figures").iterdir()]
+    assert len(sizes) == 3 * len(FIGURES)
+    assert min(sizes) > 0
 
 
 def test_the_page_asks_for_nothing_outside(reported):
@@ -179,14 +207,14 @@ def test_the_eight_verdicts_are_on_the_page_and_in_the_summary(reported):
 def test_a_page_counts_its_worlds_and_warns_if_they_are_few_or_not_all(reported, tmp_path, undrawn):
     texts = {6: (reported / "index.html").read_text(encoding="utf-8")}
     for worlds in (1, 2, 20):
-        write_report(narrowed(invent(worlds), [0, 11]), tmp_path)
+        write_report(few(worlds), tmp_path)
         texts[worlds] = (tmp_path / "index.html").read_text(encoding="utf-8")
     for worlds, text in texts.items():
         assert ("6 of 115 worlds are done" in text) is (worlds == 6)
         assert ("so few worlds may show what others would not" in text) is (worlds < 20)
         assert not re.search(r"\b1 worlds", text)
-    assert "1 world · 10 trials" in texts[1]
-    assert "2 worlds · 20 trials" in texts[2]
+    assert "1 world · 5 trials" in texts[1]
+    assert "2 worlds · 10 trials" in texts[2]
     assert json.loads((reported / "summary.json").read_text())["partial"] is True
 
 
@@ -227,14 +255,13 @@ def test_no_text_of_a_study_becomes_markup(tmp_path, undrawn):
 
 def test_failed_trials_are_counted_over_all_combinations(tmp_path, capsys, undrawn):
     grid = '"air.relative_humidity" = [0.3, 0.7]\n'
-    (tmp_path / "plan.toml").write_text(
-        PLAN.format(iterations=2, settings="", radii=[*RADII]) + grid
-    )
+    radii = [*RADII[::11]]
+    (tmp_path / "plan.toml").write_text(PLAN.format(iterations=2, settings="", radii=radii) + grid)
     cases = cases_of(read_plan(tmp_path / "plan.toml"))
     moist = [case.number for case in cases if case.values["air.relative_humidity"] == 0.7]
     failed = [(0, moist[0]), (1, moist[5]), (1, moist[-1])]
     again = tmp_path / "again"
-    write_store(again, invent(2), grid=grid, failed=failed)
+    write_store(again, invent(2), grid=grid, failed=failed, radii=radii)
     assert main(["report", str(again)]) == 0
     printed = capsys.readouterr().out.splitlines()
     assert printed[0] == "failed: 3 trials; see the page"
@@ -247,7 +274,7 @@ def test_failed_trials_are_counted_over_all_combinations(tmp_path, capsys, undra
 
 
 def test_the_summary_is_plain_json_even_of_a_study_that_diverged(tmp_path, undrawn):
-    study = invent(3)
+    study = narrowed(invent(3), [0, 11])
     for trials in study.trials.values():
         trials.scores["position_rmse_m"][:] = np.inf
         trials.nees[0] = np.inf
@@ -282,13 +309,11 @@ def test_figures_and_table_ii_have_their_numbers_under_each_rule(reported):
     assert float(table[0]["full_std"]) > 0.0
 
 
-def test_the_command_prints_the_verdicts_and_the_page_last(store, tmp_path, capsys, undrawn):
-    assert main(["report", str(store), "-o", str(tmp_path / "out")]) == 0
-    printed = capsys.readouterr().out.splitlines()
+def test_the_command_prints_the_verdicts_and_the_page_last(reported, printed):
     assert printed[0] == "partial: 6 of 115 worlds"
     assert printed[1] == "failed: 1 trial; see the page"
     assert [line[0] for line in printed[2:-1] if line[0] != " "] == list("12345678")
-    assert printed[-1] == str(tmp_path / "out" / "index.html")
+    assert printed[-1] == str(reported / "index.html")
 
 
 def test_a_mistake_ends_in_a_line(small, tmp_path, capsys, undrawn):
@@ -328,9 +353,9 @@ def test_a_third_filter_has_its_panels_rows_and_files(tmp_path, monkeypatch):
     assert "Smoother" in {row["filter"] for row in summary["findings"]}
 
 
-def test_a_stored_study_of_a_filter_that_is_not_installed_can_be_read(store, tmp_path, undrawn):
-    folder = shutil.copytree(store, tmp_path / "store")
-    plan = read_plan(folder / "plan.toml")
+def test_a_stored_study_of_a_filter_that_is_not_installed_can_be_read(tmp_path, undrawn):
+    folder = tmp_path / "store"
+    plan, *_ = write_store(folder, invent(2), radii=[*RADII[::11]])
     for world in done_worlds(folder):
         paths = {name: world_file(folder, name, world) for name in TABLES}
         tables = {name: pl.read_parquet(path) for name, path in paths.items()}

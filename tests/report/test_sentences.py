@@ -32,6 +32,16 @@ def rows(study):
     return {row["sentence"]: row for row in judge_sentences(select(study, "world"))}
 
 
+@pytest.fixture(scope="module")
+def right(study):
+    """Rows of the study in which the paper is right."""
+    return rows(study)
+
+
+def row(study, number):
+    return _judged(SENTENCES[number - 1], select(study, "world"))
+
+
 def spread(study, way, score, factor):
     """Multiply the deviations of a score from its mean over the worlds."""
     return changed(study, way, score, lambda s: s.mean(axis=0) + factor * (s - s.mean(axis=0)))
@@ -78,20 +88,20 @@ def test_there_are_26_sentences_and_each_of_the_eight_claims_has_some():
 def test_a_large_change_of_the_means_refutes_a_sentence_by_every_yardstick(
     study, number, way, score, change
 ):
-    row = rows(changed(study, way, score, change))[number]
-    assert [row[name] for name in YARDSTICKS] == [False, False, False]
-    assert row["refuted"]
+    refuted = row(changed(study, way, score, change), number)
+    assert [refuted[name] for name in YARDSTICKS] == [False, False, False]
+    assert refuted["refuted"]
 
 
 @pytest.mark.parametrize("number", [8, 11, 16, 18, 21, 22, 25])
-def test_where_the_paper_is_right_a_sentence_holds_by_every_yardstick(study, number):
-    assert [rows(study)[number][name] for name in YARDSTICKS] == [True, True, True]
+def test_where_the_paper_is_right_a_sentence_holds_by_every_yardstick(right, number):
+    assert [right[number][name] for name in YARDSTICKS] == [True, True, True]
 
 
 def test_a_difference_within_the_bands_fails_by_means_but_not_by_bands(study):
     worse = changed(study, ("fastslam", "fused"), POSITION, lambda error: error - 0.12)
-    row = rows(worse)[13]
-    assert (row["by_means"], row["by_bands"]) == (False, True)
+    within = row(worse, 13)
+    assert (within["by_means"], within["by_bands"]) == (False, True)
 
 
 @pytest.mark.parametrize(
@@ -102,22 +112,25 @@ def test_a_difference_within_the_bands_fails_by_means_but_not_by_bands(study):
         (20, ("ekf", "active"), "landmarks_full", 9.0),
     ],
 )
-def test_sentences_on_sigma_are_judged_by_the_spread_over_worlds(study, number, way, score, factor):
-    before, after = rows(study)[number], rows(spread(study, way, score, factor))[number]
-    assert before["means"] != after["means"]
-    assert rows(spread(study, way, score, 1.0))[number]["means"] == before["means"]
+def test_sentences_on_sigma_are_judged_by_the_spread_over_worlds(
+    study, right, number, way, score, factor
+):
+    after, same = (row(spread(study, way, score, by), number) for by in (factor, 1.0))
+    assert right[number]["means"] != after["means"]
+    assert right[number]["means"] == same["means"]
 
 
 def test_the_spread_of_landmarks_grows_to_narrow_beams_where_a_study_has_it_so(study):
     for score in ("landmarks_full", "landmarks_total"):
         for name in ("ekf", "fastslam"):
             study = spread(study, (name, "fused"), score, 1.0 - 0.4 * OCTAVE)
-    assert [rows(study)[23][name] for name in YARDSTICKS] == [True, True, True]
+    growing = row(study, 23)
+    assert [growing[name] for name in YARDSTICKS] == [True, True, True]
 
 
 @pytest.mark.parametrize(("count", "holds"), [(8, True), (11, True), (40, False), (0, False)])
 def test_lost_worlds_are_compared_by_the_binomial_error_of_both(study, count, holds):
-    assert rows(losing(study, "ekf", count))[1]["by_means"] is holds
+    assert row(losing(study, "ekf", count), 1)["by_means"] is holds
 
 
 @pytest.mark.parametrize(
@@ -125,15 +138,14 @@ def test_lost_worlds_are_compared_by_the_binomial_error_of_both(study, count, ho
     [(3, ("ekf", "active"), 99.0), (5, ("ekf", "active"), 9.0), (7, ("fastslam", "active"), 9.0)],
 )
 def test_consistency_is_judged_by_the_nees(study, number, way, factor):
-    assert rows(with_nees(study, way, factor))[number]["by_means"] is False
-    largest = with_nees(study, ("fastslam", "fused"), 3.0)
-    assert rows(largest)[7]["by_means"] is True
+    assert row(with_nees(study, way, factor), number)["by_means"] is False
+    assert row(with_nees(study, ("fastslam", "fused"), 3.0), 7)["by_means"] is True
 
 
 def test_nees_that_grows_to_narrow_beams_refutes_the_sentence_on_fused_sensing(study):
     growing = (1.0 - OCTAVE)[np.newaxis, :, np.newaxis]
-    row = rows(with_nees(study, ("ekf", "fused"), growing))[6]
-    assert (row["by_means"], row["by_intervals"]) == (False, False)
+    refuted = row(with_nees(study, ("ekf", "fused"), growing), 6)
+    assert (refuted["by_means"], refuted["by_intervals"]) == (False, False)
 
 
 def test_a_statistic_of_means_and_deviations_is_jackknifed():
@@ -153,8 +165,8 @@ def test_most_needs_more_than_half_and_a_part_without_cases_leaves_a_sentence_un
     signs = (1.0, 1.0, -1.0)
     selection = select(study, "world")
     for part, verdict in ((Most(beams), True), (beams, False), (lambda _: [], None)):
-        row = _judged(Sentence(1, 1, "V", "", (part,)), selection)
-        assert row["by_means"] is verdict
+        judged = _judged(Sentence(1, 1, "V", "", (part,)), selection)
+        assert judged["by_means"] is verdict
 
 
 def test_a_study_without_one_filter_leaves_its_sentences_without_comparisons(study):
