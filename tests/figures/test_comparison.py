@@ -110,7 +110,7 @@ def test_the_title_of_an_estimate_with_dollars_is_shown_as_text(tmp_path):
     paths = {("fused", "own:$x^{$"): loop()}
     figure = draw_comparison(missions_of(tmp_path, paths, paths))
     assert "$x^{$" in figure.axes[0].get_title(loc="left")
-    save_figure(figure, tmp_path / "out", "comparison")
+    figure.draw_without_rendering()
 
 
 def test_a_path_that_is_lost_or_far_away_leaves_the_others_to_be_seen(tmp_path):
@@ -172,7 +172,7 @@ def test_a_difference_that_is_not_sure_is_hollow_and_one_without_an_interval_has
     assert len(figure.axes[0].collections) == 0
 
 
-@pytest.mark.parametrize("count", [2, 4])
+@pytest.mark.parametrize("count", [pytest.param(2, marks=pytest.mark.slow), 4])
 def test_figures_are_saved_and_let_go(tmp_path, count):
     compared = studies_of(tmp_path, *np.linspace(1.0, 2.0, count))
     png, pdf = save_figure(draw_comparison(compared), tmp_path / "out", "comparison")

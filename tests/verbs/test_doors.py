@@ -26,7 +26,7 @@ COMMANDS = {
     "run --output": (*RUN, "d"),
     "run --save-log": (*RUN, "new", "--save-log", "d"),
     "run --save-world": (*RUN, "new", "--save-world", "d"),
-    "run --save-sound": (*RUN, "new", "--save-sound", "d"),
+    "run --save-sound": (*RUN, "new", "--receiver.elements", "2", "--save-sound", "d"),
     "hear --output": ("hear", "tape", "-o", "d"),
     "slam --output": ("slam", LOG, "-o", "d"),
     "study --output": ("study", "tiny.toml", "--workers", "1", "-o", "d"),

@@ -104,7 +104,7 @@ def test_hear_names_the_band_of_a_sweep_beyond_half_the_rate(refused, tmp_path):
 
 
 def test_the_figure_ends_where_echoes_do_though_noise_makes_a_row_later(tmp_path):
-    folder, _ = swept(tmp_path / "tape", [5e-3] * 30, period=0.1, loud=0.2)
+    folder, _ = swept(tmp_path / "tape", [5e-3] * 15, period=0.1, loud=0.2)
     heard = pipistrelle.hear(folder, detection__false_alarm=1e-4)
     latest = max(found.delay.max() for found in heard.overview.detections)
     left, right = heard.figure().axes[0].get_xlim()

@@ -201,7 +201,7 @@ def test_view_rejects_folders_without_results(refused, make, said):
 
 def test_a_study_is_refused_with_what_to_do_instead(obey, refused, undrawn):
     Path("tiny.toml").write_text(TINY)
-    assert obey("study", "tiny.toml", "--quiet", "-o", "study")[0] == 0
+    assert obey("study", "tiny.toml", "--workers", "1", "--quiet", "-o", "study")[0] == 0
     said = refused("view", "study")
     assert said.startswith("study: found a study, which keeps many worlds and the frames of none")
     assert "`pipistrelle report` puts it on a page; `pipistrelle run --settings study/con" in said
