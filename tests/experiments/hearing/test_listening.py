@@ -490,8 +490,15 @@ def chorus(world, moving):
     return replace(world, callers=(*world.callers, whistle))
 
 
-@pytest.mark.parametrize("engine", ["block", "dense"])
-@pytest.mark.parametrize("moving", [False, True])
+@pytest.mark.parametrize(
+    ("engine", "moving"),
+    [
+        ("block", True),
+        ("dense", False),
+        pytest.param("block", False, marks=pytest.mark.slow),
+        pytest.param("dense", True, marks=pytest.mark.slow),
+    ],
+)
 def test_a_third_caller_is_heard_where_it_is_by_either_engine(engine, moving):
     alone = ScenarioConfig(steps=8, landmarks=0)  # nothing sounds into its direct call
     world, config = short(8, receiver=ReceiverConfig(engine=engine), scenario=alone)
