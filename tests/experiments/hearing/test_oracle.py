@@ -1,4 +1,4 @@
-from dataclasses import fields, replace
+from dataclasses import fields
 
 import numpy as np
 import pytest
@@ -117,18 +117,6 @@ def test_labels_match_a_slow_second_version(seed):
 
 @given(seed=SEEDS)
 @law
-def test_an_arrival_labels_one_detection_of_each_face_at_most(seed):
-    found, arrivals = crowd(seed)
-    given_ = [
-        key
-        for key in zip(found.face, found.caller, labels(found, arrivals), strict=True)
-        if key[2] != UNLABELLED
-    ]
-    assert len(given_) == len(set(given_)) > 0
-
-
-@given(seed=SEEDS)
-@law
 def test_labels_follow_their_rows_in_any_order(seed):
     found, arrivals = crowd(seed)
     rng = np.random.default_rng(seed)
@@ -151,38 +139,6 @@ def test_gates_hold_in_delay_and_in_bearing_both():
         assert labels(detections((10.0 + late, 0.2 + off, 1, 0, 9)), ONE) == [label]
     wide = MatchingConfig(delay_gate=0.5, bearing_gate=0.2)
     assert labels(detections((11.3, 0.39, 1, 0, 9)), ONE, wide) == [7]
-
-
-def test_tones_and_faces_do_not_mix():
-    assert labels(detections((10.0, 0.2, 0, 0, 9)), ONE) == [UNLABELLED]
-    assert labels(detections((10.0, 0.2, 1, 2, 9)), ONE) == [UNLABELLED]  # it looks back
-    assert labels(detections((10.0, 0.2, 1, 3, 9)), ONE) == [UNLABELLED]  # 101 degrees off it
-    on_both = detections((10.0, 0.2, 1, 0, 9), (10.0, 0.2, 1, 1, 5))
-    assert labels(on_both, ONE) == [7, 7]
-
-
-def test_the_strongest_detection_chooses_first_and_the_rest_is_clutter():
-    nearer_but_weaker = detections((10.0, 0.2, 1, 0, 5), (10.5, 0.25, 1, 0, 9))
-    assert labels(nearer_but_weaker, ONE) == [UNLABELLED, 7]
-
-
-def test_a_detection_takes_the_nearest_arrival_in_units_of_the_gates():
-    pair = true_arrivals((10.0, 0.2, 1, 7, 0.0), (10.3, 0.2, 1, 8, 0.0))
-    assert labels(detections((10.1, 0.2, 1, 0, 9)), pair) == [7]
-    assert labels(detections((10.2, 0.2, 1, 0, 9)), pair) == [8]
-    # Once the nearest is taken, the next within the gates is free.
-    assert labels(detections((10.1, 0.2, 1, 0, 9), (10.05, 0.2, 1, 0, 5)), pair) == [7, 8]
-
-
-def test_bearings_are_compared_across_straight_back():
-    behind = true_arrivals((10.0, np.pi - 0.01, 1, 7, 0.0))
-    assert labels(detections((10.0, -np.pi + 0.02, 1, 2, 9)), behind) == [7]
-
-
-def test_an_arrival_too_faint_to_be_heard_labels_nothing():
-    for level_db, label in ((FAINTEST, 7), (FAINTEST - 0.01, UNLABELLED)):
-        arrivals = replace(ONE, level_db=np.array([level_db]))
-        assert labels(detections((10.0, 0.2, 1, 0, 9)), arrivals) == [label]
 
 
 def test_nothing_detected_is_nothing_labelled():
