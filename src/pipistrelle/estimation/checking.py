@@ -221,12 +221,20 @@ def usable_scan(scan: Scan) -> Scan:
 
 def _is_laid_out(scan: Scan) -> bool:
     """Return whether a scan's columns are arrays as kernels require them."""
-    whole = (scan.landmark, scan.caller, scan.callers, scan.moving)
+    # Written out, as it is done twice for each scan.
+    landmark, caller, numbers = scan.landmark, scan.caller, scan.numbers
+    callers, moving = scan.callers, scan.moving
     return (
-        all(_is_plain(column, INTEGER) and column.ndim == 1 for column in whole)
-        and _is_plain(scan.numbers)
-        and scan.caller.shape == scan.landmark.shape
-        and scan.numbers.shape == (NUMBERS, scan.landmark.size)
+        type(landmark) is type(caller) is type(callers) is type(moving) is np.ndarray
+        and landmark.dtype == caller.dtype == callers.dtype == moving.dtype == INTEGER
+        and landmark.ndim == callers.ndim == moving.ndim == 1
+        and caller.shape == landmark.shape
+        and _is_plain(numbers)
+        and numbers.shape == (NUMBERS, landmark.size)
+        and landmark.flags.carray
+        and caller.flags.carray
+        and callers.flags.carray
+        and moving.flags.carray
     )
 
 

@@ -201,40 +201,26 @@ def _spread(sample: Worlds) -> float:
     return float(np.std(sample, ddof=1)) if len(sample) > 1 else 0.0
 
 
-def _larger(score: str, *pairs: tuple[Way, Way], **beams: float) -> Comparisons:
-    """Compare means: the first of each pair is larger."""
+def _larger(
+    score: str, *pairs: tuple[Way, Way], near: bool = False, by_sigma: bool = False, **beams: float
+) -> Comparisons:
+    """Compare means: the first of each pair is larger, or larger by σ, or they differ by at most σ.
 
-    def made(selection: Selection) -> Iterator[Comparison]:
-        for pair in pairs:
-            for label, a, b in _pairs(selection, score, *pair, **beams):
-                yield Comparison(label, a - b, band=_spread(a) + _spread(b))
-
-    return made
-
-
-def _larger_by_sigma(score: str, *pairs: tuple[Way, Way], **beams: float) -> Comparisons:
-    """Compare means: the first of each pair is larger by a standard deviation over worlds."""
+    σ is the pooled standard deviation over worlds.
+    """
 
     def made(selection: Selection) -> Iterator[Comparison]:
         for pair in pairs:
             for label, a, b in _pairs(selection, score, *pair, **beams):
                 if len(a) > 1:
-                    yield Comparison(label, a - b, least=pooled_std(a, b))
+                    band, sigma = _spread(a) + _spread(b), pooled_std(a, b)
+                    margin, least = sigma if near else None, sigma if by_sigma else 0.0
+                    yield Comparison(label, a - b, band, margin, least)
 
     return made
 
 
-def _near(score: str, *pairs: tuple[Way, Way], **beams: float) -> Comparisons:
-    """Compare means: they differ by at most a standard deviation over worlds."""
-
-    def made(selection: Selection) -> Iterator[Comparison]:
-        for pair in pairs:
-            for label, a, b in _pairs(selection, score, *pair, **beams):
-                if len(a) > 1:
-                    band = _spread(a) + _spread(b)
-                    yield Comparison(label, a - b, band=band, margin=pooled_std(a, b))
-
-    return made
+_near, _larger_by_sigma = partial(_larger, near=True), partial(_larger, by_sigma=True)
 
 
 def _more_spread(score: str, *pairs: tuple[Way, Way]) -> Comparisons:
@@ -251,7 +237,9 @@ def _more_spread(score: str, *pairs: tuple[Way, Way]) -> Comparisons:
 
 def _stds(*columns: Worlds) -> Float[np.ndarray, "n k"]:
     """Return jackknife pseudo-values of the standard deviations of k samples."""
-    return np.column_stack([_statistic(column[:, np.newaxis], _std) for column in columns])
+    return np.column_stack(
+        [_statistic(c[:, np.newaxis], lambda _, std: std[:, 0]) for c in columns]
+    )
 
 
 def _statistic(
@@ -267,11 +255,6 @@ def _statistic(
         return statistic(off + middle, np.sqrt(np.maximum(squares - off**2, 0.0)))
 
     return pseudovalues(moments, of)
-
-
-def _std(_: np.ndarray, std: np.ndarray) -> np.ndarray:
-    """Return the standard deviation of a single column."""
-    return std[:, 0]
 
 
 # Trends over the beamwidth
