@@ -100,7 +100,7 @@ def recovering(
 ) -> B:
     """Update a belief with a scan, discarding the previous odometry if it failed (`recovered`)."""
     after: Any = correct(belief, scan)
-    if gate >= 1.0:
+    if gate >= 1.0 or (after.gated == belief.gated and after.doubt == 0.0):
         return after
     found = recovered(belief, after, scan, gate, reach)
     if isinstance(found, float):

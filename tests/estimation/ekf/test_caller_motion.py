@@ -55,7 +55,7 @@ def test_propagation_of_two_callers_and_a_ray_matches_the_exact_solution():
     whole[3:, 3:], noise[3:, 3:] = F, Q
     expected = whole @ P @ whole.T + noise
     went, spread = mean.copy(), P.copy()
-    propagate_callers(went, spread, landmark, 1.7, 0.3)
+    propagate_callers(went, spread, landmark, np.array([0.4, 1.3]), 0.3)
     np.testing.assert_allclose(went, whole @ mean, rtol=0, atol=1e-12)
     np.testing.assert_allclose(spread, expected, rtol=0, atol=1e-11)
 

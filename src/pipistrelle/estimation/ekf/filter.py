@@ -110,11 +110,11 @@ def propagate_callers(
     mean: Mean,
     covariance: Float[np.ndarray, "d room"],
     landmark: Labels,
-    seconds: float,
+    dt: Durations,
     walk_std: float,
 ) -> None:
-    """Predict moving callers over a time [s], in place; ``walk_std``: velocity std after 1 s."""
-    q, size = walk_std * walk_std, mean.size
+    """Predict moving callers through steps [s], in place; ``walk_std``: velocity std after 1 s."""
+    q, size, seconds = walk_std * walk_std, mean.size, dt.sum()
     for velocity in range(landmark.size):
         if landmark[velocity] >= UNLABELLED:
             continue
@@ -487,8 +487,7 @@ class EkfSlam:
         step = propagate if belief.error == LINEAR else propagate_invariant
         numbers = tuple(motion_numbers(self.motion))
         step(mean, covariance, controls, dt, numbers, means, covariances)
-        if is_velocity(belief.landmark).any():
-            propagate_callers(mean, covariance, belief.landmark, dt.sum(), self.walk_std)
+        propagate_callers(mean, covariance, belief.landmark, dt, self.walk_std)
         invariant = belief.error == INVARIANT
         if invariant:
             means[:, :2] += belief.origin
