@@ -58,6 +58,9 @@ SCORES = {
         title="map RMSE, aligned", unit="m", digits=3,
         shown=_in("mission", "missions", "studies", "levels"),
     ),
+    "map_rmse_shared_m": Score(
+        title="map RMSE of shared, aligned", unit="m", digits=3, shown=_in("mission", "missions")
+    ),
     "position_floor_m": Score(
         title="position floor", unit="m", digits=3, shown=_in("missions", "cases")
     ),
@@ -117,8 +120,8 @@ SCORES = {
     "wall_s": Score(title="time of the filter", unit="s", digits=2, shown=_in("missions")),
 }  # fmt: skip
 """Every score by its name in ``summary.json`` and in tables, in the order of display."""
-NOT_MEANS = frozenset(("diverged", "gated", "wall_s"))
-"""Scores without a meaningful mean over worlds."""
+NOT_MEANS = frozenset(("diverged", "gated", "wall_s", "map_rmse_shared_m"))
+"""Scores that are not averaged over the worlds of a study."""
 
 
 def shown_in(place: Place) -> dict[str, Score]:

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 from cyclopts import Parameter
 
 from pipistrelle.evaluation.scores import heading, shown_in
-from pipistrelle.verbs.console import announced, command_line, text_table
+from pipistrelle.verbs.console import announced, command_line, listening, text_table
 from pipistrelle.verbs.streams import put, say
 
 
@@ -175,7 +175,7 @@ def _studies_answer(compared: "ComparedStudies") -> list[str]:
 
 
 def _missions_answer(compared: "ComparedMissions") -> list[str]:
-    """Return a sentence for each other folder: its position RMSE, averaged over the estimates."""
+    """Return a sentence for each other folder's position RMSE, and for fused sensing in each."""
     from pipistrelle.experiments.comparing import POSITION, less
     from pipistrelle.report.variables import amount
 
@@ -188,6 +188,12 @@ def _missions_answer(compared: "ComparedMissions") -> list[str]:
             size = "+" * (mean > 0.0) + amount(mean, "m")
             mean_of = f", averaged over {count} estimates" * (count > 1)
             lines.append(f"{letter} instead of A changes the position RMSE by {size}{mean_of}.")
+    for i, letter in enumerate(compared.folders):
+        scores = (
+            (*one.estimates[i], {name: values[i] for name, values in one.scores.items()})
+            for one in compared.estimates
+        )
+        lines += [f"{letter}: {line}" for line in listening(scores)]
     return lines
 
 

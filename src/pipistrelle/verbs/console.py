@@ -4,10 +4,13 @@ import io
 import shlex
 import shutil
 import sys
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from dataclasses import asdict
+from math import isfinite, sqrt
+from textwrap import fill
 from threading import Timer
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from pipistrelle.estimation.catalogue import short_name
 from pipistrelle.evaluation.scores import heading, shown_in
@@ -25,6 +28,12 @@ NIS = (
     "rightly."
 )
 """Note below a table with innovations."""
+POSITION_ALIGNED = "position_rmse_aligned_m"
+ALIGNED = {
+    POSITION_ALIGNED: "the path is off",
+    "map_rmse_shared_m": "the landmarks that all strategies placed",
+}
+"""Scores that compare fused with active sensing, in words."""
 
 
 def command_line() -> str:
@@ -130,7 +139,41 @@ def closing_table(
     rows = [f"{line[0]:<32}" + "".join(f"{c:>{width}}" for c in line[1:]) for line in lines]
     bounded = any(trial.scores.position_bound_m is not None for trial in trials)
     weighed = any(column[NIS_TITLE] for column in columns)
-    return "\n".join([*rows, *[IN_ONE_WORLD] * bounded, *[NIS] * weighed])
+    scores = [(trial.strategy, trial.filter, asdict(trial.scores)) for trial in trials]
+    notes = [
+        *[IN_ONE_WORLD] * bounded,
+        *[NIS] * weighed,
+        *(fill(line, 100) for line in listening(scores)),
+    ]
+    return "\n".join([*rows, *notes])
+
+
+def listening(estimates: Iterable[tuple[str, str, Mapping[str, Any]]]) -> Iterator[str]:
+    """Yield for each estimator a sentence on how fused sensing changes what active sensing gives.
+
+    `estimates`: strategy, estimator and scores of each.
+    """
+    found = {(strategy, name): scores for strategy, name, scores in estimates}
+    several = len({name for _, name in found}) > 1
+    for (strategy, name), fused in found.items():
+        active = found.get(("active", name))
+        if strategy != "fused" or active is None:
+            continue
+        placed = (f"{scores['landmarks_full']:.0f}" for scores in (fused, active))
+        line = (
+            f"Listening{f', {short_name(name)}' * several}: {' landmarks instead of '.join(placed)}"
+        )
+        said = []
+        for score, title in ALIGNED.items():
+            ends = [scores.get(score) for scores in (fused, active)]
+            if all(end is not None and isfinite(end) for end in ends):
+                said.append(f"{title} by " + " instead of ".join(f"{1e3 * e:.0f} mm" for e in ends))
+        if said:
+            line += f"; after alignment {', and '.join(said)}"
+        raw, aligned = fused.get("position_rmse_m"), fused.get(POSITION_ALIGNED)
+        if raw is not None and aligned is not None and aligned < sqrt(0.5) * raw:
+            line += ". Most of the raw error is one rigid motion of path and map"
+        yield f"{line}."
 
 
 def _cells(
@@ -154,8 +197,6 @@ def _cells(
 
 def _without_truth(trial: "TrialResult", driven: float | None) -> Iterator[tuple[str, str]]:
     """Yield the innovations and standard deviations of an estimate without true poses."""
-    from math import sqrt
-
     from pipistrelle.experiments.results.scores import judged
 
     pose, measurements = trial.track.pose, judged(trial.scans)

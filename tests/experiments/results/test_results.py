@@ -18,7 +18,7 @@ from pipistrelle.estimation.beliefs import Gaussian, Track
 from pipistrelle.estimation.catalogue import entry
 from pipistrelle.evaluation.accuracy import alignment, moved, position_error, rmse
 from pipistrelle.experiments.drives import NO_TRUTH, Truth
-from pipistrelle.experiments.results.scores import Scores, TrialResult, score
+from pipistrelle.experiments.results.scores import Scores, TrialResult, score, with_shared
 from pipistrelle.experiments.results.writing import config_hash, write_results
 from pipistrelle.files import RESULTS, OwnFiles
 from reference.missions import map_with, scan_with
@@ -28,10 +28,10 @@ EKF_LIMIT = entry("ekf").nees_limit
 EVO_APE = shutil.which("evo_ape", path=Path(sys.executable).parent)
 KEYS = [
     "strategy", "filter", "position_rmse_m", "heading_rmse_rad", "map_rmse_m",
-    "position_rmse_aligned_m", "map_rmse_aligned_m", "position_floor_m", "position_bound_m",
-    "heading_bound_rad", "nees_mean", "nees_max", "caller_rmse_m", "caller_rmse_aligned_m",
-    "diverged", "landmarks_full", "landmarks_total", "measurements_per_frame", "gated",
-    "nis_mean", "gated_of", "ignored_rows", "wall_s",
+    "position_rmse_aligned_m", "map_rmse_aligned_m", "map_rmse_shared_m", "position_floor_m",
+    "position_bound_m", "heading_bound_rad", "nees_mean", "nees_max", "caller_rmse_m",
+    "caller_rmse_aligned_m", "diverged", "landmarks_full", "landmarks_total",
+    "measurements_per_frame", "gated", "nis_mean", "gated_of", "ignored_rows", "wall_s",
 ]  # fmt: skip
 
 
@@ -155,6 +155,17 @@ def test_the_map_error_counts_full_landmarks_with_known_positions():
     assert scores.map_rmse_aligned_m == rmse(
         position_error(moved(mapped, alignment(mapped, true)), true)
     )
+
+
+def test_strategies_are_compared_by_the_landmarks_that_all_have_placed():
+    labels = {"active": (1, 2, 3, 4), "fused": (2, 1, 1, 3, 4), "passive": (4, 77, 3, 2)}
+    trials = [trial(drifting_track(landmarks=there), way) for way, there in labels.items()]
+    true = TRUE_LANDMARKS[1][1:]
+    compared = with_shared(trials, TRUTH)
+    for one, kept in zip(compared, ([1, 2, 3], [0, 3, 4], [3, 2, 0]), strict=True):
+        mapped = one.track.landmarks.mean[kept]
+        error = position_error(moved(mapped, alignment(mapped, true)), true)
+        assert one.scores.map_rmse_shared_m == pytest.approx(rmse(error))
 
 
 def test_without_truth_only_the_counts_are_scored():

@@ -59,6 +59,8 @@ class Scores:
     """RMSE of the fully initialised landmarks with known true positions."""
     position_rmse_aligned_m: float | None
     map_rmse_aligned_m: float | None
+    map_rmse_shared_m: float | None = None
+    """As `map_rmse_aligned_m`, of the landmarks that all strategies of a mission placed."""
     position_floor_m: float | None = None
     """RMSE of a path without errors after the first scan (`position_floor`)."""
     position_bound_m: float | None = None
@@ -317,6 +319,25 @@ def with_bound(scores: Scores, bound: Float[np.ndarray, "t 3 3"] | None) -> Scor
 
 
 @np.errstate(over="ignore", invalid="ignore")
+def with_shared(trials: Sequence[TrialResult], truth: Truth) -> tuple[TrialResult, ...]:
+    """Add the map RMSE over the landmarks that every strategy of an estimator has placed."""
+    scored = []
+    for trial in trials:
+        maps = {
+            one.strategy: heaviest(one.track.landmarks if one.mapped is None else one.mapped)
+            for one in trials
+            if one.filter == trial.filter
+        }
+        shared = set.intersection(*({*m.landmark[m.full].tolist()} for m in maps.values()))
+        error = None
+        if truth.landmarks is not None and len(maps) > 1:
+            own = maps[trial.strategy]
+            kept = replace(own, full=own.full & np.isin(own.landmark, [*shared]))
+            error = _aligned_rmse(*scored_landmarks(kept, *truth.landmarks))
+        scored.append(replace(trial, scores=replace(trial.scores, map_rmse_shared_m=error)))
+    return tuple(scored)
+
+
 def score_path(pose: Gaussian, true_path: Float[np.ndarray, "k 3"] | None) -> PathScores:
     """Score a path against the truth, excluding its start and true poses that are NaN.
 

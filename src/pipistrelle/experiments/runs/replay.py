@@ -47,7 +47,7 @@ from pipistrelle.experiments.hearing.scenario import ALL_DRAWN
 from pipistrelle.experiments.hearing.world_folder import read_world
 from pipistrelle.experiments.named_settings import Case, each_its_own
 from pipistrelle.experiments.results.reading import SUMMARY, Summary, read_summary
-from pipistrelle.experiments.results.scores import TrialResult
+from pipistrelle.experiments.results.scores import TrialResult, with_shared
 from pipistrelle.experiments.results.tables import tum_text
 from pipistrelle.experiments.results.writing import settings_hash
 from pipistrelle.experiments.runs import truth_files
@@ -215,7 +215,7 @@ def replay(
                 case, drive, scans, own, causes=causes, progress=progress, watch=watch
             )
             trials[strategy, name] = replace(trial, left_out=unsure)
-    ordered = tuple(trials[pair] for pair in product(strategies, filters))
+    ordered = with_shared([trials[pair] for pair in product(strategies, filters)], truth)
     return Mission(config=config, drive=drive, trials=ordered, beamwidth=beamwidth, log=log)
 
 

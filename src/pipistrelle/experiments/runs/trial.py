@@ -53,6 +53,7 @@ from pipistrelle.experiments.results.scores import (
     score_path,
     with_association,
     with_bound,
+    with_shared,
 )
 from pipistrelle.experiments.runs.heard_world import HeardWorld, Mission, drive_of
 from pipistrelle.experiments.runs.validate import (
@@ -112,7 +113,7 @@ def run_mission(
     return Mission(
         config=config,
         drive=drive,
-        trials=tuple(trials[pair] for pair in product(strategies, filters)),
+        trials=with_shared([trials[pair] for pair in product(strategies, filters)], drive.truth),
         beamwidth=beamwidth_of(config),
         callers=scenario.callers[VEHICLE + 1 :],
         scenario=scenario,

@@ -156,7 +156,7 @@ def world_schemas(plan: Plan) -> "dict[str, dict[str, Any]]":
     configs = [case.config for case in cases_of(plan)]
     # Older studies lack these columns and can still be read.
     known = all(config.association.method == KNOWN for config in configs)
-    left = {"nis_mean", *(OF_ASSOCIATION if known else ())}
+    left = {"nis_mean", "map_rmse_shared_m", *(OF_ASSOCIATION if known else ())}
     kept = (field.name for field in fields(Scores) if field.name not in left)
     scores = dict.fromkeys(kept, pl.Float64)
     motion = motion_of(plan.config.motion)
