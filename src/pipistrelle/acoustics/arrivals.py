@@ -43,7 +43,7 @@ _DEEPEST_NULL = 1e-12
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Arrivals:
-    """Echoes and calls that reach the vehicle after an emission."""
+    """Delays, levels and bearings of echoes and calls that reach the vehicle after an emission."""
 
     delay: Float[np.ndarray, " a"]
     """Since the emission [s]."""
@@ -113,7 +113,7 @@ def arrivals_of_emissions(
     bodies: Bodies | None = None,
     medium: Medium | None = None,
 ) -> tuple[Arrivals, Int[np.ndarray, " k"]]:
-    """Return the arrivals of several emissions in one world, sorted by emission.
+    """Return the echoes and direct calls that reach the vehicle after each of several emissions.
 
     `poses` [m, m, rad]; `velocities` [m/s]; `landmarks` [m]; `callers`: the vehicle first, with
     paths and velocities (k, 2), a row for each emission (`callers_at`); `bodies`: of the landmarks,
@@ -177,7 +177,7 @@ def through_piston(
     speed_of_sound: float,
     off_axis: str = "pressure",
 ) -> Arrivals:
-    r"""Apply the beam of a circular piston to the levels of the vehicle's active echoes.
+    r"""Attenuate the echoes of the vehicle's call by the directivity of its circular piston.
 
     .. math:: L_\text{active} \leftarrow L_\text{active} + 20 \log_{10} p(\phi)
 
@@ -215,7 +215,7 @@ def through_piston(
 def arrivals_at(
     arrivals: Arrivals, rows: Bool[np.ndarray, " a"] | Int[np.ndarray, " k"] | slice
 ) -> Arrivals:
-    """Select rows of the arrivals."""
+    """Select arrivals by a mask, indices or a slice."""
     return Arrivals(
         delay=arrivals.delay[rows],
         level_db=arrivals.level_db[rows],
@@ -228,7 +228,7 @@ def arrivals_at(
 
 
 def arrivals_together(parts: Sequence[Arrivals]) -> Arrivals:
-    """Concatenate arrivals of the same callers."""
+    """Concatenate several sets of arrivals into one."""
     names = [name for name in Arrivals.__slots__ if getattr(parts[0], name) is not None]
     return Arrivals(**{n: np.concatenate([getattr(part, n) for part in parts]) for n in names})
 
@@ -236,7 +236,7 @@ def arrivals_together(parts: Sequence[Arrivals]) -> Arrivals:
 def _own_echoes(
     paths: SoundPaths, caller: Caller, medium: Medium, usual: TargetConfig, bodies: Bodies | None
 ) -> tuple[Arrivals, Int[np.ndarray, " a"]]:
-    """Return the echoes of the vehicle's call from all targets ahead, and the emission of each."""
+    """Return the vehicle's echoes from targets ahead of it, and the emission index of each."""
     c, absorption = medium.speed_of_sound, medium.absorption_db_per_m(caller.frequency)
     ahead = np.flatnonzero(in_front(paths.bearing))
     back, closing = paths.homeward.ravel()[ahead], paths.closing.ravel()[ahead]
@@ -266,7 +266,7 @@ def _own_echoes(
 def _sounds_of(
     j: int, paths: SoundPaths, caller: Caller, medium: Medium, strength_db: Float[np.ndarray, "k t"]
 ) -> Arrivals:
-    """Return another caller's echoes and direct call at all emissions, by label."""
+    """Return the echoes and direct calls of a caller, other than the vehicle, at all emissions."""
     c, (emissions, targets) = medium.speed_of_sound, paths.homeward.shape
     itself = paths.landmarks + j - 1
     incoming = paths.target - paths.target[:, itself : itself + 1]
@@ -288,7 +288,7 @@ def _sounds_of(
 def _departures(
     j: int, paths: SoundPaths, heading: Float[np.ndarray, " k"]
 ) -> Float[np.ndarray, " a"]:
-    """Return the angles of departure from another vehicle, off its heading [rad]."""
+    """Return departure angles of another vehicle's sound to each target, off its heading [rad]."""
     itself = paths.landmarks + j - 1
     way = paths.target - paths.target[:, itself : itself + 1]
     way[:, itself] = -paths.offset[:, itself]  # the direct call goes to the vehicle
@@ -303,7 +303,7 @@ def through_pistons(
     radius: float,
     speed_of_sound: float,
 ) -> Arrivals:
-    """Apply the beams of pistons of one radius to the calls of the vehicle and of other vehicles.
+    """Attenuate the calls of all vehicles by the directivity of pistons with the same radius.
 
     `arrivals`: of `arrivals_of_emission`; `callers`: of the same emission; `beam`: applies the
     vehicle's directivity, such as `through_piston`; another vehicle's arrivals are passed to it
@@ -332,7 +332,7 @@ def _shifted(
     frequency: float,
     c: float,
 ) -> Float[np.ndarray, "k t"]:
-    """Apply the Doppler shifts of all moving bodies to another caller's sounds."""
+    """Return the received frequencies of a caller's sounds, Doppler-shifted by all motions [Hz]."""
     if paths.drift is None:
         return doppler_frequency(frequency, receiver_speed=paths.closing, speed_of_sound=c)
     echo = np.arange(paths.closing.shape[1]) != itself
@@ -361,7 +361,7 @@ def _loss_db(
     strength_db: Float[np.ndarray, "k t"],
     medium: Medium,
 ) -> Float[np.ndarray, "k t"]:
-    """Return the spreading loss of a caller's sounds, less the target strength of its echoes."""
+    """Return a caller's spreading losses to the vehicle [dB], less the echoes' target strengths."""
     sent = np.broadcast_to(outward, strength_db.shape).copy()
     sent[:, itself] = 1.0  # no echo of itself: any distance will do
     loss_db = passive_spreading_loss_db(sent, paths.homeward, law=medium.spreading) - strength_db
@@ -376,7 +376,7 @@ def _strength_db(
     usual: TargetConfig,
     bodies: Bodies | None,
 ) -> Float[np.ndarray, "k t"]:
-    """Return the target strength of every body for a tone [Hz]."""
+    """Return the target strength of every target at every emission for a tone [dB]."""
     c = medium.speed_of_sound
     if bodies is not None:
         return strength_of_bodies_db(turn, bodies, usual=usual, frequency=tone, speed_of_sound=c)

@@ -51,22 +51,22 @@ from pipistrelle.settings import CALL_KEYS, CALLERS, Layer, beside
 
 
 class Call(Protocol):
-    """The waveform of a call, of constant envelope or not."""
+    """Interface of a call: its centre frequency, duration and waveform."""
 
     @property
     def frequency(self) -> float:
-        """Centre of the band [Hz]."""
+        """Centre frequency of the call's band [Hz]."""
         ...
 
     @property
     def duration(self) -> float:
-        """Length [s]."""
+        """Duration of the call [s]."""
         ...
 
     def waveform(
         self, time: Float[np.ndarray, "*n"], frequency: float
     ) -> Complex[np.ndarray, "*n"]:
-        """Return the analytic signal, of unit amplitude, at times since its start [s].
+        """Return the call's analytic signal, of unit amplitude, at times since its start [s].
 
         `frequency`: the centre as received, with Doppler shift [Hz].
         """
@@ -75,7 +75,7 @@ class Call(Protocol):
 
 @dataclass(frozen=True, slots=True)
 class ToneBurst:
-    """A tone switched on and off (Bradley & Abaid, Sec. II-A): its matched output is a triangle."""
+    """A tone switched on and off (Bradley & Abaid, Sec. II-A); its matched output is a triangle."""
 
     frequency: float
     """[Hz]."""
@@ -85,7 +85,7 @@ class ToneBurst:
     def waveform(
         self, time: Float[np.ndarray, "*n"], frequency: float
     ) -> Complex[np.ndarray, "*n"]:
-        """Return the tone as received.
+        """Return the analytic signal of a tone of the received frequency at given times [s].
 
         >>> ToneBurst(35e3, 2.8e-3).waveform(np.array([0.0, 1e-5]), 50e3).round(9)
         array([ 1.+0.j, -1.+0.j])
@@ -110,13 +110,13 @@ class Sweep:
 
     @property
     def frequency(self) -> float:
-        """Centre of the band [Hz]."""
+        """Centre frequency of the sweep's band [Hz]."""
         return 0.5 * (self.start + self.end)
 
     def waveform(
         self, time: Float[np.ndarray, "*n"], frequency: float
     ) -> Complex[np.ndarray, "*n"]:
-        """Return the sweep as received, zero outside its duration.
+        """Return the Doppler-scaled sweep (analytic signal) at given times; zero outside the sweep.
 
         >>> slow = Sweep(60e3, 35e3, 2.8e-3, taper=1.0)
         >>> abs(slow.waveform(np.array([0.0, 1.4e-3, 2.8e-3]), 47.5e3)).round(9)
@@ -133,7 +133,7 @@ class Sweep:
 
 
 def tapered(share: Float[np.ndarray, "*n"], taper: float) -> Float[np.ndarray, "*n"]:
-    """Return Tukey's window at relative times of the call; 0 outside it.
+    """Return Tukey's window at times given as shares of a call's duration; 0 outside [0, 1].
 
     >>> tapered(np.array([0.0, 0.1, 0.5, 1.1]), 0.4).round(3)
     array([0. , 0.5, 1. , 0. ])
@@ -147,10 +147,10 @@ def tapered(share: Float[np.ndarray, "*n"], taper: float) -> Float[np.ndarray, "
 
 
 def coupling(call: Call) -> float:
-    """Return the apparent delay of a call's echo per unit of relative Doppler shift a - 1 [s].
+    """Return the apparent delay of an echo per relative Doppler shift (received / sent - 1) [s].
 
-    By the call's matched filter, with a the ratio of received to sent frequency. It is 0 for tones
-    to first order, and for files, for which it is unknown.
+    By the call's matched filter. It is 0 for tones to first order, and for files, for which it is
+    unknown.
 
     >>> round(1e3 * coupling(Sweep(60e3, 35e3, 2.8e-3)), 2), coupling(ToneBurst(35e3, 2.8e-3))
     (3.92, 0.0)
@@ -172,7 +172,7 @@ LEAST_SAMPLES = 10
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RecordedCall:
-    """A call from a sound file, interpolated within its band, and silent after its samples."""
+    """A call from a sound file, interpolated between its samples, and silent after them."""
 
     path: str
     frequency: float
@@ -186,7 +186,7 @@ class RecordedCall:
     _envelope: "CubicSpline" = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
-        """Interpolate the analytic signal, shifted down by the band's frequency."""
+        """Build the spline of the recording's complex envelope about its centre frequency."""
         from scipy.fft import fft, ifft, next_fast_len
         from scipy.interpolate import CubicSpline
 
@@ -203,7 +203,7 @@ class RecordedCall:
     def waveform(
         self, time: Float[np.ndarray, "*n"], frequency: float
     ) -> Complex[np.ndarray, "*n"]:
-        """Return the call as received, zero outside its samples."""
+        """Return the Doppler-scaled recording (analytic signal) at given times; zero outside it."""
         own = np.asarray(time) * (frequency / self.frequency)
         inside = (own >= 0.0) & (own <= (self.samples.size - 1) / self.rate)
         turned = np.exp(2j * np.pi * self.frequency * own)
@@ -211,7 +211,7 @@ class RecordedCall:
 
 
 def sound_of(settings: CallConfig, duration: float, key: str) -> Call | None:
-    """Return the call in a caller's settings; None for a plain tone.
+    """Build the call that a caller's settings describe; return None for a tone without taper.
 
     `duration`: of every call [s]; `key`: the caller's section, for errors.
 
@@ -233,7 +233,7 @@ def sound_of(settings: CallConfig, duration: float, key: str) -> Call | None:
 
 
 def settings_of(sound: Call | None) -> dict[str, Any]:
-    """Return the settings that reproduce a call; empty for a plain tone.
+    """Return the settings that give a caller this call; empty for a tone without taper.
 
     >>> settings_of(Sweep(60e3, 35e3, 2.8e-3))["band"]
     [60000.0, 35000.0]
@@ -249,7 +249,7 @@ def settings_of(sound: Call | None) -> dict[str, Any]:
 
 
 def with_calls(layer: Layer) -> Layer:
-    """Return settings with absolute paths of the calls' files."""
+    """Make the paths of calls' sound files in a layer of settings absolute."""
     here = Path.cwd() / "settings"
     calls = {key: given for key, given in layer.items() if key in CALL_KEYS}
     named = {
@@ -264,7 +264,7 @@ def with_calls(layer: Layer) -> Layer:
 
 
 def read_call(path: Path, frequency: float, duration: float, where: str) -> RecordedCall:
-    """Read a call from a sound file of a single channel; raise if it is not suitable.
+    """Read a call from a mono sound file; raise if its length, samples or frequency do not fit.
 
     `frequency`: centre of its band [Hz]; `duration`: longest allowed [s]; `where`: the setting that
     names the file, for errors.
@@ -314,7 +314,7 @@ def opened_sound(path: Path, where: str) -> "SoundFile":
 
 @contextmanager
 def sound_faults(where: str) -> Iterator[None]:
-    """Turn failures of soundfile into errors that name the file."""
+    """Convert errors of soundfile within the context into an `InputError` with the place."""
     from soundfile import SoundFileError
 
     try:
@@ -340,7 +340,7 @@ PADDING = 8
 
 
 class Band(NamedTuple):
-    """The frequency band of a call."""
+    """Frequency band of a call: its limits, centre and spread, with the call's energy."""
 
     low: float
     high: float
@@ -353,13 +353,13 @@ class Band(NamedTuple):
 
 
 def replica(call: Call, rate: float, scale: float = 1.0) -> Complex[np.ndarray, " n"]:
-    """Return a call's samples, with its frequency scaled by a factor."""
+    """Sample a call's waveform at a rate [Hz], with its centre frequency scaled by a factor."""
     time = np.arange(math.ceil(call.duration * rate - 1e-6)) / rate
     return call.waveform(time, scale * call.frequency)
 
 
 def band_of(call: Call, rate: float) -> Band:
-    """Return the band of a call at a sample rate [Hz].
+    """Compute the frequency band that holds nearly all energy of a call sampled at a rate [Hz].
 
     >>> band = band_of(Sweep(60e3, 35e3, 2.8e-3, taper=0.2), 200e3)
     >>> round(band.low / 1e3), round(band.high / 1e3), round(band.centre / 1e3, 1)
@@ -380,7 +380,7 @@ def band_of(call: Call, rate: float) -> Band:
 
 
 def extent_of(call: Call, rate: float) -> tuple[float, float]:
-    """Return the lowest and highest frequency of a call: a tone's own, or the ends of its band."""
+    """Return a call's lowest and highest frequency [Hz], equal for a tone burst."""
     if isinstance(call, ToneBurst):
         return call.frequency, call.frequency
     band = band_of(call, rate)
@@ -420,7 +420,7 @@ def check_sampled(
 
 
 def cross_talk(calls: Sequence[Call], rate: float) -> Float[np.ndarray, "c c"]:
-    """Return the relative power of each call in the matched filter of another, at the worst lag.
+    """Return the peak relative power of each call (column) in each call's matched filter (row).
 
     `rate` [Hz]. Row i is the filter of call i.
     """
@@ -432,7 +432,7 @@ def cross_talk(calls: Sequence[Call], rate: float) -> Float[np.ndarray, "c c"]:
 
 
 def lag_step(calls: Sequence[Call], rate: float) -> int:
-    """Return the step between outputs of the matched filters in samples, at a rate [Hz].
+    """Return the step between matched-filter outputs, in samples, by the widest band of the calls.
 
     >>> lag_step([ToneBurst(35e3, 2.8e-3)], 200e3)
     6

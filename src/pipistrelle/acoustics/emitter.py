@@ -23,7 +23,7 @@ HALF_POWER = 1.6163399483107033
 
 
 def jinc(x: Float[np.ndarray, "*n"] | float) -> Float[np.ndarray, "*n"]:
-    r"""Return the far field of a uniform disc, 1 on its axis.
+    r"""Return 2 J1(x) / x, the far-field pressure of a uniform disc relative to its axis.
 
     .. math:: \operatorname{jinc}(x) = 2 J_1(x) / x
 
@@ -55,7 +55,7 @@ def piston_directivity(
     radius: float,
     speed_of_sound: float,
 ) -> Float[np.ndarray, "*n"]:
-    r"""Return the pressure of a back-baffled circular piston, relative to its axis.
+    r"""Return the pressure of a back-baffled piston at angles off its axis, relative to the axis.
 
     .. math:: p(\phi) = \left| \frac{2 J_1(ka\sin\phi)}{ka\sin\phi} \right|
               \text{ for } |\phi| \le 90°, \text{ else } 0, \qquad k = 2\pi f / c
@@ -80,7 +80,7 @@ def piston_directivity(
 def beamwidth(
     radius: Float[np.ndarray, "*n"] | float, *, frequency: float, speed_of_sound: float
 ) -> Float[np.ndarray, "*n"]:
-    r"""Return the half-power beamwidth of a back-baffled piston.
+    r"""Return the full half-power beamwidth [rad] of a back-baffled piston of a radius [m].
 
     .. math:: 2 \arcsin \frac{x}{ka}, \quad (2 J_1(x) / x)^2 = \tfrac12, \quad x = 1.6163...
 
@@ -101,7 +101,7 @@ def beamwidth(
 
 
 def beamwidth_of(config: Config) -> float:
-    """Return the half-power beamwidth of the settings' vehicle [rad].
+    """Return the half-power beamwidth of the vehicle's piston in the settings [rad].
 
     >>> round(float(np.degrees(beamwidth_of(Config()))), 1)
     33.3
@@ -113,7 +113,7 @@ def beamwidth_of(config: Config) -> float:
 def piston_radius(
     beamwidth: Float[np.ndarray, "*n"] | float, *, frequency: float, speed_of_sound: float
 ) -> Float[np.ndarray, "*n"]:
-    r"""Return the radius of the piston with a half-power beamwidth.
+    r"""Return the radius [m] of the piston that has a given half-power beamwidth [rad].
 
     .. math:: a = \frac{x}{k \sin(\text{beamwidth} / 2)}, \quad (2 J_1(x) / x)^2 = \tfrac12
 
@@ -138,7 +138,7 @@ def piston_radius(
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Shape:
-    """The scattering law of a shape of body."""
+    """Scattering law of a body's shape: intensity by angle, and growth with the radius."""
 
     intensity: Callable[
         [Float[np.ndarray, "*n"] | float, float | Float[np.ndarray, " m"]], Float[np.ndarray, "*n"]
@@ -152,7 +152,7 @@ class Shape:
 def _cylinder(
     angle: Float[np.ndarray, "*n"] | float, kr: float | Float[np.ndarray, " m"]
 ) -> Float[np.ndarray, "*n"]:
-    """Return the relative intensity scattered by a cylinder, Eq. (4)."""
+    """Return the intensity that a cylinder scatters, relative to backscatter, by angle; Eq. (4)."""
     lit = np.abs(np.sin(np.asarray(angle) / 2.0))
     shadow = 1.0 - lit**2  # cos^2 of half the angle
     return lit + 4.0 * kr / np.pi * (shadow * np.sinc(kr * np.sin(angle) / np.pi)) ** 2
@@ -161,7 +161,7 @@ def _cylinder(
 def _sphere(
     angle: Float[np.ndarray, "*n"] | float, kr: float | Float[np.ndarray, " m"]
 ) -> Float[np.ndarray, "*n"]:
-    """Return the relative intensity scattered by a sphere."""
+    """Return the intensity that a sphere scatters, relative to backscatter, by angle."""
     shadow = 1.0 - np.abs(np.sin(np.asarray(angle) / 2.0)) ** 2
     return 1.0 + (kr * shadow * jinc(kr * np.sin(angle))) ** 2
 
@@ -190,7 +190,7 @@ def target_strength_db(
     shape: str,
     speed_of_sound: float,
 ) -> Float[np.ndarray, "*n"]:
-    r"""Return the scattered intensity relative to backscatter: 10 log10(I(angle) / I(pi)).
+    r"""Return the intensity that a body scatters at an angle [rad], relative to backscatter [dB].
 
     .. math:: I_\text{cylinder}(\gamma) &= \frac r2 \sin\frac\gamma2
               + \frac1{2\pi k} \cot^2\frac\gamma2 \, \sin^2(kr\sin\gamma) \\
@@ -218,7 +218,7 @@ def target_strength_db(
 
 
 def shape_of(name: str) -> Shape:
-    """Return the shape of a name; raise if it is unknown."""
+    """Return the scattering law of a named shape, such as "cylinder"; raise if it is unknown."""
     if name not in SHAPES:
         expected = " or ".join(map(repr, SHAPES))
         raise InputError(f"target.shape: found {name!r}, expected {expected}; choose")
@@ -233,7 +233,7 @@ def strength_of_bodies_db(
     frequency: float,
     speed_of_sound: float,
 ) -> Float[np.ndarray, "*k n"]:
-    r"""Return the scattered intensity of bodies relative to the usual target's backscatter.
+    r"""Return the intensity that bodies scatter [dB], relative to backscatter at the usual radius.
 
     Backscatter grows with the radius as :math:`I(\pi) = r / 2` for a cylinder and :math:`r^2 / 4`
     for a sphere, so a body of radius r has :math:`10 \log_{10} (r / r_0)` or :math:`20 \log_{10} (r
@@ -263,18 +263,18 @@ def strength_of_bodies_db(
 
 
 def backscatter_db(bodies: Bodies, usual: TargetConfig) -> Float[np.ndarray, " n"]:
-    """Return the backscatter of bodies relative to their shape with the usual radius [dB]."""
+    """Return each body's backscatter [dB], relative to its shape with the settings' radius."""
     growth = np.array([shape_of(name).growth for name in bodies.shape.tolist()])
     return 10.0 * growth * np.log10(_radius(bodies, usual) / usual.radius)
 
 
 def _radius(bodies: Bodies, usual: TargetConfig) -> Float[np.ndarray, " n"]:
-    """Return the bodies' radii [m], or the usual target's if not stated."""
+    """Return each body's radius [m], or the settings' radius if it is not stated."""
     return np.where(np.isnan(bodies.radius), usual.radius, bodies.radius)
 
 
 def with_usual(bodies: Bodies, count: int, usual: TargetConfig) -> Bodies:
-    """Append point bodies of the settings' shape to the given bodies."""
+    """Append a number of point bodies with the settings' shape to the given bodies."""
     return Bodies(
         radius=np.append(bodies.radius, np.full(count, np.nan)),
         shape=np.append(bodies.shape, np.full(count, usual.shape)),

@@ -37,7 +37,7 @@ def reflecting_points(
     centre: Float[np.ndarray, "_ t 2"],
     radius: Float[np.ndarray, " t"],
 ) -> Float[np.ndarray, "k t 2"]:
-    r"""Return the points of bodies on the shortest sound path from a source to a receiver.
+    r"""Return the point of each round body on the shortest sound path from source to receiver.
 
     On the lit side it is the mirror point (Alhazen's problem): at the angle t along the surface,
     from the direction of the receiver, at which both angles of incidence are equal,
@@ -84,7 +84,7 @@ def _mirror_points(
     receiver: Float[np.ndarray, "k t 2"],
     radius: Float[np.ndarray, " t"],
 ) -> Float[np.ndarray, "k t 2"]:
-    """Solve Alhazen's problem by bracketed Newton steps; vectors start at the centres."""
+    """Return the mirror point between source and receiver on circles, relative to their centres."""
     out, home = _length(source), _length(receiver)
     cross = receiver[..., 0] * source[..., 1] - receiver[..., 1] * source[..., 0]
     turn = np.arctan2(cross, np.sum(receiver * source, axis=-1))
@@ -121,7 +121,7 @@ def _incidence(
     distance: Float[np.ndarray, "k t"],
     radius: Float[np.ndarray, " t"],
 ) -> tuple[Float[np.ndarray, "k t"], Float[np.ndarray, "k t"]]:
-    """Return the angle of incidence on a body's surface, and its slope (above 0)."""
+    """Return the incidence angle at a circle's point, and its derivative by the point's angle."""
     cos = np.cos(angle)
     along, across = distance * cos - radius, distance * np.sin(angle)
     slope = distance * (distance - radius * cos) / (along * along + across * across)
@@ -287,7 +287,7 @@ def _at(caller: Caller, time: Float[np.ndarray, " t"], steps: Int[np.ndarray, " 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SoundPaths:
-    """Sound paths from t targets, landmarks and then callers, to the vehicle at k emissions."""
+    """Lengths, bearings and speeds of the sound paths from targets to the vehicle, by emission."""
 
     poses: Float[np.ndarray, "k 3"]
     """Poses of the vehicle [m, m, rad]."""
@@ -342,7 +342,7 @@ def paths_to_vehicle(
 def paths_over_surfaces(
     paths: SoundPaths, caller: int, extent: Float[np.ndarray, " t"]
 ) -> SoundPaths:
-    """Compute the sound paths from the surface points that reflect a caller's sound.
+    """Compute the sound paths to the vehicle from the surface points that reflect a caller's sound.
 
     The points move with caller and vehicle, but as the path is the shortest, the change of its
     length depends to first order only on its ends.
@@ -373,7 +373,7 @@ def _measured(
     target: Float[np.ndarray, "_ t 2"],
     drift: Float[np.ndarray, "_ t 2"] | None,
 ) -> SoundPaths:
-    """Compute the sound paths from all targets, landmarks first, to the vehicle."""
+    """Compute length, bearing and closing speed of the sound paths from targets to the vehicle."""
     offset = target - poses[:, np.newaxis, :2]
     homeward = np.hypot(offset[..., 0], offset[..., 1])
     east, north = velocities[:, :1], velocities[:, 1:]
@@ -399,7 +399,7 @@ def _measured(
 def _joined(
     landmarks: Float[np.ndarray, "n 2"], callers: Sequence[np.ndarray | None]
 ) -> Float[np.ndarray, "_ t 2"]:
-    """Append the callers' positions (or velocities) to the landmarks'."""
+    """Append the callers' positions or velocities to the landmarks', along the axis of targets."""
     rows = [np.reshape(np.asarray(caller), (-1, 1, 2)) for caller in callers]
     parts = [landmarks[np.newaxis], *rows]
     count = max(len(part) for part in parts)
@@ -409,7 +409,7 @@ def _joined(
 def turn_of_sound(
     incoming: Float[np.ndarray, "_ t 2"], offset: Float[np.ndarray, "k t 2"]
 ) -> Float[np.ndarray, "k t"]:
-    """Return the deflection angle of sound at a target; pi is straight back.
+    """Return the turn of the sound at each target [rad]; pi is straight back.
 
     `incoming` [m]: from the caller to each target; `offset` [m]: from the vehicle to each target.
     Returns [rad].

@@ -17,7 +17,7 @@ from pipistrelle.config import AirConfig, InputError, WaterConfig
 def spreading_loss_db(
     path: Float[np.ndarray, "*n"] | float, *, ways: Literal[1, 2] = 1
 ) -> Float[np.ndarray, "*n"]:
-    r"""Return the spherical spreading loss over a path, re 1 m.
+    r"""Return the spherical spreading loss over a path [dB], relative to 1 m.
 
     .. math:: \beta = r \, 20 \log_{10} \frac{d}{r}
        :label: eq-2
@@ -39,7 +39,7 @@ def passive_spreading_loss_db(
     *,
     law: Literal["paper", "bistatic"],
 ) -> Float[np.ndarray, "*n"]:
-    r"""Return the spreading loss of another caller's call over a landmark, re 1 m.
+    r"""Return the spreading loss from a caller by way of a landmark to the vehicle [dB].
 
     .. math:: \beta_\text{paper} = 20 \log_{10}(d_1 + d_2), \qquad
               \beta_\text{bistatic} = 20 \log_{10} d_1 + 20 \log_{10} d_2
@@ -70,7 +70,7 @@ def absorption_db_per_m(
     relative_humidity: float,
     pressure_kpa: float,
 ) -> Float[np.ndarray, "*n"]:
-    r"""Return the absorption of a pure tone by moist air.
+    r"""Return the absorption of a pure tone by moist air [dB/m].
 
     .. math:: \alpha = 8.686 f^2 \left[ 1.84 \cdot 10^{-11} \frac{\tau^{1/2}}{p}
               + \tau^{-5/2} \left( 0.01275 e^{-2239.1/T} \frac{f_{rO}}{f_{rO}^2 + f^2}
@@ -118,7 +118,7 @@ def water_absorption_db_per_m(
     depth: float,
     ph: float,
 ) -> Float[np.ndarray, "*n"]:
-    r"""Return the absorption of a pure tone by sea or fresh water.
+    r"""Return the absorption of a pure tone by sea or fresh water [dB/m].
 
     .. math:: \alpha = A_1 \frac{f_1 f^2}{f_1^2 + f^2} + A_2 P_2 \frac{f_2 f^2}{f_2^2 + f^2}
               + A_3 P_3 f^2
@@ -203,7 +203,7 @@ def doppler_frequency(
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Medium:
-    """A homogeneous medium at rest.
+    """A homogeneous medium at rest: its speed of sound, absorption and spreading law.
 
     Helium, without absorption:
 
@@ -222,7 +222,7 @@ class Medium:
 
 @lru_cache(maxsize=64)
 def medium_of(section: AirConfig | WaterConfig) -> Medium:
-    """Return the medium of a section of the settings (`Config.medium`).
+    """Build the medium, air or water, from its section of the settings (`Config.medium`).
 
     Absorption in air is from ISO 9613-1, in water from Francois and Garrison.
 
