@@ -36,7 +36,7 @@ _KNOWN = tuple(math.atan(slope) for slope in (0.25, 0.5, 0.75, 1.0))
 
 @inlined
 def _series(coefficients, x):
-    """Return the sum of coefficients times powers of x, the highest power first."""
+    """Evaluate a polynomial at x from its coefficients, the highest power first."""
     total = 0.0
     for coefficient in coefficients:
         total = total * x + coefficient

@@ -25,7 +25,7 @@ _QUARTER_TURN = _F(0.5 * math.pi)
 
 
 def stream_key(seed: int, iteration: int, purpose: str, frame: int = 0) -> int:
-    """Return the key of a random stream, in [0, 2^64): equal arguments give an equal key.
+    """Return the 64-bit key of a random stream, a hash of seed, iteration, purpose and frame.
 
     `purpose`: use of the numbers; streams of different purposes are independent.
 
@@ -43,7 +43,7 @@ def stream_key(seed: int, iteration: int, purpose: str, frame: int = 0) -> int:
 def complex_noise(
     shape: tuple[int, ...], std: float, key: int, out: Complex[np.ndarray, "..."] | None = None
 ) -> Complex[np.ndarray, "..."]:
-    """Draw circular complex normal noise.
+    """Draw an array of circular complex normal noise from the random stream of a key.
 
     Sample i, in C order, is number i of the stream. `std`: root of the mean of abs(noise)**2;
     `key`: from `stream_key`; `out`: contiguous, written and returned instead of a new array.
@@ -59,7 +59,7 @@ def complex_noise(
 
 @kernel
 def _fill(out, variance, key):
-    """Fill interleaved real and imaginary parts with the first numbers of a stream."""
+    """Fill an array with a stream's complex normal noise, real and imaginary parts interleaved."""
     count = out.size // 2
     radial, angular = np.empty(_CHUNK, dtype=np.uint32), np.empty(_CHUNK, dtype=np.uint32)
     modulus, mantissa = np.empty(_CHUNK, dtype=np.float32), np.empty(_CHUNK, dtype=np.uint32)
@@ -85,7 +85,7 @@ def _fill(out, variance, key):
 
 @kernel
 def _split(bits, mantissa, exponent, length):
-    """Split floats, given by their bits, into a mantissa in [1, 2), as bits, and an exponent."""
+    """Write the mantissa bits and the biased exponent of 32-bit floats, which are given as bits."""
     for i in range(length):
         exponent[i] = bits[i] >> np.uint32(23)
         mantissa[i] = (bits[i] & np.uint32(0x7FFFFF)) | np.uint32(0x3F800000)
@@ -93,7 +93,7 @@ def _split(bits, mantissa, exponent, length):
 
 @kernel
 def _modulus(mantissa, exponent, length, variance, modulus):
-    """Write sqrt(-variance ln w), w = 2^(e - 127) m / 2^32 in (0, 1]."""
+    """Write moduli of complex normal noise: sqrt(-variance ln w) of random numbers w in (0, 1]."""
     for i in range(length):
         m = mantissa[i]
         halvings = _F(127 + 32) - _F(exponent[i])
@@ -108,7 +108,7 @@ def _modulus(mantissa, exponent, length, variance, modulus):
 
 @kernel
 def _turn(modulus, angular, length, real, imaginary):
-    """Convert moduli and 32-bit angles (turn: 2 bits of quarters, 30 of their part) to x and y."""
+    """Write the parts x and y of complex numbers from their moduli and random 32-bit angles."""
     for i in range(length):
         fraction = _F(np.int32(angular[i] & np.uint32(0x3FFFFFFF))) * _F(2.0**-30)
         x = (fraction - _F(0.5)) * _QUARTER_TURN

@@ -32,7 +32,7 @@ UNKNOWN = math.pi / math.sqrt(3.0)
 
 
 class Pattern(NamedTuple):
-    """Resolution and ambiguities of a group of microphones at a frequency."""
+    """Beamwidths, side lobes and ambiguous bearings of a group of microphones at a frequency."""
 
     microphones: int
     aperture: float
@@ -54,7 +54,7 @@ class Pattern(NamedTuple):
 
 
 def pattern_of(layout: Scattered, g: int, *, frequency: float, speed_of_sound: float) -> Pattern:
-    """Compute resolution and ambiguities of a group of microphones at a frequency [Hz].
+    """Compute beamwidths, side lobes and bearing bounds of a group of microphones at a tone [Hz].
 
     Over all bearings, or for a line on a face within 75 degrees of its normal. `speed_of_sound`
     [m/s].
@@ -106,7 +106,7 @@ def beam_power(
     frequency: float,
     speed_of_sound: float,
 ) -> Float[np.ndarray, " n"]:
-    """Return the power response of a group's beam to waves from bearings [rad]; 1 at the peak."""
+    """Return a steered beam's power response to waves from given bearings [rad]; 1 at the peak."""
     members = layout.group == g
     share = layout.amplitude[members] ** 2 / np.sum(layout.amplitude[members] ** 2)
     lead = (layout.lead(bearing) - layout.lead(steered))[:, members]
@@ -116,7 +116,7 @@ def beam_power(
 def _bearings(
     normal: float, place: Float[np.ndarray, "k 2"], share: Float[np.ndarray, " k"], wave: float
 ) -> tuple[Float[np.ndarray, " n"], bool]:
-    """Return the bearings that a group can receive from, and whether they form a circle."""
+    """Return sampled bearings that a group can receive from, and whether they form a circle."""
     around = np.linspace(-np.pi, np.pi, STEERED, endpoint=False)
     turn = wave * np.sqrt(spread_towards(around, place, np.sqrt(share)).max())
     count = min(max(math.ceil(2.0 * np.pi * turn / PHASE_STEP), STEERED), MOST_WAVES)
@@ -131,7 +131,7 @@ def spread_towards(
     position: Float[np.ndarray, "k 2"],
     weight: Float[np.ndarray, " k"],
 ) -> Float[np.ndarray, "*n"]:
-    r"""Return the variance of the microphones' positions across a direction [m^2].
+    r"""Return the weighted variance of microphone positions perpendicular to a direction [m^2].
 
     Weighted by the squared weights. Times the wavenumber squared it is :math:`\kappa`, the squared
     slope of the phases in the bearing in the Cramer-Rao bound
@@ -174,7 +174,7 @@ def steering_vector(
     frequency: float,
     speed_of_sound: float,
 ) -> Complex[np.ndarray, "*n e"]:
-    r"""Return the phases of a unit plane wave from an angle at the elements.
+    r"""Return the complex response of each element of a line array to a unit plane wave.
 
     .. math:: v_e(\theta) = e^{2\pi i f y_e \sin\theta / c}
 
@@ -199,7 +199,7 @@ def beampattern(
     frequency: float,
     speed_of_sound: float,
 ) -> Float[np.ndarray, "*n"]:
-    r"""Return the power response of a beam steered to one angle to waves from others.
+    r"""Return the power response of a line array's beam, steered to an angle, to other waves.
 
     .. math:: B(\theta) = \left| \frac{1}{N} v(\theta_0)^H v(\theta) \right|^2
 
@@ -224,7 +224,7 @@ def beamscan(
     frequency: float,
     speed_of_sound: float,
 ) -> Float[np.ndarray, " n"]:
-    r"""Return the power of a conventional beam over angles, with peaks at a snapshot's sources.
+    r"""Return the power that a conventional beam receives from each angle in a snapshot.
 
     .. math:: P(\theta) = \left| v(\theta)^H x \right|^2
 

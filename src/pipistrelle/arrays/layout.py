@@ -75,7 +75,7 @@ _FACE = re.compile(r"[\w-]{0,40}")
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Microphones:
-    """The microphones of an array, a row per channel."""
+    """Channels, positions, gains and faces of the microphones of an array."""
 
     channel: Int[np.ndarray, " m"]
     """Channel number: without gaps, from 0 or 1, in the order of a recording's channels."""
@@ -130,7 +130,7 @@ def read_array(path: Path, *, some: bool = False) -> Microphones:
 
 
 def microphones_of(rows: Sequence[MicrophoneRow], where: str = "receiver.array") -> Microphones:
-    """Return the microphones of a setting's rows: x, y, z [m], gain [dB] and face of each.
+    """Build the microphones from rows of the settings: x, y, z [m], gain [dB] and face of each.
 
     >>> microphones_of([(0.0, 0.1, 0.0, 0.0, ""), (0.0, -0.1, 0.0, 0.0, "")]).channel
     array([1, 2])
@@ -145,7 +145,7 @@ def microphones_of(rows: Sequence[MicrophoneRow], where: str = "receiver.array")
 
 
 def with_array(layer: Layer) -> Layer:
-    """Replace the name of an array's file in a layer of settings by its microphones."""
+    """Replace an array's file name in a layer of settings by the rows of its microphones."""
     given = layer.get(ARRAY_KEY)
     if given is None or not isinstance(given.value, str) or given.value in ("", SQUARE):
         return layer
@@ -161,7 +161,7 @@ def with_array(layer: Layer) -> Layer:
 def _checked(
     where: str, places: Sequence[str], microphones: Microphones, *, some: bool = False
 ) -> Microphones:
-    """Return microphones sorted by channel; raise if they are not an array.
+    """Return sorted microphones unchanged; raise if number, channels or positions are invalid.
 
     `places`: their lines or rows, for errors; `some`: as in `read_array`.
     """
@@ -228,7 +228,7 @@ def write_array(path: Path, microphones: Microphones) -> None:
 
 
 def _text_of_xml(path: Path, data: bytes) -> str | None:
-    """Decode XML by its byte order mark, declaration or UTF-8; return None for other files."""
+    """Decode a file's bytes if they are XML, as declared or in UTF-8; return None otherwise."""
     marked = next((name for mark, name in _MARKS.items() if data.startswith(mark)), None)
     if marked is None and not data.lstrip().startswith(b"<"):
         return None
@@ -253,7 +253,7 @@ def _text_of_xml(path: Path, data: bytes) -> str | None:
 
 
 def _rows_of_xml(path: Path, text: str) -> list[tuple[int, list[str]]]:
-    """Return line and fields of each microphone in Acoular's XML; raise at a document type."""
+    """Return line number and fields of each microphone in Acoular's XML; raise if it is invalid."""
     rows: list[tuple[int, list[str]]] = []
     parser = expat.ParserCreate("utf-8")  # overrides the declared encoding, as the text is decoded
     expected = "Acoular's <MicArray><pos x=... y=... z=.../></MicArray>"
@@ -288,7 +288,7 @@ LINE_TOLERANCE = 1e-5
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Layout:
-    """Equal, back-baffled line arrays around one phase centre, the vehicle's position.
+    """Equal, back-baffled line arrays on faces, with the vehicle's position as phase centre.
 
     An element receives within 90 degrees of its face's normal. The faces' offsets from the centre
     (some 25 mm) are neglected: they would shift delays by less than 0.1 ms.
@@ -301,11 +301,11 @@ class Layout:
 
     @property
     def shape(self) -> tuple[int, int]:
-        """Number of faces, and elements of each."""
+        """Number of faces, and number of microphones per face."""
         return self.normal.size, self.position.size
 
     def members(self, g: int) -> tuple[int, Int[np.ndarray, " k"]]:
-        """Return the row of a face in a recording, and the indices of its microphones there."""
+        """Return a face's index in a recording, and its microphones' indices within the face."""
         return g, np.arange(self.position.size)
 
     def places(self, g: int) -> tuple[Float[np.ndarray, "k 2"], Float[np.ndarray, " k"]]:
@@ -319,7 +319,7 @@ class Layout:
         frequency: float,
         speed_of_sound: float,
     ) -> Float[np.ndarray, "*n e"]:
-        r"""Return the phases [rad] at the elements of a plane wave at an angle off a face's normal.
+        r"""Return a plane wave's phases [rad] at a face's elements, by angle off the face's normal.
 
         .. math:: \varphi_e(\theta) = 2\pi f \, y_e \sin\theta / c
 
@@ -335,7 +335,7 @@ class Layout:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Scattered:
-    """Microphones in any positions on the vehicle, in groups that are scanned together.
+    """Microphones at any positions on the vehicle, in groups that form separate beams.
 
     A plane wave reaches a microphone at p earlier than the vehicle's centre by p . u / c, with u
     the unit vector to the source. Sound travels horizontally: heights are ignored.
@@ -355,11 +355,11 @@ class Scattered:
 
     @property
     def shape(self) -> tuple[int, int]:
-        """One row, and the number of microphones."""
+        """Shape of a recording's face and microphone axes: 1, and the number of microphones."""
         return 1, len(self.position)
 
     def members(self, g: int) -> tuple[int, Int[np.ndarray, " k"]]:
-        """Return the row of a group in a recording, and the indices of its microphones there."""
+        """Return 0, the only face index of a recording, and a group's microphone indices there."""
         return 0, np.flatnonzero(self.group == g)
 
     def places(self, g: int) -> tuple[Float[np.ndarray, "k 2"], Float[np.ndarray, " k"]]:
@@ -368,7 +368,7 @@ class Scattered:
         return self.position[members], self.amplitude[members]
 
     def lead(self, bearing: Float[np.ndarray, "*n"] | float) -> Float[np.ndarray, "*n e"]:
-        """Return the microphones' positions along the direction to a bearing [rad], in metres.
+        """Return each microphone's distance ahead of the centre, towards bearings [rad], in metres.
 
         >>> pair = scattered(microphones_of([(0.1, 0, 0, 0, ""), (0, 0.2, 0, 0, "")]))
         >>> pair.lead(np.pi / 2).round(9)
@@ -379,14 +379,14 @@ class Scattered:
 
 
 def layout_of(config: Config) -> Layout | Scattered:
-    """Return the array of the settings, as lines on a square or scattered microphones."""
+    """Build the array of the settings: line arrays on a square, or microphones at any positions."""
     if config.receiver.array == SQUARE:
         return square_of_four(config.receiver)
     return scattered(microphones_in(config))
 
 
 def microphones_in(config: Config) -> Microphones:
-    """Return the microphones of the settings."""
+    """Return the microphones of the settings: of the square, of a file, or listed."""
     array = config.receiver.array
     if array == SQUARE:
         return square_microphones(config.receiver)
@@ -428,7 +428,7 @@ def scattered(microphones: Microphones, where: str = "receiver.array") -> Scatte
 
 
 def at_one_centre(microphones: Microphones, where: str) -> tuple[Layout, Int[np.ndarray, "f e"]]:
-    """Return faces of equal lines as if at the vehicle's position, and each element's microphone.
+    """Build equal line arrays at the vehicle's position; also return each element's microphone.
 
     Faces are sorted by their first channels; `where`: their origin, for errors.
 
@@ -454,7 +454,7 @@ def at_one_centre(microphones: Microphones, where: str) -> tuple[Layout, Int[np.
 
 
 def square_microphones(receiver: ReceiverConfig) -> Microphones:
-    """Return the microphones of the square, on four faces around the vehicle's centre.
+    """Return the microphones of the square array, on four faces around the vehicle's centre.
 
     >>> square_microphones(ReceiverConfig()).position.shape
     (40, 3)
@@ -470,7 +470,7 @@ def square_microphones(receiver: ReceiverConfig) -> Microphones:
 
 
 def along_line(layout: Scattered, g: int) -> tuple[Int[np.ndarray, " k"], Layout]:
-    """Return the indices of a line's microphones from right to left, and its layout."""
+    """Return the indices of a line array's microphones from right to left, and its layout."""
     _, members = layout.members(g)
     left = np.array([-np.sin(layout.normal[g]), np.cos(layout.normal[g])])
     along = layout.position[members] @ left
@@ -501,7 +501,7 @@ def _normal(place: Float[np.ndarray, "k 2"], middle: Float[np.ndarray, "2"]) -> 
 
 
 def square_of_four(receiver: ReceiverConfig) -> Layout:
-    """Return the layout of four faces, to the front, left, back and right.
+    """Return the layout of four equal line arrays, facing front, left, back and right.
 
     `receiver` has the number of elements and their spacing [m]. Bradley & Abaid, Sec. II-C.
 

@@ -56,7 +56,7 @@ def noise_blocks(
     key: int,
     out: Complex[np.ndarray, "b f c e"] | None = None,
 ) -> Complex[np.ndarray, "b f c e"]:
-    """Draw the block sums of the microphones' noise: independent, of variance 40 sigma^2.
+    """Draw the microphones' noise as sums over blocks of samples, independent for each tone.
 
     `key`: of the random stream; a block's noise does not depend on their number; `out`: written and
     returned instead of a new array.
@@ -71,7 +71,7 @@ def add_echo_blocks(
     layout: Layout | Scattered,
     sampling: Sampling,
 ) -> None:
-    """Add the block sums of arrivals to a recording, from the end of the vehicle's call."""
+    """Add arrivals to a recording of block sums, which begins at the end of the vehicle's call."""
     for call in sampling.calls:
         if not isinstance(call, ToneBurst):
             raise InputError(
@@ -92,7 +92,7 @@ def add_echo_blocks(
 def _heard_by_each(
     arrivals: Arrivals, layout: Scattered, speed_of_sound: float
 ) -> tuple[Float[np.ndarray, "a e"], Float[np.ndarray, "a e"]]:
-    """Return each microphone's lead over the centre [s] and gain, for each arrival."""
+    """Return each microphone's time lead over the centre [s] and gain, for each arrival."""
     off = np.cos(arrivals.bearing[:, np.newaxis] - layout.normal[layout.group])
     ahead = ~(off < 0.0)  # NaN: all directions
     early = layout.lead(arrivals.bearing) / speed_of_sound
@@ -108,7 +108,7 @@ def record_samples(
     *,
     single: bool = False,
 ) -> Complex[np.ndarray, "t f e"] | Float[np.ndarray, "t f e"]:
-    """Record every sample of a frame at the full rate: the reference engine.
+    """Return every sample that the microphones record in a frame: the reference engine.
 
     `blocks`: length; the first sample follows the vehicle's call; `rng`: None records without
     noise; `single`: in single precision. Returns (blocks * 40, faces, elements).
@@ -144,7 +144,7 @@ def record_samples(
 def _noise(
     shape: tuple[int, ...], sampling: Sampling, rng: np.random.Generator | None, *, single: bool
 ) -> Complex[np.ndarray, "t f e"] | Float[np.ndarray, "t f e"]:
-    """Draw the samples of the microphones' noise."""
+    """Draw the microphones' noise for every sample, real or complex; zeros without a generator."""
     real, whole = (np.float32, np.complex64) if single else (np.float64, np.complex128)
     if rng is None:
         return np.zeros(shape, dtype=real if sampling.real else whole)
@@ -158,7 +158,7 @@ def _noise(
 def _wave(
     length: int, arrivals: Arrivals, a: int, early: float, duration: float, sampling: Sampling
 ) -> tuple[slice, Complex[np.ndarray, " n"]]:
-    """Return the samples of an arrival with a lead [s] in a record of a length, and its wave."""
+    """Return the slice of a recording that an arrival fills at a microphone, and its samples."""
     first, rate, delay = sampling.pulse * sampling.block, sampling.rate, arrivals.delay[a] - early
     start = max(math.ceil(delay * rate), first)
     stop = max(min(math.ceil((delay + duration) * rate), first + length), start)
@@ -168,13 +168,13 @@ def _wave(
 
 
 def _durations(arrivals: Arrivals, sampling: Sampling) -> Float[np.ndarray, " a"]:
-    """Return the length of each arrival [s]: the Doppler shift scales the call."""
+    """Return the duration of each arrival [s], a call's scaled by the Doppler shift."""
     nominal, length = sampling.tones[arrivals.caller], [call.duration for call in sampling.calls]
     return np.array(length)[arrivals.caller] * nominal / arrivals.frequency
 
 
 class _Sounds(NamedTuple):
-    """Arrivals as the kernels use them."""
+    """Delay, amplitude, bearing, frequency and duration of arrivals, for compiled functions."""
 
     delay: Float[np.ndarray, " a"]
     amplitude: Float[np.ndarray, " a"]
@@ -185,7 +185,7 @@ class _Sounds(NamedTuple):
 
 
 class _Grid(NamedTuple):
-    """The blocks and tones of a recording."""
+    """Tones, sample rate and block lengths of a recording, for compiled functions."""
 
     tones: Float[np.ndarray, " c"]
     rate: float
@@ -197,7 +197,7 @@ class _Grid(NamedTuple):
 
 @kernel
 def _geometric_sum(omega: float, start: Whole, stop: Whole) -> complex:
-    """Return the sum of exp(i omega n) over start <= n < stop."""
+    """Return the sum of exp(i omega n) over the integers n with start <= n < stop."""
     count = stop - start
     half = 0.5 * omega
     gain = float(count) if half == 0.0 else math.sin(half * count) / math.sin(half)
@@ -214,7 +214,7 @@ def _envelope(
     stop: Whole,
     block: Whole,
 ) -> Whole:
-    """Write a tone's block sums of exp(i omega n), start <= n < stop; return their number."""
+    """Write the sums of a complex exponential over the blocks it covers; return their number."""
     first, last = start // block, (stop - 1) // block
     sums[p, 0] = _geometric_sum(omega, start, min(stop, (first + 1) * block))
     if last == first:
@@ -236,7 +236,7 @@ def _steer(
     wave: float,
     position: Float[np.ndarray, " e"],
 ) -> None:
-    """Write a phasor times each element's phase, and i times that, parts interleaved."""
+    """Write an arrival's phasor at each element, and i times it, real and imaginary interleaved."""
     elements = position.size
     for e in range(elements):
         mirror = elements - 1 - e
@@ -261,7 +261,7 @@ def _add_echo(
     frequency: float,
     ears: tuple,
 ) -> None:
-    """Add an arrival's envelope, times its steering vector, to its blocks.
+    """Add an arrival to the block sums of every face that receives it.
 
     ``room``: block sums of the envelope per tone, and work arrays; ``ears``: normals of the faces,
     positions of the elements, and the speed of sound.
@@ -285,7 +285,7 @@ def _add_echo(
 def _add_echo_blocks(
     signal: Float[np.ndarray, "b f c i"], sounds: tuple, grid: tuple, ears: tuple
 ) -> None:
-    """Add every arrival to interleaved block sums, with real and imaginary parts as neighbours."""
+    """Add every arrival to the faces' block sums, with real and imaginary parts interleaved."""
     sound, on = _Sounds(*sounds), _Grid(*grid)
     blocks, _, tones, parts = signal.shape
     rate, block, blank = on.rate, on.block, on.blank
@@ -316,7 +316,7 @@ def _add_scattered_blocks(
     early: Float[np.ndarray, "a e"],
     gain: Float[np.ndarray, "a e"],
 ) -> None:
-    """Add every arrival to each microphone's block sums, with its lead [s] and gain."""
+    """Add every arrival to each microphone's block sums, by its time lead [s] and gain there."""
     sound, on = _Sounds(*sounds), _Grid(*grid)
     blocks, tones, elements = signal.shape
     rate, block, blank = on.rate, on.block, on.blank
@@ -347,7 +347,7 @@ def real_samples(
     rng: np.random.Generator,
     leak: float = 0.0,
 ) -> Float[np.ndarray, "t m"]:
-    """Return the real samples of the microphones from one call of the vehicle to the next.
+    """Simulate the microphones' real samples from one call of the vehicle to the next.
 
     `sums`: (blocks, faces, callers, elements) complex, or (samples, faces, elements) real, from the
     end of the vehicle's call; `arrivals`: their sources, besides noise; `length`: samples from the
@@ -377,7 +377,7 @@ def real_samples(
 def _replace_tones(
     samples: Float[np.ndarray, "b n m"], sums: Complex[np.ndarray, "b f c e"], sampling: Sampling
 ) -> None:
-    """Replace the components of blocks of samples at the tones by given sums, in place."""
+    """Change blocks of samples in place so that their sums at each tone are the given ones."""
     turns = np.outer(sampling.tones, np.arange(sampling.block)) / sampling.rate
     wave = np.exp(-2j * np.pi * turns)
     wanted = np.moveaxis(sums, 2, 1).reshape(len(sums), len(wave), samples.shape[2])

@@ -27,7 +27,7 @@ LEAST_RATE, LARGEST_RATE = 8e3, 1e6
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Sampling:
-    """Rate, blocks and calls of a frame; the receiver is blanked while the vehicle calls."""
+    """Recorder settings of a frame: sample rate, block length, calls and noise."""
 
     rate: float
     """[Hz]."""
@@ -50,7 +50,7 @@ class Sampling:
 
     @property
     def interval(self) -> float:
-        """Length of a block [s]."""
+        """Duration of a block of samples [s]."""
         return self.block / self.rate
 
 
@@ -61,7 +61,7 @@ def sampling(
     call: Callable[[float, float], Call] = ToneBurst,
     medium: Medium | None = None,
 ) -> Sampling:
-    """Choose rate, blocks and calls of a frame from the settings and callers.
+    """Choose sample rate, block length and calls of a recording from the settings and callers.
 
     `callers`: up to 8, the vehicle first; their calls replace the settings'; `call`: makes a call
     of a frequency [Hz] and duration [s]; `medium`: by default the settings'. Raises InputError if
@@ -107,7 +107,7 @@ def sampling(
 
 
 def off_raster(config: Config, callers: Sequence[Caller]) -> str | None:
-    """Return the first reason why block sums of 0.2 ms do not suffice; None if they do.
+    """Return why rate, tones or call length do not fit blocks of 0.2 ms; None if they fit.
 
     >>> from pipistrelle.acoustics.paths import callers_of
     >>> from pipistrelle.config import BeaconConfig
@@ -132,7 +132,7 @@ def off_raster(config: Config, callers: Sequence[Caller]) -> str | None:
 
 
 def _keys(callers: Sequence[Caller]) -> list[str]:
-    """Return the setting of each caller's frequency."""
+    """Return the key of the setting of each caller's frequency, for errors."""
     return [f"{caller.key or caller.name}.frequency" for caller in callers]
 
 
@@ -160,7 +160,7 @@ def _refuse_undersampled(config: Config, callers: Sequence[Caller], calls: Seque
 
 
 def clear_frequency(config: Config) -> float:
-    r"""Return the highest tone without grating lobes and without aliases [Hz].
+    r"""Return the highest tone that the array receives without grating lobes or aliases [Hz].
 
     Elements at a distance d cannot distinguish the angle :math:`\theta` off their normal from the
     grating lobe, :math:`\sin\theta_g = \sin\theta - \lambda / d`. For a wavelength above d times (1
@@ -181,7 +181,7 @@ def clear_frequency(config: Config) -> float:
 
 
 def free_tones(config: Config, callers: Sequence[Caller], near: float) -> str:
-    """Format the two nearest free unambiguous tones for an error; empty if there are none.
+    """Format the two unused, unambiguous tones nearest to a frequency, for an error; empty if none.
 
     >>> from pipistrelle.acoustics.paths import callers_of
     >>> free_tones(Config(), callers_of(Config(), np.zeros(2)), 31e3)
@@ -199,7 +199,7 @@ def free_tones(config: Config, callers: Sequence[Caller], near: float) -> str:
 
 
 def _refuse_alike(config: Config, callers: Sequence[Caller], keys: Sequence[str]) -> None:
-    """Raise if two tones are in the same bin of a block, directly or by aliasing."""
+    """Raise if two callers' tones are in the same frequency bin of a block, directly or aliased."""
     rate = config.receiver.sample_rate
     for j, (key, caller) in enumerate(zip(keys, callers, strict=True)):
         for other in callers[:j]:
@@ -233,7 +233,7 @@ def blocks_to_hear(
 def block_shape(
     blocks: int, layout: Layout | Scattered, sampling: Sampling
 ) -> tuple[int, int, int, int]:
-    """Return the shape of a recording in block sums.
+    """Return the shape of a recording as block sums: blocks, faces, tones, elements.
 
     >>> from pipistrelle.acoustics.paths import callers_of
     >>> from pipistrelle.arrays.layout import square_of_four
