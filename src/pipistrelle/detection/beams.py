@@ -118,7 +118,7 @@ _ANGLES = (0.0, 0.7, 1.3)
 
 
 class Beams(NamedTuple):
-    """The beams of a group of microphones."""
+    """Directions, microphone positions and weights of the beams of a group of microphones."""
 
     bearing: Float[np.ndarray, " n"]
     """Directions that are scanned [rad]."""
@@ -169,7 +169,7 @@ class Wide(NamedTuple):
 
 
 class _Call(NamedTuple):
-    """How a call's outputs are interpolated between lags."""
+    """Frequency, length and interpolation between lags of a call's matched-filter outputs."""
 
     frequency: float
     """Of a tone, or centre of the band, shifted to 0 in the outputs [Hz]."""
@@ -210,7 +210,7 @@ def circle_of(
 def wide_of(
     config: Config, layout: Layout | Scattered, group: int, calls: Sequence[Call], caller: int
 ) -> Wide:
-    """Build the detector of a wideband call for a face, or another group."""
+    """Build the detector of a wideband call for the microphones of a face or another group."""
     rate, c = config.receiver.sample_rate, config.assumed_sound_speed
     normal, (place, gain) = float(layout.normal[group]), layout.places(group)
     weight = gain / np.linalg.norm(gain)
@@ -252,7 +252,7 @@ def wide_of(
 
 
 def loudest_by_chance(chance: float, looks: float, microphones: int) -> float:
-    r"""Return the loudness that noise exceeds, somewhere in the scan, with a given probability.
+    r"""Return the beam power that noise exceeds, in any direction, with a given probability.
 
     `looks` is :math:`\int \sqrt{\kappa} d\phi` over the scan.
 
@@ -274,7 +274,7 @@ def loudest_by_chance(chance: float, looks: float, microphones: int) -> float:
 def find_around(
     matched: Complex[np.ndarray, "l c k"], circle: Circle, lags: Lags
 ) -> tuple[Int[np.ndarray, " m"], Float[np.ndarray, "6 m"]]:
-    """Detect the tones at a group of microphones, at most once in each snapshot.
+    """Return caller, delay, bearing and power of the tones that a group of microphones detects.
 
     Returns the caller of each; delay at the vehicle's centre [s], bearing [rad], power, the
     standard deviations of bearing and delay, and the arctangent of the bearing's slope in the
@@ -292,7 +292,7 @@ def edge_around(
     p: int,
     bearing: float,
 ) -> tuple[float, float]:
-    """Return `direct.front_edge` of a beam, for a detection of tone p at lag b and a bearing."""
+    """Return start and std of a tone [lags] in the beam to a detection's bearing (`front_edge`)."""
     stride, margin = max(lags.pulse // STRIDES, 1), _margin(circle.beams, lags.interval)
     low = max((b - 2 * (lags.pulse + stride)) // stride * stride, 0)
     beam = np.empty(min(b + stride + 1, len(matched)) - low, dtype=np.complex128)
@@ -309,7 +309,7 @@ def find_wide(
     lags: Lags,
     around: Callable[[], Complex[np.ndarray, "n k"]] | None = None,
 ) -> tuple[Float[np.ndarray, "6 m"], Bool[np.ndarray, " m"]]:
-    """Detect the wideband calls at a group, at most once at a time.
+    """Return delay, bearing and power of the wideband calls that a group of microphones detects.
 
     `around`: returns the outputs also at lags at which a call is only partly in the record, equally
     many at each end; called if a loud peak is near an end. Returns the numbers of `find_around`, on
@@ -343,19 +343,19 @@ def find_wide(
 
 
 def _margin(beams: Beams, interval: float) -> int:
-    """Return the largest lead or delay of a microphone, in lags of an interval [s]."""
+    """Return an upper bound, in lags, of any microphone's time lead over the beams' centre."""
     lag = beams.speed_of_sound * interval
     return math.ceil(np.linalg.norm(beams.position, axis=1).max() / lag) + 2
 
 
 def _padded(matched: Complex[np.ndarray, "l c k"], margin: int) -> Complex[np.ndarray, "c _ k"]:
-    """Return the outputs of each caller with silence before and after."""
+    """Pad the matched-filter outputs of each caller with zeros at both ends."""
     around = ((0, 0), (margin, margin), (0, 0))
     return np.pad(matched.transpose(1, 0, 2).astype(np.complex128), around)
 
 
 def _sinc() -> Float[np.ndarray, "p t"]:
-    """Return the windowed sinc at positions between two outputs, a row each."""
+    """Return the taps of a windowed-sinc interpolator for each fraction between two outputs."""
     away = np.arange(TAPS) - (TAPS // 2 - 1) - np.arange(PARTS + 1)[:, np.newaxis] / PARTS
     window = np.i0(BETA * np.sqrt(np.clip(1.0 - (away / (TAPS // 2)) ** 2, 0.0, None)))
     return np.sinc(away) * window / np.i0(BETA)
@@ -368,7 +368,7 @@ _SINC, _LINEAR = _sinc(), np.empty((0, 0))
 def _delayed(
     early: float, at: float, frequency: float, interval: float
 ) -> tuple[Whole, float, complex, complex]:
-    """Return the interpolation of a tone at a microphone that leads the centre by `early` [s].
+    """Return how to interpolate a tone between two lags at a microphone ahead by `early` [s].
 
     The first of two lags and the fraction of the way to the next, and the phases that turn the
     outputs there to the centre's.
@@ -384,7 +384,7 @@ def _delayed(
 def _output(
     matched: Complex[np.ndarray, "l k"], at: float, bearing: float, beams: Beams, call: _Call
 ) -> tuple[complex, float, float]:
-    """Return the beam to a bearing at a fractional lag, its energy, and its noise variance."""
+    """Return a beam's output at a bearing and a fractional lag, its energy, and noise variance."""
     ahead, left = math.cos(bearing), math.sin(bearing)
     total, energy, noise = 0.0j, 0.0, 0.0
     parts = call.sinc.shape[0] - 1
@@ -417,14 +417,14 @@ def _output(
 def _power(
     matched: Complex[np.ndarray, "l k"], at: float, bearing: float, beams: Beams, call: _Call
 ) -> float:
-    """Return the power of the beam to a bearing at a fractional lag, in units of its noise."""
+    """Return a beam's power at a bearing and a fractional lag, in units of its noise variance."""
     z, _, noise = _output(matched, at, bearing, beams, call)
     return (z.real * z.real + z.imag * z.imag) / noise
 
 
 @no_alloc
 def _moved(before: float, here: float, after: float) -> float:
-    """Return the offset of a parabola's peak from the middle of three powers, at most a step."""
+    """Return the offset of a parabola's peak from the middle of three powers, at most 1 step."""
     bend = 2.0 * here - before - after
     move = 0.5 * (after - before) / bend if bend > 0.0 else math.copysign(1.0, after - before)
     return min(max(move, -1.0), 1.0)
@@ -439,7 +439,7 @@ def _climb(
     beams: Beams,
     call: _Call,
 ) -> tuple[float, float, float]:
-    """Climb to the top of a lobe near a beam; return its lag, bearing and power.
+    """Return lag, bearing and power at the top of a lobe, climbed from a nearby start.
 
     The lag of a tone stays: the loudest bearing is found at a given time.
     """
@@ -467,7 +467,7 @@ def _lobes(
     call: _Call,
     lobes: Float[np.ndarray, "4 n"],
 ) -> tuple[Whole, Whole]:
-    """Write lag, bearing, power and step of the lobes; return the loudest's index and their count.
+    """Write lag, bearing, power and step of a scan's lobes; return the loudest's index, and count.
 
     ``power``: of each beam at the lag; ``faintest``: least of a lobe; ``step``: of a climb [rad],
     0 for half the distance of two beams.
@@ -497,7 +497,7 @@ def _ambiguity(
     own: Whole,
     near: float,
 ) -> float:
-    """Return the mean square bearing difference to other lobes, weighted by their odds.
+    """Return a bearing's variance from the odds that another lobe of the scan is the true source.
 
     Of a lobe and its power; lobes of the index `own`, or nearer than `near` [rad], are the same.
     """
@@ -519,7 +519,7 @@ def _write_row(
     beams: Beams,
     row: Float[np.ndarray, "6"],
 ) -> None:
-    """Write the numbers of a detection, except its delay.
+    """Write bearing, power and standard deviations of a detection, but not its delay.
 
     ``lobe``: bearing, power and power over the noise; ``wave``: angular frequency; ``square``: see
     `_ambiguity`; ``late``: standard deviations of the delay at the beams' centre, by the noise and
@@ -553,10 +553,10 @@ def _rows(
     wide: Wide,
     call: _Call,
 ) -> Float[np.ndarray, "6 m"]:
-    """Return the numbers of each peak, its delay from lag 0 [s]; `slow` has silent margins.
+    """Return delay, bearing, power and standard deviations of the wideband call at each peak.
 
     The lag is not yet the peak's, and another of several nearly equal lobes may be the loudest at
-    its own time: the top of each is computed.
+    its own time: the top of each is computed. `slow` has silent margins.
     """
     beams, band = wide.beams, wide.band
     numbers, power = np.empty((6, peaks.size)), np.empty(beams.bearing.size)
@@ -587,7 +587,7 @@ def _rows(
 def _find(
     matched: Complex[np.ndarray, "c l k"], margin: Whole, circle: Circle, lag: Lags
 ) -> tuple[Int[np.ndarray, " m"], Float[np.ndarray, "6 m"]]:
-    """Detect the call of every snapshot; `matched` has silent margins."""
+    """Return caller, delay, bearing and power of detected tones; `matched` is zero-padded."""
     beams, pulse, tones = circle.beams, lag.pulse, matched.shape[0]
     stride, count, last = max(pulse // STRIDES, 1), 0, matched.shape[1] - margin - 1
     loudness = np.empty(((matched.shape[1] - 2 * margin + stride - 1) // stride, tones))
@@ -672,7 +672,7 @@ def _beam(
     call: _Call,
     beam: Complex[np.ndarray, " r"],
 ) -> None:
-    """Write the beam to a bearing at consecutive lags, with the phase of the first."""
+    """Write a beam's outputs at consecutive lags, in units of noise, in phase with the first."""
     turn = 2.0 * math.pi * call.frequency * call.interval
     for k in range(beam.size):
         z, _, noise = _output(matched, float(first + k), bearing, beams, call)
@@ -680,7 +680,7 @@ def _beam(
 
 
 class _Table(NamedTuple):
-    """The beams of a tone at whole lags: lags and factors of each microphone's outputs."""
+    """Lag offsets and factors that sum microphone outputs to a tone's beams at whole lags."""
 
     back: Int[np.ndarray, "n k"]
     """Offset from the centre's lag to the first of the two that are interpolated."""
@@ -691,7 +691,7 @@ class _Table(NamedTuple):
 
 @kernel
 def _table(call: _Call, beams: Beams) -> _Table:
-    """Return the beams of a tone at whole lags."""
+    """Compute each microphone's lag offsets and factors for a tone's beams at whole lags."""
     shape = beams.bearing.size, beams.weight.size
     back = np.empty(shape, dtype=np.int64)
     first, then = np.empty(shape, dtype=np.complex128), np.empty(shape, dtype=np.complex128)
@@ -729,7 +729,7 @@ def _scan(
     threshold: float,
     loudness: Float[np.ndarray, " s"],
 ) -> None:
-    """Write the loudness of a tone at every stride's lag; 0 where even the energy is too low."""
+    """Write the largest beam power of a tone at every `stride`-th lag; 0 if energy is too low."""
     square, power = _largest_near(matched, margin), np.empty(len(table.back))
     for s in range(len(loudness)):
         b, energy = margin + s * stride, 0.0
@@ -759,7 +759,7 @@ def _largest_near(matched: Complex[np.ndarray, "l k"], margin: Whole) -> Float[n
 def _loudness(
     matched: Complex[np.ndarray, "l k"], wide: Wide, interval: float
 ) -> Float[np.ndarray, " l"]:
-    """Return the power of the loudest beam at each lag."""
+    """Return the power of the loudest beam at each lag of a wideband call's outputs."""
     from scipy.fft import fft, ifft, next_fast_len
 
     lags, beams = len(matched), wide.beams
@@ -789,7 +789,7 @@ def _steer(
     step: float,
     beams: Complex[np.ndarray, "b n"],
 ) -> None:
-    """Write the spectra of beams, from the first to the last bin, `step` [Hz] wide."""
+    """Write spectra of delay-and-sum beams from the microphones' spectra, in a frequency band."""
     count = spectrum.shape[1]
     total = np.empty(last - first + 1, dtype=np.complex128)
     for b in range(early.shape[0]):
@@ -806,7 +806,7 @@ def _steer(
 
 
 def _lobes_of(call: Call, wide: Wide, step: int, rate: float) -> Float[np.ndarray, " l"]:
-    """Return the largest share of its power that a call leaves at each lag from its peak."""
+    """Return a call's highest side lobes by lag from its peak, relative to the peak's power."""
     interval, sent, beams = step / rate, replica(call, rate), wide.beams
     reach = math.ceil(sent.size / step) + 2 * _margin(beams, interval)
     count, most, length = 4 * reach, np.zeros(reach), 4 * reach * interval
@@ -829,7 +829,7 @@ def _lobes_of(call: Call, wide: Wide, step: int, rate: float) -> Float[np.ndarra
 
 
 def _cut_lobes_of(call: Call, wide: Wide, step: int, rate: float) -> Float[np.ndarray, "s l"]:
-    """Return the largest share of power around the peak of a call that is only partly recorded.
+    """Return the highest relative side lobes of a call that is only partly recorded, by lag.
 
     A row for each share of the call that is missing, at its beginning or its end. A beam sums the
     microphones' outputs, each displaced by the error of the beam's delay, two margins at most: away
@@ -863,7 +863,7 @@ def _peaks(
     cut_lobes: Float[np.ndarray, "s q"],
     cut: Whole,
 ) -> Int[np.ndarray, " m"]:
-    """Return the lags of peaks that exceed the leakage of all louder ones, the loudest first.
+    """Return lags of loudness peaks above the side lobes of all louder peaks, the loudest first.
 
     At the `cut` lags of either end, calls are only partly in the record. Loudness is periodic, as
     it comes from a transform. Beyond a table, lobes fall with the square of the distance.

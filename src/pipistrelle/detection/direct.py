@@ -44,7 +44,7 @@ EDGE_BLOCKS = 2
 
 
 class Lags(NamedTuple):
-    """The lags of a matched filter's output: delay of the first, step, and call length."""
+    """Time axis of matched-filter outputs: delay of the first lag, step, and lags in a call."""
 
     start: float
     """Delay of lag 0 [s]."""
@@ -55,7 +55,7 @@ class Lags(NamedTuple):
 
 
 class DirectCalls(NamedTuple):
-    """The direct call of each caller: its detection, and the time of its beginning."""
+    """Index of the detection, and start time, of the direct call of each caller."""
 
     detection: Int[np.ndarray, " c"]
     """Index of its detection; -1 for the vehicle and for callers that were not detected."""
@@ -72,7 +72,7 @@ def own_alone(
     own: Int[np.ndarray, " c"],
     missable: Bool[np.ndarray, " c"],
 ) -> DirectCalls:
-    """Drop direct calls with a wrong label, if the caller's direct call may be missed.
+    """Discard supposed direct calls that are really echoes, for callers that may be missed.
 
     A caller that calls with the vehicle, equally in all directions, is always received first. A
     caller with a beam may point away, and with an independent clock it may call while the vehicle
@@ -95,7 +95,7 @@ def own_alone(
 
 
 def without_calls(calls: DirectCalls, dropped: Bool[np.ndarray, " c"]) -> DirectCalls:
-    """Remove the direct calls of some callers, as if undetected."""
+    """Mark the direct calls of some callers as undetected."""
     return DirectCalls(
         detection=np.where(dropped, -1, calls.detection),
         delay=np.where(dropped, np.nan, calls.delay),
@@ -132,7 +132,7 @@ def front_edge(
     pulse: Whole,
     least: float,
 ) -> tuple[float, float]:
-    """Return the first lag of the first call of a tone, and its standard deviation.
+    """Return the lag of the front edge of a tone's first call, and its standard deviation.
 
     Searched from two calls before lag b to b, in blocks of energy above `least` means of the noise.
     NaN if there is none. NaN with an infinite deviation if an edge does not last: a call that an
@@ -166,7 +166,7 @@ def front_edge(
 
 @no_alloc
 def _mean_after(gain: Complex[np.ndarray, "k e"], begin: Whole, e: Whole) -> complex:
-    """Return the mean of the `EDGE_BLOCKS` blocks after block `begin`, at an element."""
+    """Return an element's mean output over the `EDGE_BLOCKS` blocks after block `begin`."""
     total = 0.0j
     for a in range(begin + 1, begin + 1 + EDGE_BLOCKS):
         total += gain[a, e]
@@ -175,7 +175,7 @@ def _mean_after(gain: Complex[np.ndarray, "k e"], begin: Whole, e: Whole) -> com
 
 @no_alloc
 def _fitted(gain: Complex[np.ndarray, "k e"], k: Whole, noise: float) -> tuple[float, float]:
-    """Fit the start of a call in block k or k - 1; return it and its deviation, in blocks."""
+    """Fit the start of a call in block k or k - 1; return the start and its std, in blocks."""
     least, best, std, elements = math.inf, math.nan, math.nan, gain.shape[1]
     for begin in range(max(k - 1, 0), k + 1):
         square, along, misfit = 0.0, 0.0, 0.0
@@ -204,7 +204,7 @@ def direct_calls(
     edge: Callable[[int, int, int], tuple[float, float]],
     lead: Float[np.ndarray, " d"] | None = None,
 ) -> DirectCalls:
-    """Find the direct call of every other caller, by loudness and order, and its beginning.
+    """Return every other caller's direct call, chosen by loudness and order, and its start time.
 
     `heard`: caller, delay and the delay's standard deviation of each detection; `powers`: for each
     caller, of the detections of its kind of call; `edge`: finds the beginning of the call of a
@@ -235,7 +235,7 @@ def direct_calls(
 def may_leak(
     delay: Float[np.ndarray, " d"], power: Float[np.ndarray, " d"], d: Whole, within: float
 ) -> bool:
-    """Return whether detection d is faint enough to be leakage of another at the same time.
+    """Return whether detection d is faint enough to be leakage of a louder simultaneous call.
 
     The louder has another tone, as no direct call is so faint in its own tone
     (`MIN_RELATIVE_POWER`). It may be at any face, as sound from behind a face also leaks into it

@@ -108,7 +108,7 @@ def average_faces(
     speed_of_sound: float,
     callers: Int[np.ndarray, " c"] = NO_CALLERS,
 ) -> FrameMeasurements:
-    r"""Average the strongest detection of each face, for each label and caller.
+    r"""Average the strongest detections of all faces to a measurement per label and caller.
 
     Bearings are averaged as directions, ``plain`` or ``weighted`` by the inverse variance at the
     array's angle, :math:`\cos^2\theta`. The range, only of the vehicle's own call, is c/2 times the
@@ -145,7 +145,7 @@ def average_faces(
 def same_echo(
     detections: Detections, *, delay_gate: float, bearing_gate: float
 ) -> Int[np.ndarray, " d"]:
-    """Number the echoes: detections of one call by different faces, at one time and direction.
+    """Return for each detection the number of its echo, which several faces may detect.
 
     Each echo begins with the strongest remaining detection, and takes the strongest matching
     detection of every other face.
@@ -188,7 +188,7 @@ def _average(
     weighted: bool,
     speed_of_sound: float,
 ) -> tuple[Int[np.ndarray, " m"], Int[np.ndarray, " m"], Float[np.ndarray, "8 m"]]:
-    """Average each label's and caller's strongest detections; return label, caller and numbers."""
+    """Return label, caller and numbers of measurements, averaged over the faces' detections."""
     found, direct, labels = Columns(*detections), DirectCalls(*calls), _distinct(label)
     faces = callers = 0
     for d in range(label.size):
@@ -254,7 +254,7 @@ def _take_strongest(
 def _number(
     order: Int[np.ndarray, " d"], found: Columns, delay_gate: float, bearing_gate: float
 ) -> Int[np.ndarray, " d"]:
-    """Number the echoes greedily, in a given order of the detections."""
+    """Return for each detection the number of its echo, assigned greedily in a given order."""
     number, count = np.full(order.size, UNLABELLED, dtype=np.int64), 0
     for first in order:
         if number[first] != UNLABELLED:
@@ -274,7 +274,7 @@ def _number(
 
 
 def with_edge_floor(detections: Detections, config: Config) -> Detections:
-    """Add `EDGE_FLOOR` to the standard deviation of the direct calls' beginning."""
+    """Add a floor to the std of direct calls' start times, if overlapping echoes are resolved."""
     direct = detections.direct
     if direct is None or config.detection.overlaps != "resolve":
         return detections
@@ -286,7 +286,7 @@ def with_edge_floor(detections: Detections, config: Config) -> Detections:
 def unlabelled_scan(
     time: float, detections: Detections, config: Config, missable: Bool[np.ndarray, " c"]
 ) -> tuple[Scan, Int[np.ndarray, " d"]]:
-    """Average a frame's detections by echo into a scan without labels.
+    """Average a frame's detections into a scan without labels, a measurement per echo.
 
     `missable`: callers with a beam or an independent clock, whose direct call may be missed; the
     first of their tone may be an echo, so without labels they have no excess paths. Returns the
@@ -317,7 +317,7 @@ def unlabelled_scan(
 
 
 class Finder(NamedTuple):
-    """A detector of some callers' calls at some of the microphones."""
+    """A detector of some callers' calls at a group of microphones."""
 
     callers: Int[np.ndarray, " c"]
     group: int
@@ -333,7 +333,7 @@ class Finder(NamedTuple):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Finders:
-    """Detectors of microphones anywhere, or of calls that are not all tones."""
+    """All detectors of an array with microphones anywhere, or of calls that are not all tones."""
 
     finders: tuple[Finder, ...]
     narrow: Int[np.ndarray, " n"]
@@ -348,7 +348,7 @@ class Finders:
     """Whether outputs keep the phase of the record's start, not of a call at their lag."""
 
     def of(self, caller: int, group: int) -> Finder:
-        """Return the detector of a caller's calls in a group.
+        """Return the detector of a caller's calls at a group of microphones.
 
         The detectors of tones come first, and include the vehicle even if it is silent.
         """
@@ -366,7 +366,7 @@ def front_end(
     where: str = "receiver.array",
     calls: Sequence[Call] = (),
 ) -> FrontEnd:
-    """Build the detector of calls with given tones [Hz] in the outputs of a layout.
+    """Build the detectors of all callers' calls in the matched-filter outputs of an array.
 
     `where`: origin of the layout, for errors; `calls`: needed if some are not tones, or tones are
     not whole bins, at the rate ``receiver.sample_rate``. Raises InputError as `detector` does, if
@@ -415,7 +415,7 @@ def _tone_finders(
     callers: Int[np.ndarray, " n"],
     where: str,
 ) -> Iterator[tuple[float, Finder]]:
-    """Yield the detectors of tones, each with its least signal-to-noise ratio."""
+    """Yield each microphone group's least detectable signal-to-noise ratio and tone detector."""
     if isinstance(layout, Layout):
         of_all = detector(config, layout, tones)
         yield math.nan, Finder(callers, 0, slice(None), slice(None), of_all, np.zeros(2))
@@ -445,7 +445,7 @@ def find_calls(
     pulse: int,
     around: Callable[[], Complex[np.ndarray, "l f c e"]] | None = None,
 ) -> Detections:
-    """Detect bearings and delays of all calls that exceed the noise, as in `detect`.
+    """Return the detections and direct calls of all calls that exceed the noise (see `detect`).
 
     `around`: returns the outputs also at lags at which a call is only partly in the record, equally
     many at each end (`BandFilters.around`); without it, such calls are not considered, and with it
@@ -489,7 +489,7 @@ def call_in(
 
 
 def _leaking(config: Config, tones: Sequence[Call]) -> Config:
-    """Raise the leakage threshold to the tones' cross talk, if that is higher."""
+    """Return settings with a leakage threshold of at least the cross talk between the tones."""
     if len(tones) < 2:
         return config
     talk = cross_talk(tones, config.receiver.sample_rate)
@@ -503,7 +503,7 @@ def _leaking(config: Config, tones: Sequence[Call]) -> Config:
 def _outputs(
     matched: Complex[np.ndarray, "l f c e"], end: Finders, finder: Finder, lags: Lags
 ) -> Complex[np.ndarray, "l g n k"]:
-    """Return the outputs of a detector; around a circle, with the phase of a call at their lag."""
+    """Select the matched-filter outputs that a detector uses, with the phases that it expects."""
     outputs = np.ascontiguousarray(matched[:, finder.faces, finder.callers][..., finder.members])
     if isinstance(finder.detector, Wide):
         return outputs
@@ -518,7 +518,7 @@ def _outputs(
 
 
 def _ahead(finder: Finder, bearing: Float[np.ndarray, "*m"]) -> Float[np.ndarray, "*m"]:
-    """Return the lead of a line over the vehicle's centre for sound from a bearing [s]."""
+    """Return a line array's time lead over the vehicle's centre for sound from a bearing [s]."""
     x, y = finder.lead
     return x * np.cos(bearing) + y * np.sin(bearing)
 
@@ -530,7 +530,7 @@ def _found(
     lags: Lags,
     around: Callable[[], Complex[np.ndarray, "l f c e"]] | None,
 ) -> tuple[Detections, Bool[np.ndarray, " m"]]:
-    """Detect calls at a group; also return a mask of the calls that are wholly in the record."""
+    """Detect calls at a group of microphones; also return a mask of calls recorded in full."""
     outputs = _outputs(matched, end, finder, lags)
     if isinstance(finder.detector, Detector):
         found = detect(outputs, finder.detector, **lags._asdict())
@@ -573,7 +573,7 @@ def _cross_talk_in(found: Detections, end: Finders, lags: Lags) -> Bool[np.ndarr
 def _direct_of(
     matched: Complex[np.ndarray, "l f c e"], end: FrontEnd, found: Detections, lags: Lags
 ) -> DirectCalls:
-    """Find the direct calls among detections; the time of a wideband call is its peak's."""
+    """Return the direct calls among detections, with a wideband call's time at its peak."""
     if isinstance(end, Detector):
         return direct_of_faces(matched, found, lags)
     tones = np.where(np.isin(found.caller, end.narrow), found.power, 0.0)

@@ -19,7 +19,7 @@ from pipistrelle.jit import Whole, kernel, no_alloc
 def steering_phases(
     u: float, place: Float[np.ndarray, " e"], phases: Complex[np.ndarray, " e"]
 ) -> None:
-    """Write the phase of each element that steers a beam, for phase u per spacing.
+    """Write the phasors that steer a line array's beam; `u`: phase between neighbours [rad].
 
     `place`: positions of the elements, in spacings; empty if equally spaced.
     """
@@ -41,7 +41,7 @@ def steer(
     phases: Complex[np.ndarray, " e"],
     beam: Complex[np.ndarray, " r"],
 ) -> None:
-    """Write the output of a beam with given phases, for `lags` lags from `low`."""
+    """Write a beam's output, the phased sum of its elements', for `lags` lags from `low`."""
     for k in range(lags):
         beam[k] = 0.0
     for e in range(matched.shape[3]):
@@ -80,7 +80,7 @@ def _best_fraction(z0: complex, z1: complex, pulse: Whole) -> tuple[float, float
 
 @kernel
 def reach_of(pulse: Whole) -> Whole:
-    """Return the largest distance from a snapshot's lag to the start of its call, in lags."""
+    """Return the largest distance between a snapshot's lag and the start of its call, in lags."""
     return max(pulse // 7, 1)
 
 
@@ -116,13 +116,13 @@ def arrival_lag(
 
 
 class Workspace:
-    """Arrays that frames reuse, as allocation costs more than the arithmetic."""
+    """Named work arrays that frames reuse, as allocation costs more than the arithmetic."""
 
     def __init__(self) -> None:
         self._flat: dict[str, np.ndarray] = {}
 
     def array(self, name: str, shape: tuple[int, ...]) -> Complex[np.ndarray, "..."]:
-        """Return the array of a name in a given shape; its content is undefined."""
+        """Return a named work array in a given shape; its content is undefined."""
         size = math.prod(shape)
         if name not in self._flat or self._flat[name].size < size:
             self._flat[name] = np.empty(size + size // 4, dtype=np.complex128)
@@ -200,7 +200,7 @@ class BandFilters:
     def __call__(
         self, samples: Float[np.ndarray, "t f e"], noise_std: float = 1.0
     ) -> Complex[np.ndarray, "l f c e"]:
-        """Return the outputs; lag i is a call that starts with sample i times `step`.
+        """Return each call's matched-filter outputs; lag i is a start at sample i times `step`.
 
         `noise_std`: of one complex sample, so that real ones have half of it. Noise has unit
         variance. If there are fewer samples than a call, the output is empty.
@@ -238,7 +238,7 @@ class BandFilters:
     def _summed(
         self, samples: Float[np.ndarray, "t f e"], tone: float
     ) -> Complex[np.ndarray, "l f e"]:
-        """Return the outputs of a tone [Hz], at unit noise."""
+        """Return the matched-filter outputs of samples for a tone [Hz], at unit noise."""
         blocks = len(samples) // self.step
         some = samples[: blocks * self.step].reshape(blocks, self.step, -1)
         wave = 2.0 * np.exp(-2j * np.pi * tone / self.rate * np.arange(self.step))
@@ -255,7 +255,7 @@ class BandFilters:
         bins: Int[np.ndarray, " b"],
         sent: Complex[np.ndarray, " b"],
     ) -> Complex[np.ndarray, "l f e"]:
-        """Return the outputs of a call that is no tone, from the transform of `count` samples."""
+        """Return the matched-filter outputs of a call in its band, from the samples' spectrum."""
         from scipy.fft import ifft
 
         fewer = np.zeros((count // self.step, *heard.shape[1:]), heard.dtype)
@@ -265,7 +265,7 @@ class BandFilters:
     def _in_bands(
         self, count: int
     ) -> list[tuple[Int[np.ndarray, " b"], Complex[np.ndarray, " b"]]]:
-        """Return the bins of each call's band in a transform of `count` samples, and weights."""
+        """Return each call's frequency bins in a transform of `count` samples, and its weights."""
         found = []
         for call in self.calls:
             band, length = band_of(call, self.rate), count / self.rate
@@ -280,7 +280,7 @@ class BandFilters:
 def _boxcar(
     rows: Float[np.ndarray, "b i"], width: Whole, scale: float, sums: Float[np.ndarray, "l i"]
 ) -> None:
-    """Write the running sums of `width` rows, scaled."""
+    """Write the scaled sum of every `width` consecutive rows."""
     columns = rows.shape[1]
     total = np.zeros(columns)
     for b in range(min(width - 1, rows.shape[0])):

@@ -65,7 +65,7 @@ matter."""
 
 
 def loudest_noise(elements: int) -> float:
-    """Return the 0.999 quantile of the residual power of a steered beam in noise, in its variances.
+    """Return the residual power of a steered beam that unit noise exceeds in 1 of 1000 cases.
 
     >>> round(loudest_noise(10), 2)
     2.35
@@ -77,7 +77,7 @@ def loudest_noise(elements: int) -> float:
 
 @kernel
 def over_noise(power: float, energy: float, elements: Whole, loudest: float) -> float:
-    """Return the ratio p of the power of a steered beam to the noise, from the snapshot's energy.
+    """Return the signal-to-noise power ratio of a steered beam, from its power and all energy.
 
     >>> over_noise(101.0, 110.0, 10, 2.35), round(over_noise(101.0, 191.0, 10, 2.35), 2)
     (100.0, 9.1)
@@ -88,7 +88,7 @@ def over_noise(power: float, energy: float, elements: Whole, loudest: float) -> 
 
 @kernel
 def bearing_std(power: float, slope: float, spread: float) -> float:
-    """Return the standard deviation of a bearing [rad].
+    """Return the standard deviation of a bearing [rad] from a beam's signal-to-noise ratio.
 
     `slope`: phase between neighbours per radian; `spread`: twelve times the variance of the
     elements' positions, in spacings: N^2 - 1 if equally spaced.
@@ -101,7 +101,7 @@ def bearing_std(power: float, slope: float, spread: float) -> float:
 
 @kernel
 def delay_std(power: float, pulse: Whole) -> float:
-    """Return the standard deviation of a delay, in lags; `pulse`: lags in a call.
+    """Return a delay's std in lags from the signal-to-noise ratio; `pulse`: lags in a call.
 
     >>> round(delay_std(100.0, 14), 3)
     0.259
@@ -115,7 +115,7 @@ _CHUNK = 256
 
 @kernel
 def energy_of(parts: Float[np.ndarray, " i"], elements: Whole) -> Float[np.ndarray, " t"]:
-    """Sum squares over the elements of every output, real and imaginary parts neighbours."""
+    """Return each output's energy, summed over elements; real and imaginary parts alternate."""
     energy = np.empty(parts.size // (2 * elements))
     square = np.empty(_CHUNK * elements)  # stays in the cache
     for start in range(0, energy.size, _CHUNK):
@@ -135,7 +135,7 @@ def energy_of(parts: Float[np.ndarray, " i"], elements: Whole) -> Float[np.ndarr
 def candidates(
     energy: Float[np.ndarray, " t"], threshold: float, row: Whole
 ) -> Int[np.ndarray, " k"]:
-    """Find the energies above the threshold that are local maxima in time.
+    """Return the indices of energies above the threshold that are local maxima in time.
 
     Every test is written and few are kept: a branch on each could not be predicted.
     """
@@ -156,7 +156,7 @@ def candidates(
 def _is_loudest(
     energy: Float[np.ndarray, " t"], test: Whole, row: Whole, reach: Whole, floor: float
 ) -> bool:
-    """Return whether a lag is the loudest within a reach, or until the energy falls to a floor.
+    """Return whether no nearby lag has more energy, within a reach or until it falls to a floor.
 
     A row of tests is a lag: the neighbour in time is a row away, the other tones are adjacent.
     """
@@ -198,7 +198,7 @@ def is_leakage(
 def _run_of(
     energy: Float[np.ndarray, " t"], test: Whole, row: Whole, floor: float
 ) -> tuple[Whole, Whole]:
-    """Return the half-open range of lags of a test's run above a level."""
+    """Return the half-open range of consecutive lags, around a given lag, above an energy level."""
     first = last = test
     while first >= row and energy[first - row] > floor:
         first -= row
@@ -218,7 +218,7 @@ def snapshot(
     threshold: float,
     leakage: float,
 ) -> tuple[Whole, Whole]:
-    """Return the half-open range of lags of a test's snapshot; empty if it has none.
+    """Return the half-open range of lags of a candidate's snapshot; empty if it is rejected.
 
     The leakage test of a run is left to its peaks, as a run may hold other echoes besides leakage.
     """
@@ -238,7 +238,7 @@ STDS = BEARING_STD, RANGE_STD, EXCESS_PATH_STD
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ConstantNoise:
-    """The same standard deviations for all rows (Bradley & Abaid, Table I).
+    """Measurement noise with the same std for all measurements (Bradley & Abaid, Table I).
 
     >>> from pipistrelle.detection.scans import make_scan
     >>> scan = make_scan(0.5, np.array([3, 8]), np.zeros(2), bearing_std=np.array([0.02, np.nan]))
@@ -254,13 +254,13 @@ class ConstantNoise:
     """Whether they replace the signal's standard deviations for an estimator."""
 
     def __call__(self, scan: Scan) -> Scan:
-        """Fill in the missing standard deviations."""
+        """Fill a scan's missing standard deviations with the constants."""
         stds = self.bearing_std, self.range_std, self.excess_path_std
         numbers = _filled(np.ascontiguousarray(scan.numbers), *stds)
         return replace(scan, numbers=numbers)
 
     def hidden(self, heard: Scan, stated: Scan) -> Scan:
-        """Remove the signal's standard deviations from a scan that was associated with them."""
+        """Remove a scan's standard deviations that come from the signal, after data association."""
         if not self.instead:
             return stated
         same = (heard.numbers == stated.numbers) | np.isnan(stated.numbers)
@@ -272,7 +272,7 @@ class ConstantNoise:
 def _filled(
     numbers: Float[np.ndarray, "8 m"], bearing_std: float, range_std: float, excess_path_std: float
 ) -> Float[np.ndarray, "8 m"]:
-    """Copy numbers, with constants in place of missing standard deviations."""
+    """Return a scan's numbers, with constants in place of missing standard deviations."""
     filled = numbers.copy()
     for m in range(filled.shape[1]):
         if math.isnan(filled[BEARING_STD, m]):

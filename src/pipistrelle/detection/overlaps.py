@@ -85,7 +85,7 @@ SAME_SINE = 0.1
 
 
 def most_left(elements: int) -> Float[np.ndarray, " k"]:
-    """Return the residual energy of 1, 2, ... sources that noise exceeds with probability 0.001.
+    """Return the residual energy after 1, 2, ... fitted sources that 0.1 % of noise exceeds.
 
     In units of an output's noise; fewer than `MOST` entries if the elements are too few.
 
@@ -99,7 +99,7 @@ def most_left(elements: int) -> Float[np.ndarray, " k"]:
 
 
 class Sources(NamedTuple):
-    """Sources in a snapshot, and work arrays; the next snapshot overwrites them."""
+    """Directions and beams of the sources in a snapshot, in work arrays that are reused."""
 
     u: Float[np.ndarray, " k"]
     """Phase between neighbours of each [rad]."""
@@ -126,7 +126,7 @@ class Sources(NamedTuple):
 
 @kernel
 def room_for(most: Whole, elements: Whole) -> Sources:
-    """Allocate the arrays for up to `most` sources."""
+    """Allocate the work arrays for up to `most` sources in a snapshot."""
     return Sources(
         u=np.empty(most),
         inverse=np.empty((most, most)),
@@ -144,7 +144,7 @@ def room_for(most: Whole, elements: Whole) -> Sources:
 
 @no_alloc
 def _product(a: Complex[np.ndarray, " e"], b: Complex[np.ndarray, " e"]) -> complex:
-    """Return a^H b."""
+    """Return the inner product of two complex vectors, the first conjugated."""
     total = 0.0j
     for e in range(a.size):
         total += a[e].conjugate() * b[e]
@@ -153,13 +153,13 @@ def _product(a: Complex[np.ndarray, " e"], b: Complex[np.ndarray, " e"]) -> comp
 
 @no_alloc
 def _power(z: complex) -> float:
-    """Return the squared modulus."""
+    """Return the squared modulus of a complex number."""
     return z.real * z.real + z.imag * z.imag
 
 
 @no_alloc
 def _leave(x: Complex[np.ndarray, " e"], basis: Complex[np.ndarray, "k e"], count: Whole) -> None:
-    """Remove from x its projection on the first vectors of a basis."""
+    """Subtract from a vector its projection on the first vectors of an orthonormal basis."""
     for k in range(count):
         along = _product(basis[k], x)
         for e in range(x.size):
@@ -168,7 +168,7 @@ def _leave(x: Complex[np.ndarray, " e"], basis: Complex[np.ndarray, "k e"], coun
 
 @no_alloc
 def _span(found: Sources, count: Whole, without: Whole, place: Float[np.ndarray, " p"]) -> Whole:
-    """Write an orthonormal basis of the waves of all sources except one; return its size."""
+    """Write an orthonormal basis of the waves of all sources except `without`; return its size."""
     size = 0
     for k in range(count):
         if k != without:
@@ -189,7 +189,7 @@ def _best_beside(
     scan: Float[np.ndarray, " n"],
     place: Float[np.ndarray, " p"],
 ) -> float:
-    """Return the grid direction that explains most of x outside the space of a basis."""
+    """Return the grid direction of a further source that explains most of a snapshot's residual."""
     best, direction = -1.0, 0.0
     for e in range(x.size):
         found.left[e] = x[e]
@@ -209,7 +209,7 @@ def _best_beside(
 def _aim(
     x: Complex[np.ndarray, " e"], found: Sources, count: Whole, place: Float[np.ndarray, " p"]
 ) -> float:
-    """Write beams, gains, residual, J and g; return the residual's energy."""
+    """Write all beams, the residual and the Gauss-Newton terms; return the residual's energy."""
     for k in range(count):
         size, beam = _span(found, count, k, place), found.beam[k]
         steering_phases(-found.u[k], place, beam)
@@ -254,7 +254,7 @@ def _invert(matrix: Float[np.ndarray, "k k"], size: Whole) -> None:
 
 @no_alloc
 def _shift(found: Sources, count: Whole, share: float) -> None:
-    """Move the sources by a share of the step."""
+    """Move the directions of the sources by a fraction of the Gauss-Newton step."""
     for k in range(count):
         found.u[k] += share * found.step[k]
 
@@ -263,7 +263,7 @@ def _shift(found: Sources, count: Whole, share: float) -> None:
 def _settle(
     x: Complex[np.ndarray, " e"], found: Sources, count: Whole, place: Float[np.ndarray, " p"]
 ) -> float:
-    """Move the sources to a local minimum by damped Gauss-Newton steps; return the residual."""
+    """Refine the sources' directions by damped Gauss-Newton steps; return the residual's energy."""
     energy = _aim(x, found, count, place)
     for _ in range(STEPS):
         _invert(found.inverse, count)
@@ -295,7 +295,7 @@ def resolve(
     most_left: Float[np.ndarray, " k"],
     found: Sources,
 ) -> tuple[Whole, float]:
-    """Find the fewest sources that explain a snapshot; return their number and the residual.
+    """Find the fewest sources that explain a snapshot; return number and residual energy.
 
     ``scan``: grid of directions; ``place``: positions of the elements, in spacings; empty if
     equally spaced.
@@ -326,7 +326,7 @@ def resolve(
 
 @no_alloc
 def _are_apart(found: Sources, count: Whole) -> bool:
-    """Return whether all directions are resolved: std of at most the limit in unit noise."""
+    """Return whether all sources are resolved: the std of each direction is at most the limit."""
     apart = 0
     for k in range(count):
         apart += 0.5 * found.inverse[k, k] <= UNSURE * UNSURE
@@ -335,7 +335,7 @@ def _are_apart(found: Sources, count: Whole) -> bool:
 
 @no_alloc
 def deviation(x: Complex[np.ndarray, " e"], found: Sources, k: Whole, noise: float) -> float:
-    """Return the standard deviation of a source's u [rad], for a noise power."""
+    """Return the std of a source's phase between neighbour elements [rad], for a noise power."""
     heard = 0.0j
     for e in range(x.size):
         heard += x[e] * found.beam[k, e]
@@ -347,7 +347,7 @@ def deviation(x: Complex[np.ndarray, " e"], found: Sources, k: Whole, noise: flo
 def surest(
     whole: Int[np.ndarray, "3 m"], numbers: Float[np.ndarray, "5 m"], apart: float
 ) -> Bool[np.ndarray, " m"]:
-    """Return a mask of the rows with the smallest deviation of their echo among several snapshots.
+    """Return a mask of the rows with the smallest std where several snapshots have the same echo.
 
     ``whole``: face, caller and snapshot; ``numbers``: begin with delay, sine of the angle, power
     and deviation of the bearing; ``apart``: largest difference of an echo's delays [s].

@@ -45,7 +45,7 @@ BEARING, RANGE, EXCESS_PATH, BEARING_STD, RANGE_STD, EXCESS_PATH_STD, LEVEL, SLO
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Scan:
-    """Measurements at one time.
+    """Measurements of landmarks and callers at the same time, in columns.
 
     `numbers` is a single array with a row for each column, for kernels; properties name the
     columns. `pipistrelle.detection.noise` states standard deviations.
@@ -73,7 +73,7 @@ class Scan:
 
     @property
     def bearing(self) -> Float[np.ndarray, " m"]:
-        """Bearing from the heading, counter-clockwise [rad]; NaN for a mere excess path."""
+        """Bearing from the heading, counter-clockwise [rad]; NaN for an excess path only."""
         return self.numbers[BEARING]
 
     @property
@@ -83,7 +83,7 @@ class Scan:
 
     @property
     def excess_path(self) -> Float[np.ndarray, " m"]:
-        """Length of the path over the landmark less the direct path [m], or NaN."""
+        """Sound path over the landmark less the direct path from the caller [m], or NaN."""
         return self.numbers[EXCESS_PATH]
 
     @property
@@ -108,7 +108,7 @@ class Scan:
 
     @property
     def bearing_slope(self) -> Float[np.ndarray, " m"]:
-        """Derivative of the bearing by the logarithm of the speed of sound [rad], or NaN."""
+        """Derivative of the bearing with respect to the log of the speed of sound [rad], or NaN."""
         return self.numbers[SLOPE]
 
 
@@ -148,7 +148,7 @@ def with_columns(scan: Scan, **columns: np.ndarray | float) -> Scan:
 
 
 def _made_of(time: float, shape: tuple[int, ...], given: dict[str, np.ndarray | float]) -> Scan:
-    """Make a scan from columns; missing columns have their defaults."""
+    """Build a scan from columns by name, with defaults for missing columns."""
     if unknown := sorted(given.keys() - set(COLUMNS)):
         raise InputError(f"scan: no such column {unknown[0]}; expected one of {', '.join(COLUMNS)}")
     shapes = {name: _shape(name, value) for name, value in given.items()}
@@ -169,7 +169,7 @@ def _made_of(time: float, shape: tuple[int, ...], given: dict[str, np.ndarray | 
 
 
 def _shape(name: str, values: np.ndarray | float) -> tuple[int, ...]:
-    """Return the shape of a column; raise if its rows have different lengths."""
+    """Return the shape of a scan's column; raise if its rows have different lengths."""
     try:
         return np.shape(values)
     except ValueError:
@@ -179,7 +179,7 @@ def _shape(name: str, values: np.ndarray | float) -> tuple[int, ...]:
 
 
 def rows_of(scan: Scan, rows: Bool[np.ndarray, " m"] | Int[np.ndarray, " k"]) -> Scan:
-    """Select rows of a scan.
+    """Select rows of a scan by a mask or by indices.
 
     >>> scan = make_scan(0.5, np.array([3, 8]), np.array([0.2, 1.0]))
     >>> rows_of(scan, scan.bearing > 0.5).landmark
@@ -197,7 +197,7 @@ def rows_of(scan: Scan, rows: Bool[np.ndarray, " m"] | Int[np.ndarray, " k"]) ->
 def _moved(
     direct: Int[np.ndarray, " c"], size: int, rows: Bool[np.ndarray, " m"] | Int[np.ndarray, " k"]
 ) -> Int[np.ndarray, " c"]:
-    """Return the rows of the direct calls after a selection among `size` rows; -1 if removed."""
+    """Renumber the rows of direct calls after a selection of a scan's rows; -1 if removed."""
     if direct.size == 0:
         return direct
     kept, place = np.arange(size)[rows], np.full(size + 1, -1)
@@ -225,7 +225,7 @@ def without_labels(scan: Scan, callers: Int[np.ndarray, " c"]) -> Scan:
 
 
 def with_callers(scan: Scan, callers: Int[np.ndarray, " c"]) -> Scan:
-    """Set the labels of the callers in a scan without labels, by their numbers, or UNLABELLED.
+    """Set the callers' labels in a scan without labels, by caller number; UNLABELLED if unknown.
 
     >>> scan = make_scan(0.5, np.full(2, -1), np.zeros(2), caller=1)
     >>> heard = replace(scan, direct=np.array([-1, 0, 1]), moving_callers=np.array([1, 2]))
@@ -256,7 +256,7 @@ def without_excess_paths(scan: Scan, *numbers: int) -> Scan:
 
 
 def without(scan: Scan, *numbers: int) -> Scan:
-    """Set some of a scan's numbers to NaN.
+    """Set some columns of a scan to NaN.
 
     >>> scan = make_scan(0.5, np.array([3]), np.zeros(1), range=2.0, range_std=0.1)
     >>> without(scan, RANGE_STD).range_std
@@ -322,7 +322,7 @@ def labelled(scan: Scan, label: Int[np.ndarray, " m"]) -> Scan:
 def _fused(
     scan: Scan, label: Int[np.ndarray, " m"], *, own: bool, others: bool, labels_only: bool
 ) -> Scan:
-    """Select the rows of some callers and merge rows of equal labels."""
+    """Select the measurements of some callers in a scan, and merge rows with equal labels."""
     numbers = np.ascontiguousarray(scan.numbers)
     landmark, caller, numbers = _fuse(label, scan.caller, numbers, own, others, labels_only)
     return replace(scan, landmark=landmark, caller=caller, numbers=numbers)
@@ -342,7 +342,7 @@ def _checked(scan: Scan, label: np.ndarray) -> Int[np.ndarray, " m"]:
 
 @kernel
 def settled(label: Int[np.ndarray, " m"], bearing: Float[np.ndarray, " m"]) -> bool:
-    """Return whether a scan is labelled and merged, with rows without a bearing at the end."""
+    """Return whether all rows are labelled and merged, with rows without a bearing at the end."""
     for m in range(label.size):
         bare = math.isnan(bearing[m])
         if label[m] == UNLABELLED or (m > 0 and math.isnan(bearing[m - 1]) and not bare):
@@ -362,7 +362,7 @@ def _fuse(
     others: bool,
     labels_only: bool,
 ) -> tuple[Int[np.ndarray, " k"], Int[np.ndarray, " k"], Float[np.ndarray, "8 k"]]:
-    """Select the rows of some callers and merge the rows of each landmark.
+    """Return label, caller and numbers of some callers' measurements, merged by landmark.
 
     Rows without a label are kept unmerged, or left out. Further excess paths of a landmark become
     rows at the end.
@@ -412,7 +412,7 @@ def _average(
     merged: Int[np.ndarray, " m"],
     sums: Float[np.ndarray, "5 m"],
 ) -> None:
-    """Replace each row's first bearing by the mean of its merged bearings; `sums` are relative."""
+    """Average the bearings that were merged into each row; `sums` are relative to the first."""
     turn, weighted, slope, weighted_slope, weight = sums
     for k in range(numbers.shape[1]):
         if merged[k] > 1:

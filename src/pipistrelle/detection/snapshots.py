@@ -94,7 +94,7 @@ class Detections:
 
 
 class Columns(NamedTuple):
-    """The columns of `Detections`, for kernels."""
+    """Columns of `Detections` as a tuple, for compiled functions."""
 
     face: Int[np.ndarray, " m"]
     caller: Int[np.ndarray, " m"]
@@ -107,7 +107,7 @@ class Columns(NamedTuple):
 
 
 def columns_of(detections: Detections) -> Columns:
-    """Return the columns of detections, for kernels."""
+    """Return the columns of detections as a tuple, for compiled functions."""
     d = detections
     return Columns(
         d.face, d.caller, d.angle, d.bearing, d.delay, d.power, d.bearing_std, d.delay_std
@@ -115,7 +115,7 @@ def columns_of(detections: Detections) -> Columns:
 
 
 class Detector(NamedTuple):
-    """Thresholds and tables of the detection stage (`detector`)."""
+    """Thresholds and beam tables to detect tones at line arrays (`detector`)."""
 
     threshold: float
     """Least energy of a face and tone, in units of an output's noise."""
@@ -144,7 +144,7 @@ class Detector(NamedTuple):
 
 
 def detector(config: Config, layout: Layout, tones: Float[np.ndarray, " c"]) -> Detector:
-    """Compute the thresholds and tables of the detection stage.
+    """Compute the thresholds and beam tables to detect tones at line arrays.
 
     `layout` has two elements or more; if they are not equally spaced, the smallest gap is the
     spacing, and the scan takes longer. `tones`: of the calls [Hz]. Raises InputError if the
@@ -187,7 +187,7 @@ def detector(config: Config, layout: Layout, tones: Float[np.ndarray, " c"]) -> 
 
 
 def _spaced(layout: Layout) -> tuple[float, Float[np.ndarray, " e"]]:
-    """Return the spacing of elements [m] and, if unequal, their positions in spacings."""
+    """Return the spacing of a line's elements [m] and, if unequal, their positions in spacings."""
     position = layout.position
     gaps = np.diff(position)
     if position.size < 2 or not gaps.min() > 0.0:
@@ -208,7 +208,7 @@ def detect(
     interval: float,
     pulse: int,
 ) -> Detections:
-    """Detect bearings and delays of all calls that exceed the noise.
+    """Detect bearings and delays of all calls that exceed the noise at line arrays.
 
     `matched` has unit noise variance; `start`: delay of lag 0 [s]; `interval`: between two lags
     [s]; `pulse`: lags per call.
@@ -235,7 +235,7 @@ def detect(
 def direct_of_faces(
     matched: Complex[np.ndarray, "l f c e"], found: Columns | Detections, lags: Lags
 ) -> DirectCalls:
-    """Find the direct calls among detections of tones by faces."""
+    """Return the callers' direct calls among the detections of tones at line arrays."""
 
     def edge(d: int, p: int, b: int) -> tuple[float, float]:
         return front_edge(matched, b, found.face[d], p, lags.pulse, MIN_EDGE_ENERGY)
@@ -256,7 +256,7 @@ def detections_at(found: Detections, rows: Bool[np.ndarray, " m"]) -> Detections
 
 
 def joined(parts: Sequence[Detections]) -> Detections:
-    """Concatenate detections of one call from several frames; direct calls are the first's."""
+    """Concatenate sets of detections; keep the direct calls of the first set."""
     columns = {name: np.concatenate([getattr(p, name) for p in parts]) for name in Columns._fields}
     return Detections(**columns, direct=parts[0].direct)
 
@@ -270,7 +270,7 @@ def _steered_power(
     table: Float[np.ndarray, "2 e n"],
     power: Float[np.ndarray, " n"],
 ) -> None:
-    """Write the power of `_scan_power` for elements in any positions, by steering vectors."""
+    """Write the beam power in each scanned direction, for unequally spaced elements."""
     for i in range(power.size):
         power[i] = 0.0
         for b in range(lags[0], lags[1]):
@@ -289,7 +289,7 @@ def _scan_power(
     table: Float[np.ndarray, "2 k n"],
     power: Float[np.ndarray, " n"],
 ) -> None:
-    """Write the power of the beam over the scan, summed over lags, from sums over element pairs."""
+    """Write the beam power in each scanned direction, summed over a range of lags."""
     elements, beams = matched.shape[3], power.size
     if table.shape[1] == elements:
         _steered_power(matched, lags, f, p, table, power)
@@ -323,7 +323,7 @@ def _loudest_lag(
     phases: Complex[np.ndarray, " e"],
     beam: Complex[np.ndarray, " r"],
 ) -> tuple[Whole, float]:
-    """Return the loudest lag of a beam in a half-open range of lags, and its power."""
+    """Return the lag with a beam's highest power in a half-open range of lags, and the power."""
     loudest, highest = lags[0], -1.0
     steer(matched, lags[0], lags[1] - lags[0], f, p, phases, beam)
     for k in range(lags[1] - lags[0]):
@@ -335,7 +335,7 @@ def _loudest_lag(
 
 @no_alloc
 def _peaks(power: Float[np.ndarray, " n"], ratio: float, place: Int[np.ndarray, " n"]) -> Whole:
-    """Write the indices of the power's peaks close to the highest; return their number."""
+    """Write the indices of a beam scan's peaks near the highest in power; return their number."""
     count, kept, last = 0, 0, power.size - 1
     for i in range(1, last):
         place[count] = i
@@ -357,7 +357,7 @@ def _find_peaks(
     rules: tuple,
     lag: Lags,
 ) -> tuple[Int[np.ndarray, "2 m"], Float[np.ndarray, "5 m"]]:
-    """Find every peak of every snapshot.
+    """Return a detection for every beam-scan peak of every snapshot of a tone.
 
     Returns face and caller; delay, sine of the angle, power, and the standard deviations of bearing
     and delay.
@@ -412,7 +412,7 @@ def _find_sources(
     rules: tuple,
     lag: Lags,
 ) -> tuple[Int[np.ndarray, "2 m"], Float[np.ndarray, "5 m"]]:
-    """Find every source of every snapshot (`overlaps`); returns the columns of `_find_peaks`."""
+    """Return a detection for every resolved source of every snapshot, in `_find_peaks`' columns."""
     _, faces, tones, elements = matched.shape
     rule, pulse, row, count = Detector(*rules), lag.pulse, faces * tones, 0
     tests = candidates(energy, rule.threshold, row if pulse > 1 else energy.size)
