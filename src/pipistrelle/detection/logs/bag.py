@@ -36,7 +36,7 @@ MOST_FRAMES = 100
 
 @contextmanager
 def bounded_unpacking() -> Iterator[None]:
-    """Limit the size that rosbags unpacks, by replacing its decompressors while in the context."""
+    """Limit the bytes that rosbags unpacks within the context, by replacing its decompressors."""
     try:
         from lz4.frame import LZ4FrameDecompressor
         from rosbags.rosbag1.reader import decompressors as of_first
@@ -90,15 +90,15 @@ class _File:
         self._left = ROOM * shutil.disk_usage(gettempdir()).free
 
     def __enter__(self) -> "_File":
-        """Return the file."""
+        """Return this file, for use in a `with` statement."""
         return self
 
     def __exit__(self, *_: object) -> None:
-        """Close the file."""
+        """Close the compressed file."""
         self._file.close()
 
     def read(self, size: int = -1) -> bytes:
-        """Read the next bytes."""
+        """Read the next unpacked bytes; raise if the file exceeds its limit."""
         data = self._file.read(size)
         self._left -= len(data)
         if self._left < 0.0:
@@ -118,7 +118,7 @@ MOST_METADATA = 1_000_000
 
 
 class Message(NamedTuple):
-    """A message of a bag."""
+    """A decoded message of a bag, with its topic, number and time of reception."""
 
     topic: str
     number: int
@@ -130,7 +130,7 @@ class Message(NamedTuple):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Topic:
-    """A topic of a bag."""
+    """Name, message type, message count and time span of a topic of a bag."""
 
     name: str
     type: str
@@ -142,7 +142,7 @@ class Topic:
 
 
 class Bag:
-    """An open bag."""
+    """An open ROS bag that lists topics and yields messages."""
 
     def __init__(self, path: Path, reader: Any) -> None:
         self.path = path
@@ -153,7 +153,7 @@ class Bag:
 
     @property
     def topics(self) -> dict[str, Topic]:
-        """The topics, by name."""
+        """Topics of the bag by name, with their message types and counts."""
         return {
             name: Topic(
                 name=name,
@@ -164,7 +164,7 @@ class Bag:
         }
 
     def seen(self) -> list[Topic]:
-        """List the topics with their message counts and times, after a pass over all messages."""
+        """Read all messages; list the topics with their message counts and times."""
         found: dict[str, tuple[int, int, int]] = {}
         with faults_named(str(self.path)):
             for connection, stamp, _ in self._reader.messages():
@@ -210,7 +210,7 @@ class Bag:
                 raise refusal(where, f"{found} messages", f"the {said} that the bag counts", fix)
 
     def checked(self, name: str, types: Iterable[str], option: str) -> str:
-        """Return a topic that an option names; raise if the bag lacks it or its type is wrong."""
+        """Return a topic's name from an option; raise if the bag lacks it or its type is wrong."""
         topics, where = self.topics, f"{self.path}, option {option}"
         if name not in topics:
             near = meant(name, topics)
@@ -224,7 +224,7 @@ class Bag:
 
 @contextmanager
 def opened(path: Path) -> Iterator[Bag]:
-    """Open a bag; raise if the path is not a readable bag."""
+    """Open a ROS bag within the context; raise if the path is not a readable bag."""
     whole = _storage(path)
     need_rosbags(str(path))
     from rosbags.rosbag1 import Reader as Reader1
@@ -280,7 +280,7 @@ def need_rosbags(where: str) -> None:
 
 
 def _storage(path: Path) -> Path:
-    """Return the path to open: the given path, or the only file of a folder without metadata."""
+    """Return a bag's path to open: the given path, or a folder's only file without metadata."""
     if not path.exists():
         found = "a link to no file" if path.is_symlink() else "no such file"
         raise refusal(path, found, "a ROS bag", "check the path")
@@ -303,7 +303,7 @@ def _storage(path: Path) -> Path:
 
 @contextmanager
 def faults_named(where: str) -> Iterator[None]:
-    """Turn any failure in the context into an error that names the place."""
+    """Convert any failure within the context into an `InputError` that names the place."""
     try:
         yield
     except InputError as error:
@@ -320,7 +320,7 @@ _MEND = "mend it (`ros2 bag reindex`, `mcap recover`, `rosbag reindex`), or reco
 
 
 def _decoder(connection: "Connection") -> Callable[[bytes], Any]:
-    """Return the function that decodes the messages of a connection."""
+    """Return the function that decodes a ROS connection's messages from bytes."""
     from rosbags.interfaces import ConnectionExtRosbag1, MessageDefinitionFormat
 
     first, name = isinstance(connection.ext, ConnectionExtRosbag1), connection.msgtype

@@ -50,7 +50,7 @@ class Frames:
         self._beside: dict[str, dict[str, Pose]] = {}
 
     def add(self, message: Any) -> list[str]:
-        """Add the transforms of a message; return a line for each with an invalid rotation."""
+        """Add a message's transforms; return an error text for each invalid rotation."""
         odd = []
         for one in message.transforms:
             parent, child = bare(one.header.frame_id), bare(one.child_frame_id)
@@ -93,18 +93,18 @@ def after(outer: Pose, inner: Pose) -> Pose:
 
 
 def inverse(pose: Pose) -> Pose:
-    """Return the inverse transform."""
+    """Return the inverse of a rigid transform."""
     return pose[0].T, -pose[0].T @ pose[1]
 
 
 def planar(x: float, y: float, heading: float) -> Pose:
-    """Return the transform of a pose in the plane."""
+    """Return the three-dimensional transform of a planar pose."""
     c, s = np.cos(heading), np.sin(heading)
     return np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]]), np.array([x, y, 0.0])
 
 
 def along_axis(points: Float[np.ndarray, "n 3"], mount: Pose) -> Float[np.ndarray, "n 3"]:
-    """Return points about a sensor's axis, x or z of its frame, in the axes of that frame.
+    """Convert points about a sonar's axis, x or z, to the axes of the sonar's frame.
 
     Profiling sonars have z along the axis and y to starboard (ProjectedSonarImage of
     marine_acoustic_msgs); others have x ahead. The more level of the two is the axis.
@@ -138,7 +138,7 @@ def echoes_of(bag: Bag, settings: BagConfig) -> list[str]:
 
 
 def transforms_of(bag: Bag) -> list[str]:
-    """Return the topic of the static transforms, if the bag has it."""
+    """Return a list of the topic of static transforms, empty if the bag lacks it."""
     there = bag.topics.get(TRANSFORMS)
     if there is not None and there.type != TRANSFORMS_TYPE:
         where, fix = f"{bag.path}, topic {TRANSFORMS}", "leave the topic out of the bag"
@@ -162,7 +162,7 @@ def roles(topics: Iterable[Topic], settings: BagConfig) -> dict[str, str]:
 
 
 def _odometries(topics: Iterable[Topic], settings: BagConfig) -> list[str]:
-    """List the topics that may be the odometry."""
+    """List the names of the topics that may be the odometry."""
     return [one.name for one in topics if one.type == ODOMETRY and one.name != settings.truth]
 
 
@@ -198,7 +198,7 @@ class Remarks:
 
 @dataclass(slots=True)
 class TopicPoses:
-    """The poses of a topic, message by message."""
+    """Poses collected from the messages of a topic, with delays of reception."""
 
     path: Path
     topic: str
@@ -210,7 +210,7 @@ class TopicPoses:
     """A line for each message with an invalid orientation."""
 
     def add(self, message: Message, settings: BagConfig, read: Callable[..., Any]) -> None:
-        """Add a message, converted to a row by `read`."""
+        """Convert a message to a row of time and pose by `read`, and store it."""
         try:
             row = read(message, settings)
         except TurnError as error:
@@ -220,7 +220,7 @@ class TopicPoses:
         self.lag.append(message.received - row[0])
 
     def sound(self, remarks: Remarks) -> list[tuple[float, ...]]:
-        """Return the usable rows; raise if most messages of the topic are invalid."""
+        """Return the valid rows of poses; raise if most messages of the topic are invalid."""
         where, count = f"{self.path}, topic {self.topic}", len(self.rows) + len(self.odd)
         if 2 * len(self.odd) > count:
             some = f"{len(self.odd)} of {count} messages are like it"
@@ -237,7 +237,7 @@ class TopicPoses:
 def _kept(
     where: str, topic: str, stamps: list[float], began: float, remarks: Remarks
 ) -> list[bool]:
-    """Return a mask of the stamps from a running clock; `began` [s]: time of the first pose.
+    """Return whether each stamp is of a running clock; `began` [s]: time of the first pose.
 
     Messages that are sent before a simulation publishes its clock have the stamp 0. If the clock
     begins with the drive, at less than `BEGUN`, 0 is a valid time.
@@ -254,7 +254,7 @@ def _kept(
 
 @dataclass(slots=True)
 class TopicEchoes:
-    """The echoes of a topic, message by message."""
+    """Echoes collected from the messages of a topic, with times and delays of reception."""
 
     type: str
     time: list[float] = field(default_factory=list)
@@ -266,7 +266,7 @@ class TopicEchoes:
     echoes: list[Echoes] = field(default_factory=list)
 
     def add(self, message: Message, settings: BagConfig) -> None:
-        """Add the echoes of a message."""
+        """Convert a message's echoes, and store them with its time and coordinate frame."""
         content = message.content
         time = _time(message, settings)
         with np.errstate(all="ignore"):  # invalid numbers are left out, or raise later
@@ -278,7 +278,7 @@ class TopicEchoes:
         self.echoes.append(echoes)
 
     def begin(self, path: Path, topic: str, began: float, remarks: Remarks) -> None:
-        """Remove messages from before the clock began."""
+        """Remove the echoes of messages with the stamp 0, from before the clock began."""
         kept = _kept(f"{path}, topic {topic}", topic, self.time, began, remarks)
         columns: tuple[list[Any], ...] = self.time, self.lag, self.number, self.frame, self.echoes
         for rows in columns:
@@ -344,7 +344,7 @@ def read_bag(
 def read_poses(
     path: Path, settings: BagConfig, remarks: Remarks | None = None
 ) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, "n 3"]] | None:
-    """Read the truth as `path_of` does, None without a topic; `remarks` receives warnings."""
+    """Read a bag's true poses as `path_of`; None without a topic; `remarks` receives warnings."""
     if settings.truth is None:
         return None
     with opened(path) as bag:
@@ -358,7 +358,7 @@ def read_poses(
 
 
 def _time(message: Message, settings: BagConfig) -> float:
-    """Return the time of a message [s]."""
+    """Return a message's time [s], of its header or, by the settings, of its reception."""
     if settings.stamps == "received":
         return message.received
     stamp = message.content.header.stamp
@@ -366,7 +366,7 @@ def _time(message: Message, settings: BagConfig) -> float:
 
 
 def step_row(message: Message, settings: BagConfig) -> tuple[float, ...]:
-    """Return time, pose, velocities ahead and to the left, angular rate and their covariance."""
+    """Return time, pose, velocities and velocity covariance of an odometry message as a row."""
     content = message.content
     twist = content.twist.twist
     stated = np.asarray(content.twist.covariance, dtype=float)[list(_UPPER)]
@@ -378,7 +378,7 @@ def step_row(message: Message, settings: BagConfig) -> tuple[float, ...]:
 
 
 def _table(where: str, columns: tuple[str, ...], rows: list[Any], stated: int = 0) -> Table:
-    """Make a checked table of rows; each row begins with its message's number."""
+    """Build a table of rows that begin with their message's number; raise if a value is invalid."""
     if not rows:
         raise refusal(where, "no messages", "some", "name another topic; --topics lists them")
     table = _messages(where, columns, np.array(rows, dtype=float))
@@ -393,7 +393,7 @@ def _table(where: str, columns: tuple[str, ...], rows: list[Any], stated: int = 
 
 
 def _messages(where: str, names: tuple[str, ...], rows: Float[np.ndarray, "n c"]) -> Table:
-    """Make an unchecked table of rows that begin with the number of their message."""
+    """Build a table of rows that begin with their message's number, without checks."""
     number, *values = rows.T
     column = dict(zip(names, values, strict=True))
     return Table(path=where, line=number.astype(np.int64), unit="message", column=column)
@@ -402,7 +402,7 @@ def _messages(where: str, names: tuple[str, ...], rows: Float[np.ndarray, "n c"]
 def odometry_table(
     path: Path, topic: str, rows: list[Any], settings: BagConfig, remarks: Remarks
 ) -> Table:
-    """Return the table of the odometry."""
+    """Build the odometry table from message rows: velocities, or poses with covariances."""
     where, steps = f"{path}, topic {topic}", f"in steps of {settings.step:g} s"
     steps = steps if settings.step else "each a step"
     names = ("time", *POSE, "velocity", "sideways", "angular_rate", *MOTION_COVARIANCE)
@@ -429,7 +429,7 @@ def odometry_table(
 def mounts_of(
     path: Path, topic: str, rows: TopicEchoes, frames: Frames, base: str, settings: BagConfig
 ) -> dict[str, Pose]:
-    """Return the pose of the sensor on the vehicle for each frame of a topic's messages."""
+    """Return the sensor's pose on the vehicle for each coordinate frame of a topic's messages."""
     found: dict[str, Pose] = {}
     for frame, echoes in zip(rows.frame, rows.echoes, strict=True):
         if frame in found:
@@ -475,7 +475,7 @@ def rows_of(where: str, rows: TopicEchoes, mounts: dict[str, Pose], ignored: Cou
 
 
 def _merged(where: str, parts: list[Table]) -> Table:
-    """Return the rows of all topics in order of time."""
+    """Merge the echo tables of all topics into a single table in order of time."""
     names = parts[0].column
     column = {name: np.concatenate([part.column[name] for part in parts]) for name in names}
     line = np.concatenate([part.line for part in parts])
@@ -496,7 +496,7 @@ def _clock(topic: str, lags: list[float], settings: BagConfig) -> list[str]:
 
 
 def _widest_beam(std: Float[np.ndarray, " n"]) -> dict[str, float]:
-    """Return the largest bearing std that association accepts, if the widest beam's is larger.
+    """Return the bearing-std limit that association needs for the widest beam, if above default.
 
     In a beam the std follows from its width, for weak and loud echoes, so no beam may be discarded
     as likely noise for it.
@@ -543,7 +543,7 @@ _LIVE = Path("ROS")
 
 
 def motion_of(model: str) -> Literal["poses", "twist"]:
-    """Return how odometry messages are used for a motion model, as in `BagConfig.motion`."""
+    """Return whether a motion model uses the "poses" or the "twist" of odometry messages."""
     if model in ("poses", "unicycle"):
         return "poses" if model == "poses" else "twist"
     expected = "'poses' or 'unicycle', which nav_msgs/Odometry tells"
@@ -552,7 +552,7 @@ def motion_of(model: str) -> Literal["poses", "twist"]:
 
 
 def stamp_and_pose(message: Any) -> tuple[float, tuple[float, float, float]]:
-    """Return time [s] and pose [m, m, rad] of a ``nav_msgs/Odometry``, which may be the first."""
+    """Return time [s] and pose [m, m, rad] of a ``nav_msgs/Odometry``; raise if it is invalid."""
     with faults_named("ROS, odometry"):
         row = step_row(Message("odometry", 1, 0.0, message), BagConfig())
     odometry_table(_LIVE, "odometry", [(1, *row)], BagConfig(), Remarks())
@@ -561,7 +561,7 @@ def stamp_and_pose(message: Any) -> tuple[float, tuple[float, float, float]]:
 
 
 def clock_began(before: Any, now: Any) -> bool:
-    """Return whether the clock began between two messages: the first has the stamp 0."""
+    """Return whether a clock began between two messages: the first has the stamp 0."""
     times = [one.header.stamp.sec + one.header.stamp.nanosec / 1e9 for one in (before, now)]
     return times[0] == 0.0 and times[1] > BEGUN
 
@@ -599,7 +599,7 @@ def learn_transforms(frames: Frames, message: Any) -> None:
 def scans_in(
     kind: str, message: Any, base: str, frames: Frames, settings: BagConfig
 ) -> list[tuple[float, dict[str, Float[np.ndarray, " m"]]]]:
-    """Return time [s] and columns (`Slam.hear`) of the scans in a message of echoes, by time.
+    """Return the scans in a message of echoes: time [s] and columns for `Slam.hear` of each.
 
     `kind`: the name of its type, with ``/msg/``; `base`: the vehicle's frame; `frames`: static
     transforms to the sensors. Rows have no labels if the whole message has none.

@@ -62,7 +62,7 @@ _UNIFORM = 12.0**-0.5
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Echoes:
-    """The echoes of one message."""
+    """Positions, delays and standard deviations of the echoes in a message."""
 
     point: Float[np.ndarray, "n 3"]
     """Position relative to the sensor [m]."""
@@ -108,12 +108,12 @@ def rotation_of(q: Any) -> Float[np.ndarray, "3 3"]:
 
 
 def pose_of(place: Any, q: Any) -> Pose:
-    """Return the transform of a position and a quaternion."""
+    """Return the rigid transform (rotation, translation) of a position and a quaternion."""
     return rotation_of(q), np.array([place.x, place.y, place.z], dtype=float)
 
 
 def _planar(place: Any, q: Any) -> tuple[float, float, float]:
-    """Return x, y and heading; raise if the vehicle is upside down."""
+    """Return x, y and heading of a position and a quaternion; raise for a vehicle upside down."""
     heading = yaw_of(q)
     if q.x * q.x + q.y * q.y > q.z * q.z + q.w * q.w:
         raise TurnError(
@@ -137,7 +137,7 @@ POSES: dict[str, Callable[[Any], tuple[float, float, float]]] = {
 
 
 def _sonar_detections(message: Any, speed_of_sound: float | None) -> Echoes:
-    """Convert travel times and beam angles (ahead, to starboard) to echoes."""
+    """Convert the travel times and beam angles of a sonar message to echoes."""
     time = np.asarray(message.two_way_travel_times, dtype=float)
     speed = message.ping_info.sound_speed or speed_of_sound
     if not speed:
@@ -151,7 +151,7 @@ def _sonar_detections(message: Any, speed_of_sound: float | None) -> Echoes:
 
 
 def _sonar_ranges(message: Any, _: float | None) -> Echoes:
-    """Convert ranges along unit vectors to echoes."""
+    """Convert the ranges along unit vectors of a sonar message to echoes."""
     distance = np.asarray(message.ranges, dtype=float)
     vectors = [(v.x, v.y, v.z) for v in message.beam_unit_vec]
     if len(vectors) != distance.size:
@@ -166,7 +166,7 @@ def _beams(
     distance: Float[np.ndarray, " n"],
     delays: Any,
 ) -> Echoes:
-    """Return the echoes of beams with a valid range and no flag; uniform over the beam's width."""
+    """Return the echoes of beams with a valid range and no flag, with std by the beam's width."""
     size = distance.size
     flags = np.array([flag.flag for flag in message.flags])
     flagged = _per_beam("flags", flags, size, 0.0) != 0.0
@@ -201,7 +201,7 @@ def _range(message: Any, _: float | None) -> Echoes:
 
 
 def _range_bearing(message: Any, _: float | None) -> Echoes:
-    """Convert labelled ranges and angles to echoes; the message states the sensor's pose."""
+    """Convert a message of labelled ranges and angles, with the sensor's pose, to echoes."""
     rows = [(one.range, one.yaw, one.pitch, one.id) for one in message.sensed_data]
     distance, yaw, pitch, label = np.array(rows, dtype=float).reshape(-1, 4).T
     if not (distance > 0.0).all():
@@ -238,7 +238,7 @@ CONES = "sensor_msgs/msg/Range"
 def _per_beam(
     name: str, values: Any, size: int, default: float = np.nan
 ) -> Float[np.ndarray, " n"]:
-    """Expand to a number for each beam: `values` of all or of each, or the default if empty."""
+    """Return a number per beam: its value, the only value, or the default if there is none."""
     numbers = np.asarray(values, dtype=float)
     if numbers.size not in (0, 1, size):
         raise InputError(f"found {numbers.size} {name}, expected one for each of {size} beams")
@@ -248,7 +248,7 @@ def _per_beam(
 
 
 def _echoes(point: Float[np.ndarray, "n 3"], **said: Any) -> Echoes:
-    """Make echoes, with defaults for missing fields; raise if a point or delay is not finite."""
+    """Build echoes at points, with defaults for missing fields; raise if not finite."""
     nothing = np.full(len(point), np.nan)
     given: dict[str, Any] = {
         "delay": np.zeros(len(point)),
@@ -328,7 +328,7 @@ def types_of(name: str, text: str, *, idl: bool, first: bool) -> Any:
 
 @cache
 def _known(first: bool) -> Any:
-    """Return the types that rosbags and this package define, for ROS 1 or ROS 2."""
+    """Return a type store of all types that rosbags and this package define, for ROS 1 or 2."""
     from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
     store = get_typestore(Stores.ROS1_NOETIC if first else Stores.ROS2_HUMBLE)
@@ -340,7 +340,7 @@ def _known(first: bool) -> Any:
 def _compared(
     name: str, told: Mapping[str, Fields], known: Mapping[str, Any]
 ) -> tuple[bool, tuple[str, str] | None]:
-    """Return whether two types have the same bytes, and the first mismatch of a known field."""
+    """Return whether two definitions of a type share their byte layout, and the first mismatch."""
     there, fields = dict(told[name]), known[name][1]
     same, fault = [one for one, _ in told[name]] == [one for one, _ in fields], None
     for part, kind in fields:
@@ -354,7 +354,7 @@ def _compared(
 
 
 def _bytes_of(kind: Any) -> Any:
-    """Return a type without the bounds of texts and lists, which do not affect its bytes."""
+    """Return a field's type without length bounds, which do not affect its byte layout."""
     if kind is None or kind[0] == NAME:
         return kind if kind is None else (NAME, kind[1])
     if kind[0] == BASE:
@@ -372,13 +372,13 @@ def _words(kind: Any) -> str:
 
 
 def _record(kind: Any) -> str | None:
-    """Return the name of the record type of a field or of its elements; None if there is none."""
+    """Return the nested message type of a field or of its elements; None for plain types."""
     one = kind if kind[0] in (BASE, NAME) else kind[1][0]
     return one[1] if one[0] == NAME else None
 
 
 def _registered(name: str, types: Mapping[str, Fields]) -> Any:
-    """Return a type store of a type and its parts; raise if it is too large."""
+    """Build a rosbags type store of a message type and its nested types; raise if too large."""
     from rosbags.typesys import Stores, get_typestore
 
     sizes: dict[str, int] = {}
@@ -393,7 +393,7 @@ def _registered(name: str, types: Mapping[str, Fields]) -> Any:
 def _parts(
     name: str, types: Mapping[str, Fields], sizes: dict[str, int], within: tuple[str, ...]
 ) -> int:
-    """Count the fields of a type, including fields of its records; raise if nested too deep."""
+    """Count the fields of a message type and its nested types; raise if nested too deep."""
     where = f"the definition of {(*within, name)[0]}"
     if name in within or len(within) == DEEPEST:
         found = f"{name} within itself" if name in within else f"more than {DEEPEST} records"
@@ -413,7 +413,7 @@ def _parts(
 
 
 def read_definition(name: str, text: str, *, idl: bool = False) -> dict[str, Fields]:
-    r"""Parse the text definition of a type and of the records in it, by the names of types.
+    r"""Parse the definition of a message type and its nested types; return fields by type name.
 
     >>> read_definition("a_msgs/msg/Pair", "float64 x  # ahead\nfloat64[2] y\n")
     {'a_msgs/msg/Pair': [('x', (1, ('float64', 0))), ('y', (3, ((1, ('float64', 0)), 2)))]}
@@ -447,7 +447,7 @@ def read_definition(name: str, text: str, *, idl: bool = False) -> dict[str, Fie
 
 
 def _full(name: str, owner: str = "") -> str:
-    """Return the name of a type with its package and ``/msg/``."""
+    """Return the full name of a message type, with its package and ``/msg/``."""
     name = _SHORT.get(name, name)
     if "/" not in name and owner:
         name = f"{owner.rpartition('/')[0]}/{name}"
@@ -458,7 +458,7 @@ def _full(name: str, owner: str = "") -> str:
 
 
 def _of_msg(text: str, owner: str) -> Fields:
-    """Parse the fields of a type in ROS's own language, each on a line."""
+    """Parse the fields of a message type from text in ROS's message language, a field per line."""
     fields = []
     for line in text.split("\n"):
         if not line.strip() or line.lstrip().startswith("#"):
@@ -477,7 +477,7 @@ def _of_msg(text: str, owner: str) -> Fields:
 
 
 class _Idl:
-    """Parser of the records in IDL as ROS writes it: modules, constants, typedefs, structs."""
+    """Parser of message types in ROS's IDL text: modules, constants, typedefs and structs."""
 
     def __init__(self, text: str) -> None:
         found = _TOKEN.finditer(text)
@@ -521,7 +521,7 @@ class _Idl:
         self._expect(";")
 
     def _declared(self) -> tuple[str, Any]:
-        """Parse a type and a name, perhaps with the length of an array."""
+        """Parse a field's declaration in IDL; return its name and type."""
         kind, name = self._kind(), self._next()
         if not re.fullmatch(r"[A-Za-z]\w*", name, re.ASCII):
             raise InputError(f"found {shown(name)} in IDL, expected a name")
@@ -543,7 +543,7 @@ class _Idl:
         return kind
 
     def _kind(self) -> Any:
-        """Parse the type of a field."""
+        """Parse the type of a field in IDL."""
         word = self._next()
         while self._left and f"{word} {self._left[-1]}" in (*_IDL_NUMBERS, "unsigned long"):
             word = f"{word} {self._next()}"

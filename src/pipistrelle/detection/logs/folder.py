@@ -162,7 +162,7 @@ def read_log(folder: Path) -> Log:
 
 
 def read_odometry(folder: Path, motion: str) -> Table:
-    """Read ``odometry.csv`` with the columns of a motion model."""
+    """Read the table in ``odometry.csv``, with the columns of a motion model."""
     schema = ODOMETRY[motion]
     odometry = schema.read(folder / schema.file)
     if motion == "ackermann":
@@ -231,7 +231,7 @@ def _readme(motion: str, driven: Iterable[str], measured: Iterable[str]) -> str:
 
 
 def as_logged(scan: Scan, name: str) -> np.ndarray:
-    """Return a column of a scan as written in a log: the excess path of a direct call is 0."""
+    """Return a scan's column as written in a log, where a direct call has an excess path of 0."""
     values = getattr(scan, name)
     if name == "excess_path" and scan.direct.size:
         values = values.copy()
@@ -274,7 +274,7 @@ def _measurement_columns(log: Log) -> dict[str, np.ndarray]:
 
 
 class RowsHeard:
-    """A log of unlabelled scans, written scan by scan next to existing odometry.
+    """Text of a log of unlabelled scans, made scan by scan for existing odometry.
 
     `folder` contains ``odometry.csv`` and ``recording.toml``; `about` is the table ``log`` of the
     latter, and `callers` have the keys of ``log.toml``. Raises InputError if a table is invalid.
@@ -309,7 +309,7 @@ class RowsHeard:
         return table_text(dict(zip(self.columns, values, strict=True))).split("\n", 1)[1]
 
     def files(self) -> dict[str, str]:
-        """Return odometry, README and log.toml by name; raise without echoes while it drives."""
+        """Return the log's other files by name; raise if no echo is in the odometry's time span."""
         if not self.inside:
             begin, end = self.time[[0, -1]].tolist()
             found = f"{self.rows} echoes, none between {begin!r} s and {end!r} s"

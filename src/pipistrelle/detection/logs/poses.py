@@ -67,7 +67,7 @@ def path_of(table: Table) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, "n
 
 
 def relative_motions(poses: Float[np.ndarray, "t 3"]) -> Float[np.ndarray, "t-1 3"]:
-    """Return each pose relative to the pose before.
+    """Return the motion from each pose to the next: forward, sideways and turn.
 
     `poses` [m, m, rad]. Returns forward, sideways [m] and the shorter turn [rad].
     """
@@ -107,7 +107,7 @@ def jumps(motions: Float[np.ndarray, "k _"], dt: Float[np.ndarray, " k"]) -> Int
 def _turned(
     points: Float[np.ndarray, "k 2"], angle: Float[np.ndarray, " k"]
 ) -> Float[np.ndarray, "k 2"]:
-    """Rotate each point by its angle."""
+    """Rotate each point in the plane by its angle [rad]."""
     c, s, (x, y) = np.cos(angle), np.sin(angle), points.T
     return np.column_stack([c * x - s * y, s * x + c * y])
 
@@ -115,7 +115,7 @@ def _turned(
 def _at_rows(
     time: Float[np.ndarray, " t"], rows: Float[np.ndarray, " n"]
 ) -> Float[np.ndarray, " t"]:
-    """Snap times to the times of rows within `_RESOLUTION`."""
+    """Replace each time by the nearest row's time if the difference is at most 1e-6 s."""
     after = np.clip(np.searchsorted(rows, time), 1, len(rows) - 1)
     nearest = np.where(time - rows[after - 1] < rows[after] - time, rows[after - 1], rows[after])
     return np.where(np.abs(nearest - time) <= _RESOLUTION, nearest, time)
@@ -138,7 +138,7 @@ def _poses_at(
 def _across_arc(
     points: Float[np.ndarray, "k 2"], turn: Float[np.ndarray, " k"], *, back: bool = False
 ) -> Float[np.ndarray, "k 2"]:
-    """Convert arc lengths along turns to displacements; with `back`, the inverse."""
+    """Convert arc lengths driven at a constant turn to displacements; with `back`, the inverse."""
     half = 0.5 * turn
     chord = np.sinc(half / np.pi)[:, None]
     return _turned(points / chord, -half) if back else _turned(points * chord, half)
@@ -151,7 +151,7 @@ def _step_covariances(
     poses: Float[np.ndarray, "n 3"],
     stated: Float[np.ndarray, "n 3 3"],
 ) -> Float[np.ndarray, "t-1 3 3"]:
-    """Sum the covariances of the rows' motions, in the axes at the start of each step."""
+    """Return the motion covariance of each step in the axes at its start, summed over rows."""
     extra = np.flatnonzero(~np.isin(time, stamp))
     order = np.argsort(np.append(stamp, time[extra]), kind="stable")
     cut, at = np.append(stamp, time[extra])[order], np.vstack([poses, there[extra]])[order]
@@ -195,7 +195,7 @@ def _check_ways(odometry: Table, poses: Float[np.ndarray, "n 3"]) -> None:
 
 
 def _covariances(odometry: Table) -> Float[np.ndarray, "n 3 3"]:
-    """Return the covariance of the motion to each row; NaN if the row does not state it."""
+    """Return the covariance of the motion from the row before to each row; NaN if not stated."""
     absent = np.full(len(odometry.line), np.nan)
     column = [odometry.column.get(name, absent) for name in MOTION_COVARIANCE]
     values = np.column_stack(column)
@@ -217,7 +217,7 @@ def _covariances(odometry: Table) -> Float[np.ndarray, "n 3 3"]:
 def _definite(
     odometry: Table, covariance: Float[np.ndarray, "n 3 3"], rows: Int[np.ndarray, " n"]
 ) -> Float[np.ndarray, "n 3 3"]:
-    """Raise if a matrix is not a covariance; set negative eigenvalues of rounding to 0."""
+    """Set slightly negative eigenvalues of covariances to 0; raise if any is clearly negative."""
     variance = np.diagonal(covariance, axis1=1, axis2=2)
     std = np.sqrt(np.maximum(variance, 0.0))
     unit = np.where(std > 0.0, std, 1.0)[:, :, None]

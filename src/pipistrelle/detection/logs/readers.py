@@ -25,7 +25,7 @@ Robot = int | str
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Reader:
-    """How logs of one format are recognised and read."""
+    """A log format: how its logs are recognised and read."""
 
     name: str
     title: str
@@ -46,7 +46,7 @@ class Reader:
 
 
 def reader_of(folder: Path, readers: Sequence[Reader] = ()) -> Reader:
-    """Find the reader of a folder: the first that recognises it.
+    """Return the first reader that recognises the format of a log's folder.
 
     `readers` are tried before the package's. If none recognises the folder, the reader of log
     folders is returned, whose error names the missing files.
@@ -70,7 +70,7 @@ def recording_of(path: Path) -> str | None:
 
 
 def _imported(module: str, name: str) -> "Callable[..., Log]":
-    """Return a function of a module of this folder, which is imported when it is called."""
+    """Return a log-reading function that imports its module only when it is called."""
 
     def read(*path_and_robot: Any, **framed: Any) -> "Log":
         read = getattr(import_module(f"pipistrelle.detection.logs.{module}"), name)

@@ -82,7 +82,7 @@ class LogCaller(Section):
     @field_validator("place", "place_std")
     @classmethod
     def _of_a_place(cls, value: Any, known: ValidationInfo) -> Any:
-        """Raise if a caller that moves has a place, or a standard deviation has none."""
+        """Raise if a moving caller has a position, or a std is given without a position."""
         if value is not None and known.data.get("moves"):
             raise ValueError("no place of a caller that moves")
         if value is not None and known.field_name == "place_std" and not known.data.get("place"):
@@ -226,7 +226,7 @@ def assemble(
 
 
 def scan_at(time: float, rows: Table, callers: tuple[LogCaller, ...]) -> Scan:
-    """Make the scan of measurements at one time, as `assemble` does.
+    """Build a scan from rows of measurements at the same time, as `assemble` does.
 
     `rows` have ``landmark``, ``bearing``, ``range``, ``caller``, perhaps other columns of a log.
     Raises InputError if a row is not valid in a log.
@@ -241,7 +241,7 @@ def scan_at(time: float, rows: Table, callers: tuple[LogCaller, ...]) -> Scan:
 
 
 def check_seconds(table: Table, longest_gap: float = _MAX_GAP) -> None:
-    """Raise if times, or gaps above `longest_gap` [s], are implausible; name the likely unit."""
+    """Raise if a table's times or gaps cannot be seconds, and name the likely unit."""
     time = table.column["time"]
     gaps = np.diff(time)
     typical = float(np.median(gaps[gaps > 0.0])) if np.any(gaps > 0.0) else 0.0
@@ -269,7 +269,7 @@ def _cut(path: Path | str, time: np.ndarray, span: tuple[float, float]) -> np.nd
 
 
 def _step_times(odometry: Table, time: np.ndarray, step: float | None) -> np.ndarray:
-    """Return the start and the ends of steps: the rows' times, or of equal length `step` [s]."""
+    """Return the boundaries of the control steps [s]: the rows' times, or every `step` [s]."""
     if step is None:
         long = np.flatnonzero(np.diff(time) > LONGEST_STEP)
         if long.size:
@@ -326,7 +326,7 @@ def _mean_controls(
 
 
 def _of_callers(measurements: Table, callers: tuple[LogCaller, ...]) -> Table:
-    """Add the callers' numbers as a column; raise on invalid excess paths and empty rows."""
+    """Add caller numbers to measurements; raise at invalid excess paths or empty rows."""
     column, nothing = measurements.column, np.full(len(measurements.line), np.nan)
     caller, excess_path = column.get(CALLER, nothing), column.get("excess_path", nothing)
     own = np.array([UNLABELLED, *(one.landmark for one in callers)])
@@ -371,7 +371,7 @@ def _scans(
     resolution: float,
     callers: tuple[LogCaller, ...],
 ) -> tuple[Scan, ...]:
-    """Return a scan for each time of the sorted measurements, at the end of its step."""
+    """Return a scan per time of the sorted measurements, dated at the end of its control step."""
     labels = (
         np.array([UNLABELLED, *(caller.landmark for caller in callers)]) if callers else NO_CALLERS
     )

@@ -56,7 +56,7 @@ ODOMETRY["poses"] = Schema(
 
 
 class _Association(Section):
-    """Properties of the sensor, by the names of the settings of `association`."""
+    """Sensor properties in ``log.toml``, named like the settings of `association`."""
 
     model_config = ConfigDict(strict=True)
 
@@ -106,7 +106,7 @@ class Vehicle(Section):
         return bounds
 
     def told(self) -> dict[str, Any]:
-        """Return the values as fields of a `Log`."""
+        """Return the log's values as keyword arguments for `Log`."""
         told = (*SHARED, "wheelbase", "speed_offset")
         values = {name: getattr(self, name) for name in type(self).model_fields if name in told}
         values["control_std"] = tuple(getattr(self, f"{name}_std") for name in NOISY[self.motion])
@@ -114,7 +114,7 @@ class Vehicle(Section):
         return values
 
     def text(self) -> str:
-        """Return the text of ``log.toml``."""
+        """Format keys and values as the text of a ``log.toml``."""
         import tomli_w
 
         return tomli_w.dumps(self.model_dump(mode="json", exclude_defaults=True, exclude_none=True))
@@ -169,7 +169,7 @@ def read_vehicle(path: Path) -> tuple[Vehicle, tuple[str, ...]]:
 
 
 def vehicle_of(table: Mapping[str, Any], where: object) -> Vehicle:
-    """Validate a table of the keys of ``log.toml``; raise its first error, at `where`."""
+    """Return the validated keys of a ``log.toml`` table; raise its first error, naming `where`."""
     model = KINDS.get(str(table.get("motion")), _Unicycle)
     try:
         return model.model_validate(table)
