@@ -49,14 +49,14 @@ class Blocks(NamedTuple):
 
     @property
     def interval(self) -> float:
-        """Length of a block [s]."""
+        """Duration of a block of samples [s]."""
         return self.block / self.rate
 
 
 def blocks_of(
     rate: float, duration: float, tones: Float[np.ndarray, " c"], deaf: float | None = None
 ) -> Blocks:
-    """Choose the block length for a call of a duration [s].
+    """Choose how samples are divided into blocks, for calls of a duration [s].
 
     `deaf`: time before the first block, by default the duration [s].
 
@@ -77,7 +77,7 @@ def blocks_of(
 
 
 class ToneSums:
-    """Sums of samples over blocks at each tone, for all channels, in units of their noise."""
+    """Converter of samples to block sums at each tone, for all channels, in units of the noise."""
 
     apart, gaps = 1, 256
     """Step between sums for the noise; most gaps between calls that are read for it."""
@@ -95,7 +95,7 @@ class ToneSums:
     def __call__(
         self, samples: Float[np.ndarray, "t m"], out: Complex[np.ndarray, "..."] | None = None
     ) -> Complex[np.ndarray, "b f c e"]:
-        """Return the sums of the blocks after a call; the samples begin with the call."""
+        """Return the block sums of the samples after a call; the samples begin with the call."""
         heard, on = samples[self.blocks.blank :], self.blocks
         shape = (len(heard) // on.block, *self.gain.shape)
         sums = np.empty(shape, dtype=np.complex128) if out is None else out
@@ -115,7 +115,7 @@ def _sum_blocks(
     mean: Float[np.ndarray, " k"],
     sums: Complex[np.ndarray, "b f c e"],
 ) -> None:
-    """Write the sums of whole blocks at each tone."""
+    """Write the sums of each channel's samples over blocks at each tone."""
     tones, _, block = table.shape
     channels = samples.shape[1]
     total, offset = np.empty((tones, 2, channels)), np.zeros((tones, 2))
@@ -143,7 +143,7 @@ def _sum_blocks(
 
 
 class CallOutputs:
-    """Matched-filter outputs of samples for each call and channel, in units of the noise.
+    """Converter of samples to matched-filter outputs per call and channel, in units of the noise.
 
     Used instead of `ToneSums` and its boxcar if any call is not a tone; a block is a lag here.
     """
@@ -170,7 +170,7 @@ class CallOutputs:
     def __call__(
         self, samples: Float[np.ndarray, "t m"], *, around: bool = False
     ) -> Complex[np.ndarray, "l f c e"]:
-        """Return the outputs after a call; the samples begin with the call.
+        """Return matched-filter outputs of the samples after a call; the samples begin with it.
 
         `around`: also at lags at which only a part of a call is received (`BandFilters.around`).
         """
@@ -202,7 +202,7 @@ _CHUNK = 1 << 21
 
 
 class Calls(NamedTuple):
-    """The vehicle's calls, in order."""
+    """First samples, times and lengths of the vehicle's calls in a recording."""
 
     sample: Int[np.ndarray, " k"]
     """Sample at which each begins, from 0."""
@@ -212,7 +212,7 @@ class Calls(NamedTuple):
     """Samples that belong to each call, from its beginning."""
 
     def spread(self, most: int) -> Int[np.ndarray, " g"]:
-        """Return the numbers of at most so many calls, spread over the recording."""
+        """Return the indices of at most `most` calls, spread evenly over the recording."""
         return np.unique(np.linspace(0, self.sample.size - 1, most).round().astype(np.int64))
 
     def gaps(
@@ -260,7 +260,7 @@ def calls_of(folder: Path, about: Description, sound: Sound, blocks: Blocks, sen
 
 
 def _told(path: Path, sound: Sound) -> tuple[Float[np.ndarray, " k"], Float[np.ndarray, " k"]]:
-    """Read ``calls.csv``: samples, and times or NaN."""
+    """Read ``calls.csv``; return the sample and the time of each call, NaN if not stated."""
     table = read_table(path, ("sample",), optional=("time",))
     sample, time = table.column["sample"], table.column["time"]
     for wrong, found, expected in (
@@ -280,7 +280,7 @@ def _told(path: Path, sound: Sound) -> tuple[Float[np.ndarray, " k"], Float[np.n
 def _lengths(
     sample: Int[np.ndarray, " k"], sound: Sound, blocks: Blocks, where: str
 ) -> Int[np.ndarray, " k"]:
-    """Return the number of samples of each call; raise if calls follow too fast."""
+    """Return the number of samples from each call to the next; raise if calls follow too fast."""
     gap = np.diff(sample)
     last = int(np.median(gap)) if gap.size else round(LONGEST * sound.rate)
     least = blocks.blank + MIN_GAP * blocks.pulse * blocks.block
@@ -294,7 +294,7 @@ def _lengths(
 
 
 def _pieces(sound: Sound, step: int, more: int) -> Iterator[tuple[int, Float[np.ndarray, "t m"]]]:
-    """Yield the sound in pieces of whole steps, each with `more` samples of the next."""
+    """Yield a recording's samples in consecutive pieces, each with `more` samples of the next."""
     size = max(_CHUNK // sound.channels // step, 1) * step
     for first in range(0, sound.samples, size):
         samples = sound.read(first, min(size + more, sound.samples - first))
@@ -303,7 +303,7 @@ def _pieces(sound: Sound, step: int, more: int) -> Iterator[tuple[int, Float[np.
 
 
 def _least(sound: Sound, sample: Float[np.ndarray, " k"], level: Float[np.ndarray, " k"]) -> float:
-    """Return the least level of a call: a share of the median of the loudest of each stretch."""
+    """Return the least level that counts as a call, a share of the median loudest level."""
     stretches, stretch = np.unique(sample / sound.rate // _STRETCH, return_inverse=True)
     loudest = np.zeros(stretches.size)
     np.maximum.at(loudest, stretch, level)
@@ -311,7 +311,7 @@ def _least(sound: Sound, sample: Float[np.ndarray, " k"], level: Float[np.ndarra
 
 
 def _triggered(sound: Sound, channel: int, where: str, apart: int) -> Float[np.ndarray, " k"]:
-    """Find the samples of a rise of the trigger channel, with a minimum gap."""
+    """Return the samples where the trigger channel rises, with a minimum gap."""
     if channel >= sound.channels:
         found, expected = f"channel {channel + 1}", f"1 to {sound.channels}"
         raise refusal(where, found, expected, "correct it")
@@ -327,7 +327,7 @@ def _triggered(sound: Sound, channel: int, where: str, apart: int) -> Float[np.n
 
 
 def _leaks(sound: Sound, sent: Call, apart: int) -> Float[np.ndarray, " k"]:
-    """Find the samples of the loudest matched-filter outputs, with a minimum gap."""
+    """Return the samples where the call leaks into the microphones, with a minimum gap."""
     filters = BandFilters((sent,), sound.rate)
     step, loudest = filters.step, []
     some = max(apart // step, 1)

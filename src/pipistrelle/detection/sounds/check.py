@@ -51,7 +51,7 @@ DISAGREE = 0.15
 
 
 class _Echo(NamedTuple):
-    """A loud echo at a group of microphones, at the time of its middle."""
+    """Matched-filter outputs of a loud echo at a group of microphones, at the echo's middle."""
 
     frequency: Float[np.ndarray, " k"]
     """Frequency of a tone, or frequencies of the parts of a band [Hz]."""
@@ -75,7 +75,7 @@ def array_faults(hearing: Hearing) -> Iterator[str]:
 
 
 def _collect(frame: Frame, hearing: Hearing, heard: list[list[_Echo]]) -> None:
-    """Keep the loudest echo of each group and caller, if it is loud."""
+    """Append a frame's loudest echo of each microphone group and caller, if loud, to `heard`."""
     found = frame.detections
     for g, echoes in enumerate(heard):
         for caller in np.unique(found.caller):
@@ -89,7 +89,7 @@ def _collect(frame: Frame, hearing: Hearing, heard: list[list[_Echo]]) -> None:
 
 
 def _echo(frame: Frame, hearing: Hearing, d: int) -> _Echo | None:
-    """Return a group's outputs for a detection, or None too near the ends of the frame.
+    """Return a microphone group's outputs at a detection, or None near the ends of the frame.
 
     The outputs of a wideband call are split into frequencies, as the microphones of a large array
     receive it at different times.
@@ -117,7 +117,7 @@ def _echo(frame: Frame, hearing: Hearing, d: int) -> _Echo | None:
 
 
 def _pairs(frame: Frame, hearing: Hearing) -> list[tuple[int, float, int, float]]:
-    """Pair loud detections of an echo by two faces, within a quarter of a call of each other."""
+    """Return faces and angles of loud echoes that two faces detect within a quarter of a call."""
     found, pairs = frame.detections, []
     late = 0.25 * hearing.about.call.duration
     for one, other in combinations(np.flatnonzero(found.power >= LOUD).tolist(), 2):
@@ -130,7 +130,7 @@ def _pairs(frame: Frame, hearing: Hearing) -> list[tuple[int, float, int, float]
 
 
 def _order(hearing: Hearing, g: int, echoes: list[_Echo]) -> Iterator[str]:
-    """Yield a report if swapping two channels of a group, or a sign, would lower its misfit."""
+    """Yield a report if swapping two channels of a group, or inverting a channel, fits better."""
     lead, gain = _directions(hearing, g)
     if np.ptp(lead, axis=1).max() > WIDEST * hearing.about.call.duration:  # keep wideband only
         echoes = [echo for echo in echoes if echo.frequency.size > 1]
@@ -156,7 +156,7 @@ def _order(hearing: Hearing, g: int, echoes: list[_Echo]) -> Iterator[str]:
 def _shares(
     echo: _Echo, lead: Float[np.ndarray, "b e"], gain: Float[np.ndarray, " e"]
 ) -> tuple[float, Float[np.ndarray, "e e"]]:
-    """Return an echo's energy share in the best beam, now and after each swap or sign change."""
+    """Return an echo's energy share in the best beam, now and after channel swaps or inversions."""
     now, changed = 0.0, np.zeros((gain.size, gain.size))
     for some in np.array_split(lead, math.ceil(lead.size * gain.size / AT_ONCE)):
         # for each direction, position and channel: the term that would be added to a beam
@@ -195,7 +195,7 @@ def _named(hearing: Hearing, g: int) -> str:
 
 
 def _faces(hearing: Hearing, pairs: Float[np.ndarray, "n 4"]) -> Iterator[str]:
-    """Yield a report if another order of the faces, or of their channels, would fit better."""
+    """Yield a report if another order of faces or channels would reconcile two faces' bearings."""
     normal, names = hearing.array.layout.normal, hearing.array.face
     count = len(names)
     face, angle = pairs[:, [0, 2]].astype(np.int64), pairs[:, [1, 3]]
@@ -222,7 +222,7 @@ def _faces(hearing: Hearing, pairs: Float[np.ndarray, "n 4"]) -> Iterator[str]:
 
 
 def _change(names: tuple[str, ...], order: tuple[int, ...], side: float) -> str:
-    """Format a change: the new order of the faces, and whether their channels are reversed."""
+    """Format a correction of ``array.csv``: the order of the faces and of their channels."""
     changes = ["count each face's channels from its other end"] if side < 0 else []
     moved = [(f, o) for f, o in enumerate(order) if f != o]
     changes += [f"let face {names[f]} be where face {names[o]} is" for f, o in moved]
@@ -251,7 +251,7 @@ class Overview:
     scans: list[Scan] = field(default_factory=list)
 
     def look(self, frame: Frame) -> None:
-        """Keep a frame, if it is one of the first `SHOWN_CALLS`."""
+        """Store the outputs and detections of a frame, if it is among the first `SHOWN_CALLS`."""
         if len(self.time) == SHOWN_CALLS:
             return
         lags, faces, tones, elements = frame.matched.shape
@@ -360,7 +360,7 @@ def _tone_rate(
 def _call_rate(
     sound: Sound, calls: Calls, gaps: Int[np.ndarray, " g"], sent: Call
 ) -> Iterator[str]:
-    """Yield a report if the leaked call fits another sample rate better."""
+    """Yield a report if the vehicle's call in the recording fits another sample rate better."""
     share = {}
     for rate in (sound.rate, *RATES):
         if extent_of(sent, rate)[1] >= rate / 2.0:
@@ -386,7 +386,7 @@ def _call_rate(
 
 
 def _clock(calls: Calls, rate: float) -> Iterator[str]:
-    """Yield a report if a few calls are not as regular as the others."""
+    """Yield a report if a few intervals between calls deviate from the usual interval."""
     gap = np.diff(calls.sample)
     if gap.size < 5:
         return

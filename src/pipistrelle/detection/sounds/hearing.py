@@ -75,7 +75,7 @@ CHANCE = 5.0
 
 
 def set_noise(sums: ToneSums | CallOutputs, sound: Sound, calls: Calls, folder: Path) -> None:
-    """Measure noise and mean of each channel, and scale the sums to unit noise."""
+    """Measure each channel's noise and mean, and set the gains that scale sums to unit noise."""
     first, gaps = calls.spread(FIRST_GAPS), calls.spread(sums.gaps)
     means, constant = [], np.ones(sound.channels, dtype=bool)
     for samples in calls.gaps(sound, first):
@@ -110,7 +110,7 @@ def _powers(
     numbers: Int[np.ndarray, " g"],
     stretches: Sequence[int],
 ) -> list[Float[np.ndarray, "b f c e"]]:
-    """Return the powers of the sums in some stretches, concatenated over some gaps."""
+    """Return the powers of block sums in given sections of given gaps between calls, by section."""
     power: list[list[np.ndarray]] = [[] for _ in stretches]
     for samples in calls.gaps(sound, numbers):
         heard = sums(samples)[:: sums.apart]
@@ -122,7 +122,7 @@ def _powers(
 
 
 def _quiet(power: Sequence[Float[np.ndarray, "b f c e"]]) -> list[int]:
-    """Return the stretches that are as quiet as the quietest, up to chance: three at most."""
+    """Return the indices of the quietest sections of a gap, up to chance; three at most."""
     level = np.array([np.median(part) if part.size else np.inf for part in power])
     order = level.argsort()[:QUIET]
     count = power[int(order[0])].size
@@ -131,7 +131,7 @@ def _quiet(power: Sequence[Float[np.ndarray, "b f c e"]]) -> list[int]:
 
 
 def _alike(power: Float[np.ndarray, "f c e"], count: int) -> Float[np.ndarray, "f c e"]:
-    """Average the channels' levels, overall or by frequency, if chance explains differences."""
+    """Average noise powers over channels or frequencies if chance explains their differences."""
     chance = CHANCE / (math.log(2.0) * math.sqrt(count))
     for axes in ((0, 1, 2), (0, 2)):
         mean = power.mean(axis=axes, keepdims=True)
@@ -178,7 +178,7 @@ def copied_channels(
 def _sums(
     sound: Sound, calls: Calls, blank: int, used: Int[np.ndarray, " m"]
 ) -> tuple[Float[np.ndarray, "d m m"], Float[np.ndarray, "d m"], Float[np.ndarray, " m"], int]:
-    """Return sums over samples: products of channels at each delay, squares, and the count."""
+    """Return the products of all channel pairs at each delay, and the squares, summed over time."""
     lates = range(-LATEST, LATEST + 1)
     product, count = np.zeros((len(lates), used.size, used.size)), 0
     source, power = np.zeros((len(lates), used.size)), np.zeros(used.size)
@@ -222,7 +222,7 @@ class Frame(NamedTuple):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Hearing:
-    """An open recording, with everything that its calls share."""
+    """An open recording with its microphones, calls, noise levels and detectors."""
 
     about: Description
     sound: Sound
@@ -236,7 +236,7 @@ class Hearing:
 
     @property
     def blocks(self) -> Blocks:
-        """Sampling of a frame."""
+        """Sample rate, block length and tones of a frame."""
         return self.sums.blocks
 
     @classmethod
@@ -262,7 +262,7 @@ class Hearing:
         return one if isinstance(one, Wide) else None
 
     def frames(self, numbers: Sequence[int]) -> Iterator[Frame]:
-        """Yield the frames after some of the calls, numbered from 0."""
+        """Yield matched-filter output and detections after some of the calls, numbered from 0."""
         calls, room = self.calls, Workspace()
         for k in numbers:
             first = int(calls.sample[k])
@@ -273,7 +273,7 @@ class Hearing:
     def _matched(
         self, first: int, samples: Float[np.ndarray, "t m"], room: Workspace
     ) -> Complex[np.ndarray, "l f c e"]:
-        """Filter the samples after a call, from its first sample; raise if they are not finite."""
+        """Return the matched-filter outputs after a call; raise if its samples are not finite."""
         on, shape = self.blocks, self.sums.gain.shape
         if isinstance(self.sums, CallOutputs):
             self.sound.refuse_odd(first, samples)
@@ -291,7 +291,7 @@ class Hearing:
         matched: Complex[np.ndarray, "l f c e"],
         samples: Float[np.ndarray, "t m"],
     ) -> Frame:
-        """Detect the echoes of a call."""
+        """Detect the echoes of a call; return its frame with detections and unlabelled scan."""
         on, around = self.blocks, None
         start = on.blank / on.rate
         if isinstance(self.sums, CallOutputs):
@@ -309,7 +309,7 @@ class Hearing:
 def prepared(
     folder: Path, sound: Sound, about: Description
 ) -> tuple[RecordedArray, ToneSums | CallOutputs, tuple[Call, ...], Calls]:
-    """Return the array of a recording, its sums or filters, calls by caller, and calls in time."""
+    """Return a recording's microphones, filters, callers' waveforms, and the vehicle's calls."""
     array = recorded_array(folder, sound.channels, one_centre=about.one_centre)
     sent, where = about.calls(folder), str(folder / FILE)
     for call in sent:
@@ -332,7 +332,7 @@ def hear_recording(
     look: Callable[[Frame], None],
     progress: Progress | None = None,
 ) -> list[str]:
-    """Hear a recording, call by call; return reasons why its echoes may be wrong, a line each.
+    """Detect a recording's echoes, call by call; return a line for each reason to doubt them.
 
     `frames` returns the range of calls to hear, given their number; `look` is called with each
     frame.
@@ -349,7 +349,7 @@ def hear_recording(
 
 
 def log_callers(about: Description) -> list[dict[str, Any]]:
-    """Return the callers, as in ``log.toml``."""
+    """Return the callers as tables for ``log.toml``: name, landmark label and whether it moves."""
     return [
         {"name": one.name, "landmark": number if one.landmark is None else one.landmark}
         | ({"moves": True} if one.moves else {})

@@ -78,7 +78,7 @@ _Channel = Annotated[int, Field(ge=1, le=1024)]
 
 
 class _Told(CallConfig):
-    """A call, with the keys of the settings; a file name is relative to the recording."""
+    """Keys of a call in ``recording.toml``; its sound file is relative to the recording."""
 
     model_config = ConfigDict(strict=True)
 
@@ -95,7 +95,7 @@ class _Told(CallConfig):
 
 
 class OwnCall(_Told):
-    """The vehicle's own call, and its times."""
+    """The vehicle's own call, and its times, as keys of ``recording.toml``."""
 
     duration: Annotated[float, Field(ge=1e-5, le=1.0)]
     """Length [s]."""
@@ -122,7 +122,7 @@ class OwnCall(_Told):
 
 
 class OtherCaller(_Told):
-    """A caller other than the vehicle."""
+    """A caller other than the vehicle, as keys of ``recording.toml``."""
 
     name: _Name
     level_db: Level | None = None
@@ -134,7 +134,7 @@ class OtherCaller(_Told):
 
 
 class Description(Section):
-    """The keys of ``recording.toml``."""
+    """The keys of ``recording.toml``, which describes a sound recording."""
 
     model_config = ConfigDict(strict=True)
 
@@ -179,7 +179,7 @@ class Description(Section):
         return self
 
     def calls(self, folder: Path) -> tuple[Call, ...]:
-        """Return the calls of all callers, the vehicle's first; `folder`: of the recording."""
+        """Return the call of each caller, the vehicle's first; `folder`: of the recording."""
         duration, calls = self.call.duration, []
         for key, one in zip(self._keys(), (self.call, *self.callers), strict=True):
             file = {} if one.call in (TONE, SWEEP) else {"call": str(folder / one.call)}
@@ -189,7 +189,7 @@ class Description(Section):
         return tuple(calls)
 
     def _keys(self) -> list[str]:
-        """Return the keys of the tables of all callers, the vehicle's first."""
+        """Return the keys of all callers' tables in ``recording.toml``, the vehicle's first."""
         return ["call", *(f"callers.{j}" for j in range(1, len(self.callers) + 1))]
 
 
@@ -233,7 +233,7 @@ PACKED = ("FLAC", "ALAC_16", "ALAC_20", "ALAC_24", "ALAC_32")
 
 
 class _Kind(NamedTuple):
-    """The layout of chunks in a kind of file."""
+    """The layout of chunks in a kind of sound file, such as WAV."""
 
     first: int
     """Offset of the first chunk [byte]."""
@@ -260,7 +260,7 @@ _KINDS = {
 
 
 def _check_header(path: Path, file: "SoundFile") -> None:
-    """Raise if a header does not agree with its file: size, samples or rate."""
+    """Raise if a sound file's header contradicts the file: its size, samples or rate."""
     length = path.stat().st_size
     with path.open("rb") as raw:
         magic = raw.read(4)
@@ -280,7 +280,7 @@ def _check_header(path: Path, file: "SoundFile") -> None:
 def _check_size(
     path: Path, file: "SoundFile", magic: bytes, size: int, there: int, rate: int | None
 ) -> None:
-    """Raise if the announced size is not filled in, exceeds the file, or contradicts a field."""
+    """Raise if the announced size is not filled in, exceeds the file, or contradicts the header."""
     if size in UNFILLED and size != there:
         raise InputError(
             f"{path}: found a header in which the size of its sound was never filled in "
@@ -304,7 +304,7 @@ def _check_size(
 
 
 def _announced(raw: BinaryIO, magic: bytes, length: int) -> tuple[int, int, int | None] | None:
-    """Return the announced size of the sound, the size from its beginning on, and bytes per second.
+    """Return the announced and the actual size of a file's sound, and its bytes per second.
 
     None for an unknown kind, or a file without sound; the last is None if not announced.
     """
@@ -416,7 +416,7 @@ def open_sound(folder: Path, about: Description) -> Iterator[Sound]:
 
 
 def _paths(folder: Path, about: Description) -> list[Path]:
-    """Return the sound files, in their order."""
+    """Return the paths of a recording's sound files, in their order."""
     if about.sound:
         return [folder / name for name in about.sound]
     found = sorted(path for path in folder.iterdir() if path.suffix.lower() in ENDINGS)
@@ -427,7 +427,7 @@ def _paths(folder: Path, about: Description) -> list[Path]:
 
 
 def _opened(path: Path) -> "SoundFile":
-    """Open a sound file, and check its header."""
+    """Open a sound file, and raise if its header contradicts the file."""
     file = opened_sound(path, str(path))
     try:
         with sound_faults(str(path)):
