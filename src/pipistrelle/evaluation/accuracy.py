@@ -11,7 +11,7 @@ from pipistrelle.geometry import wrap
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class MapEstimate:
-    """A map with one row per landmark, in the order of their entry."""
+    """An estimated map with a row per landmark, in the order of their first appearance."""
 
     landmark: Int[np.ndarray, " n"]
     mean: Float[np.ndarray, "n 2"]
@@ -23,7 +23,7 @@ class MapEstimate:
 
 
 def heaviest(landmarks: Landmarks) -> MapEstimate:
-    """Represent each landmark by its heaviest hypothesis, the first of equals.
+    """Return a map that holds each landmark's hypothesis of largest weight, the first of equals.
 
     Bradley & Abaid, Sec. V-A, "fully and partially initialize".
 
@@ -191,7 +191,7 @@ def alignment(
 def moved(
     points: Float[np.ndarray, "n 2"], motion: Float[np.ndarray, "3"]
 ) -> Float[np.ndarray, "n 2"]:
-    r"""Move points rigidly.
+    r"""Rotate and translate points by a rigid motion.
 
     .. math:: q_i = R(\theta) p_i + t
 

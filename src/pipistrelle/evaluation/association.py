@@ -26,7 +26,7 @@ STAY = np.zeros(3)
 
 
 def causes_of(scan: Scan, rows: Scan, cause: Int[np.ndarray, " n"]) -> Int[np.ndarray, " m"]:
-    """Return the true labels of the rows of a scan, a selection of a frame's rows.
+    """Return the true label of each measurement of a scan, from the true labels of its frame.
 
     >>> from pipistrelle.detection.scans import make_scan, rows_of
     >>> frame = make_scan(0.0, np.full(2, -1), np.array([0.1, 0.4]))
@@ -41,7 +41,7 @@ def causes_of(scan: Scan, rows: Scan, cause: Int[np.ndarray, " n"]) -> Int[np.nd
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Associated:
-    """The landmark of each label, from the causes of rows or from positions."""
+    """The true landmark that each label represents, and the shares of correct measurements."""
 
     names: Mapping[int, int]
     """The landmark that each label represents, or UNLABELLED."""
@@ -58,7 +58,7 @@ class Associated:
 def associated(
     labels: Sequence[Int[np.ndarray, " m"]], causes: Causes, moving: Sequence[int] = ()
 ) -> Associated:
-    """Compare the labels of all scans' rows with the true labels.
+    """Compare the labels of all measurements, scan by scan, with their true labels.
 
     `moving`: callers that move, which are not landmarks.
 
@@ -117,7 +117,7 @@ def nearest_motion(
     true: Float[np.ndarray, "k 2"],
     motions: Sequence[Float[np.ndarray, "3"]],
 ) -> Float[np.ndarray, "3"]:
-    """Select the rigid motion that brings points nearest to true points, by `gospa`.
+    """Select the rigid motion that brings points nearest to true points by the GOSPA metric.
 
     >>> nearest_motion(np.ones((1, 2)), np.full((1, 2), 5.0), [STAY, np.array([4.0, 4.0, 0.0])])
     array([4., 4., 0.])
@@ -174,7 +174,7 @@ def out_of_place(
     true_position: Float[np.ndarray, "k 2"],
     motion: Float[np.ndarray, "3"] = STAY,
 ) -> frozenset[int]:
-    """Return the labels of initialised landmarks that are far from all true ones after a motion."""
+    """Return labels of associated landmarks that are far from all true landmarks after a motion."""
     full, known = placed(landmarks), {*true_landmark.tolist()}
     labels, points = landmarks.landmark[full].tolist(), moved(landmarks.mean[full], motion)
     return frozenset(
@@ -185,7 +185,7 @@ def out_of_place(
 
 
 def renamed(landmarks: Landmarks, found: Associated) -> Landmarks:
-    """Return a map with the labels of the true landmarks.
+    """Return a map relabelled by the true landmarks that its labels represent.
 
     Of several labels of a landmark, the one with most rows is used. The others, and labels without
     a landmark, become negative.
@@ -219,7 +219,7 @@ def map_counts(
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Gospa:
-    """The GOSPA metric and its three parts."""
+    """GOSPA distance between two sets of points, with its error, missed and false points."""
 
     distance: float
     """[m]."""

@@ -152,7 +152,7 @@ def true_controls(
     time: Float[np.ndarray, " t"],
     path: Float[np.ndarray, "t 3"],
 ) -> Float[np.ndarray, "k c"]:
-    """Return the controls that lead along the true path; zero controls and poses are unchanged."""
+    """Return the controls that reproduce the true path; controls of 0, or poses, are unchanged."""
     if motion.model == "poses":
         return controls
     commanded = controls.any(axis=1, keepdims=True)
@@ -168,7 +168,7 @@ def _write_transition(
     motion: MotionNumbers,
     walk_std: float,
 ) -> None:
-    """Write F and Q of the true step to k, for the pose and moving callers."""
+    """Write transition matrix and process noise of true step k, for pose and moving callers."""
     F, Q, (steered, seconds) = work.F, work.Q, control
     write_identity(F)
     Q[:] = 0.0
@@ -198,7 +198,7 @@ def _bound(
     rows: Arrays,
     heard: Int[np.ndarray, "t 3"],
 ) -> Float[np.ndarray, "t 3 3"]:
-    """Eliminate along the true path, as the smoother does; return the bound of each pose.
+    """Return the bound of each pose by elimination along the true path, as the smoother does.
 
     ``driven``: true controls and their durations; ``heard``: for each step the first row, the row
     after the last, and the number of separator columns measured so far.

@@ -58,7 +58,7 @@ INTERVALS = (
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Statement:
-    """A claim about the mean of a sample over worlds."""
+    """A claim about the mean of a sample with a number per world."""
 
     label: str
     sample: Float[np.ndarray, " n"]
@@ -79,7 +79,7 @@ class Statement:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Finding:
-    """Test result of a statement within its family."""
+    """Test result of a statement: mean, confidence intervals, p value, and whether it holds."""
 
     n: int
     """Number of worlds, of two samples in the smaller."""
@@ -100,7 +100,7 @@ class Finding:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Contrast:
-    """Comparison of two values of a factor over worlds."""
+    """Comparison of two values of a factor, such as two filters, over worlds."""
 
     by: Mapping[str, Any]
     """Values of the columns that both have in common."""
@@ -220,7 +220,7 @@ def contrasts(
 def _by_key(
     rows: "pl.DataFrame", keys: Sequence[str], columns: Sequence[str]
 ) -> dict[tuple[Any, ...], tuple[Float[np.ndarray, " n"], ...]]:
-    """Average columns in each world and collect the finite worlds by key."""
+    """Average columns per world; return them by key, as arrays over worlds with finite values."""
     import polars as pl
 
     means = rows.group_by([*keys, "world"], maintain_order=True).agg(pl.col(*columns).mean())
@@ -235,7 +235,7 @@ def _by_key(
 
 
 def judge(statements: Sequence[Statement], confidence: float = 0.95) -> tuple[Finding, ...]:
-    """Test a family of statements together.
+    """Test statements together with Holm's correction; return the finding of each.
 
     A statement of absence ("not above", "slightly above") holds only if the family could have
     detected a mean of one standard deviation of the sample: half the width of its widest interval,
@@ -341,7 +341,7 @@ def pseudovalues(
 
 
 def _moments(statement: Statement) -> tuple[float, float, float]:
-    """Return number, mean and standard deviation of a sample, or of Welch's equivalent of two."""
+    """Return size, mean and std of a sample, or Welch's equivalent of two samples' difference."""
     n, mean, std = _sample_moments(statement.label, statement.sample)
     if statement.against is None:
         return n, mean, std
@@ -354,7 +354,7 @@ def _moments(statement: Statement) -> tuple[float, float, float]:
 
 
 def _sample_moments(label: str, numbers: Float[np.ndarray, " n"]) -> tuple[int, float, float]:
-    """Return number, mean and standard deviation of a sample; NaN if undefined."""
+    """Return size, mean and standard deviation of a sample; NaN if undefined."""
     sample = np.asarray(numbers, dtype=np.float64)
     if not np.all(np.isfinite(sample)):
         raise ValueError(f"{label}: found a number that is not finite")
@@ -374,7 +374,7 @@ def _half_width(moments: tuple[float, float, float], tail: float) -> float:
 def _lower_bounds(
     samples: Sequence[tuple[float, float, float]], edges: Sequence[float], alpha: float
 ) -> tuple[Float[np.ndarray, " m"], Float[np.ndarray, " m"]]:
-    """Return lower bounds of means, and Holm-adjusted p values of not exceeding their edges."""
+    """Return simultaneous lower bounds of means, and Holm's p values against given edges."""
     from scipy.special import stdtr
 
     p = np.ones(len(samples))
@@ -401,7 +401,7 @@ def _verdict(
     tail: float,
     resolved: bool,
 ) -> tuple[bool | None, float]:
-    """Decide a statement from the p values of its edges, the opposite's edges last."""
+    """Return whether a statement holds, fails or is open (None), and its two-sided p value."""
     _, mean, std = moments
     above, below = p_low <= tail, p_high <= tail
     p = min(1.0, 2.0 * float(min(p_low[0], p_high[0])))

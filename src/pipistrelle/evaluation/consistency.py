@@ -42,7 +42,7 @@ def nees(
 def _eliminated(
     error: Float[np.ndarray, "*n d"], covariance: Float[np.ndarray, "*n d d"]
 ) -> tuple[Float[np.ndarray, "*n"], Bool[np.ndarray, "*n"]]:
-    """Compute the NEES by elimination, and whether each covariance is positive definite."""
+    """Return the NEES of errors, and whether each covariance is positive definite."""
     r = np.array(error, dtype=np.float64)
     P = np.array(covariance, dtype=np.float64)
     d = r.shape[-1]
@@ -89,7 +89,7 @@ def track_nees(pose: Gaussian, true: Float[np.ndarray, "k 3"]) -> Float[np.ndarr
 def _right_invariant(
     pose: Gaussian, error: Float[np.ndarray, "k 3"]
 ) -> tuple[Float[np.ndarray, "k 3"], Float[np.ndarray, "k 3 3"]]:
-    r"""Convert linear errors and covariances to right-invariant ones about the first position.
+    r"""Convert pose errors and covariances from linear to right-invariant about the first position.
 
     With positions relative to it, :math:`\hat p = R(\xi_\theta) p + V(\xi_\theta) \xi_p`; the
     filter's error, from estimate to truth, is the negative.
@@ -229,7 +229,7 @@ def strayed_landmarks(
 def _residuals(
     track: Track, label: np.ndarray, time: np.ndarray, scans: Sequence[Scan]
 ) -> tuple[Float[np.ndarray, " m"], np.ndarray]:
-    """Return each measurement's squared residual and its dimension; 0 if not on the map."""
+    """Return each measurement's squared normalised residual and its dimension; 0 if unmapped."""
     known = some_of(track.landmarks, placed(track.landmarks))
     order = np.argsort(known.landmark)
     at = np.searchsorted(known.landmark[order], label).clip(0, max(order.size - 1, 0))

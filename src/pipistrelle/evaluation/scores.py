@@ -34,7 +34,7 @@ class Score:
 
 
 def _in(*places: Place) -> frozenset[Place]:
-    """Return a set of display places."""
+    """Return the given display places of a score as a set."""
     return frozenset(places)
 
 
@@ -125,7 +125,7 @@ NOT_MEANS = frozenset(("diverged", "gated", "wall_s", "map_rmse_shared_m"))
 
 
 def shown_in(place: Place) -> dict[str, Score]:
-    """Return the scores that a place shows.
+    """Return the scores, by name, that a place such as a report or a table shows.
 
     >>> list(shown_in("studies"))[:2]
     ['position_rmse_m', 'heading_rmse_rad']
