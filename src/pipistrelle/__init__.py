@@ -21,7 +21,7 @@ _ROOMS = {
 
 
 def __getattr__(name: str) -> object:
-    """Import a public name on first use."""
+    """Import the module of a public name on first access, and return the object of that name."""
     from importlib import import_module
 
     if name == "__version__":
@@ -32,5 +32,5 @@ def __getattr__(name: str) -> object:
 
 
 def __dir__() -> list[str]:
-    """Return the public names."""
+    """Return the package's public names, for `dir`."""
     return [*__all__, "__version__"]

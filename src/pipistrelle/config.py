@@ -42,7 +42,7 @@ LEAST_STD = 1e-6
 
 
 def _not_tiny(value: float) -> float:
-    """Raise if a positive number is below 1 / LARGEST."""
+    """Return a positive number; raise if it is so small that its inverse exceeds `LARGEST`."""
     if value < 1.0 / LARGEST:
         raise ValueError(f"at least {1.0 / LARGEST:g}")
     return value
@@ -60,7 +60,7 @@ Probability = Annotated[float, Field(gt=0, le=1)]
 
 
 def _gate(value: Any) -> Any:
-    """Return a gate as a float in (0, 1] or as "auto"; raise for any other value."""
+    """Return a gate's probability as a float in (0, 1], or "auto"; raise for any other value."""
     if value == "auto":
         return value
     if isinstance(value, (int, float)) and value is not True and 0.0 < value <= 1.0:
@@ -78,10 +78,10 @@ STRATEGIES: tuple[Strategy, ...] = ("active", "fused", "passive")
 
 
 class InputError(ValueError):
-    """A mistake of the user, with its place, the found and the expected value, and a fix."""
+    """Error of the user's input: its place, the found and the expected value, and a fix."""
 
     def _render_traceback_(self) -> list[str]:
-        """Return only the message for a notebook, because the mistake is not in the code."""
+        """Return the error's message without a traceback, for a notebook to show."""
         return [f"InputError: {self}"]
 
 
@@ -98,7 +98,7 @@ MAX_OTHERS = 7
 
 
 class ScenarioConfig(Section):
-    """The true world: a noisy drive, round the paper's circle, among random landmarks."""
+    """The true world: random landmarks, and a noisy drive among them, by default on a circle."""
 
     world: Annotated[str, Field(min_length=1)] | None = None
     """Folder of a world to use; whatever it omits is drawn by the other settings."""
@@ -145,7 +145,7 @@ class ScenarioConfig(Section):
 
 
 class AirConfig(Section):
-    """The air, the default medium; the paper does not report its humidity."""
+    """Properties of the air, the default medium; the paper does not report its humidity."""
 
     speed_of_sound: SoundSpeed | None = None
     """Speed of sound [m/s]; by default 343 sqrt(T / 293.15 K) at the temperature T."""
@@ -168,7 +168,7 @@ class AirConfig(Section):
 
 
 class WaterConfig(Section):
-    """Sea or fresh water, the medium if `scenario.medium` is `water`."""
+    """Properties of sea or fresh water, the medium if `scenario.medium` is `water`."""
 
     speed_of_sound: SoundSpeed | None = None
     """Speed of sound [m/s]; by default computed from temperature, salinity and depth."""
@@ -201,7 +201,7 @@ class WaterConfig(Section):
 
 
 class TargetConfig(Section):
-    """The bodies of the landmarks; their radius and shape are unreported."""
+    """Shape and radius of the landmarks' bodies, both unreported in the paper."""
 
     shape: Literal["cylinder", "sphere"] = "cylinder"
     """Shape of a landmark, rigid at short waves: cylinder (the paper's formula, corrected) or
@@ -334,12 +334,12 @@ class CallerConfig(Section):
 
     @property
     def own_clock(self) -> bool:
-        """Whether it calls at other times than the vehicle."""
+        """Whether the caller calls at other times than the vehicle."""
         return any(getattr(self, name) is not None for name in _CLOCK)
 
     @property
     def way(self) -> str:
-        """Kind of motion: one of the keys of `_WAYS`."""
+        """Kind of the caller's motion, such as `route` or `circle`."""
         if self.route is not None:
             return "route"
         return "waypoints" if self.waypoints is not None else self.course or "stand"
@@ -378,7 +378,7 @@ class CallerConfig(Section):
 
 
 def caller_names(callers: tuple[CallerConfig, ...]) -> tuple[str, ...]:
-    """Return the names of callers; without a name `beacon` or the number in the list.
+    """Return the callers' names, by default `beacon` for the first, then `caller2` and so on.
 
     >>> caller_names((CallerConfig(), CallerConfig(name="boat"), CallerConfig()))
     ('beacon', 'boat', 'caller3')
@@ -470,7 +470,7 @@ class DetectionConfig(Section):
 
 
 class MatchingConfig(Section):
-    """Limits for matching detections with arrivals (known labels) and with other faces."""
+    """Largest differences in matching detections to true arrivals, and between faces."""
 
     delay_gate: Positive = 0.25
     """Largest difference of the delays, as a share of the call's length."""
@@ -503,7 +503,7 @@ class AssociationConfig(Section):
 
 
 class ListeningConfig(Section):
-    """The quantities that estimators use of the detections."""
+    """Choice of the measured quantities that estimators use."""
 
     timing: bool = False
     """Use of excess paths: the delay of a caller's echo after its direct call."""
@@ -558,7 +558,7 @@ PARAMETERS: tuple[Parameter, ...] = get_args(Parameter)
 
 
 class FilterConfig(Section):
-    """Measurement noise, outliers and start, as the estimators assume them."""
+    """Measurement noise, outliers and start pose that the estimators assume."""
 
     noise: Literal["constant", "measured"] = "constant"
     """Source of measurement noise: `constant` uses range_std, bearing_std and excess_path_std for
@@ -616,13 +616,13 @@ class PriorConfig(Section):
 
 
 def _check_rising(near: float, far: float) -> None:
-    """Raise if the lower bound is not below the upper one."""
+    """Raise if the lower bound of a range is not below the upper bound."""
     if near >= far:
         raise ValueError(f"range_bounds must rise, found [{near}, {far}]")
 
 
 class RayConfig(Section):
-    """Passive landmarks as rays of Gaussian members (Table I; pruning and power unreported)."""
+    """Bearing-only landmarks, each a ray of Gaussians (Table I; pruning and power unreported)."""
 
     ratio: Annotated[float, Field(gt=0, lt=1)] = 0.3
     """Standard deviation of a ray's member along the ray, as a share of its range (alpha)."""
@@ -779,7 +779,7 @@ class Config(Section):
 
     @property
     def medium(self) -> AirConfig | WaterConfig:
-        """The section of the chosen medium."""
+        """Settings of the chosen medium, air or water."""
         return self.water if self.scenario.medium == "water" else self.air
 
     @property

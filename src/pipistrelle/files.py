@@ -42,7 +42,7 @@ def check_ordinary(path: Path) -> None:
 
 
 def read_file(path: Path) -> bytes:
-    """Read a file as bytes."""
+    """Read an ordinary file as bytes; raise for a folder, a pipe or a device."""
     check_ordinary(path)
     return path.read_bytes()
 
@@ -73,7 +73,7 @@ def read_text(path: Path) -> str:
 
 
 def printable(path: Path) -> str:
-    """Return the path as text; shortened or escaped if no file can have such a name."""
+    """Return a path as text; shortened or escaped if no file can have such a name."""
     text = str(path)
     return text if text.isprintable() and len(text) < 4096 else shown(text)
 
@@ -110,7 +110,7 @@ def without_links(path: Path) -> Path:
 
 @contextlib.contextmanager
 def held(folder: Path) -> Iterator[Path]:
-    """Yield a path that keeps leading to a folder if another folder takes its name.
+    """Yield a path that keeps leading to a folder even if the folder is renamed or replaced.
 
     On Linux the path goes through a descriptor; on other systems it is `folder` itself.
     """
@@ -149,7 +149,7 @@ class PiecesFile:
 
     @property
     def sum(self) -> str:
-        """The sum of the data written so far."""
+        """The SHA-256 checksum of the data written so far."""
         return self._sum.hexdigest()
 
     def write(self, data: bytes) -> None:
@@ -167,7 +167,7 @@ class PiecesFile:
                 self._file.close()
 
     def discard(self) -> None:
-        """Remove the file if it was not put in place."""
+        """Close the temporary file, and remove it unless it has its final name."""
         with contextlib.suppress(OSError):  # on a full disk, closing writes the rest
             self._file.close()
         with contextlib.suppress(OSError):
@@ -190,7 +190,7 @@ def not_written(path: Path, error: OSError) -> InputError:
 
 
 def whole_name(partial: str) -> str | None:
-    """Return the final name of a partial file; None for any other name."""
+    """Return the final name of a file with a temporary name; None for any other name."""
     found = _PARTIAL.fullmatch(partial)
     return found[1] if found else None
 
@@ -257,14 +257,14 @@ class Kind:
     """Patterns of names that are checked individually, when they are written."""
 
     def writes(self, name: str) -> bool:
-        """Return whether this kind includes a file name, relative to the folder."""
+        """Return whether this kind of output includes a file name, relative to the folder."""
         path = PurePosixPath(name)
         inside = not path.is_absolute() and ".." not in path.parts and path.as_posix() == name
         return inside and _matches(name, (*self.names, *self.more))
 
 
 def _matches(name: str, patterns: Iterable[str]) -> bool:
-    """Return whether a name matches any pattern, ignoring case."""
+    """Return whether a file name matches any of the patterns, ignoring case."""
     return any(fnmatchcase(name.lower(), pattern.lower()) for pattern in patterns)
 
 
@@ -310,7 +310,7 @@ COMMAND_LINE = ("-o DIR", "--overwrite")
 def claim(
     folder: Path, kind: Kind, *, overwrite: bool, flags: tuple[str, str] = COMMAND_LINE
 ) -> "OwnFiles":
-    """Accept a folder for output: a new or empty one, or one with our results.
+    """Check that a folder can receive output: it is new, empty, or holds results to replace.
 
     Raises if it cannot be written, which is tested without leaving anything there. `overwrite`:
     whether our earlier output may be replaced; `flags`: options for another folder and for
@@ -389,7 +389,7 @@ def drawn_files(draw: Callable[[Path], object], under: str = "") -> dict[str, by
 
 
 class OwnFiles:
-    """The files that we wrote into a folder, identified by its list of sums.
+    """The files that Pipistrelle wrote into a folder, identified by the folder's checksums.
 
     `kind`: the kind to read or write; a folder with another kind is not written.
 
@@ -411,11 +411,11 @@ class OwnFiles:
         """The title of the kind in the folder, None if it has no files of ours, and their sums."""
 
     def __contains__(self, name: str) -> bool:
-        """Return whether a file is listed: we wrote it, or began to."""
+        """Return whether the checksums list a file: we wrote it, or began to."""
         return name in self._sums
 
     def read(self, name: str) -> bytes:
-        """Read a file if it is unchanged since we wrote it; else raise."""
+        """Return a file's content; raise if the file was changed since we wrote it."""
         path = self.folder / name
         try:
             data = read_file(path)
@@ -440,7 +440,7 @@ class OwnFiles:
             )
 
     def check(self) -> None:
-        """Raise if the folder contains changed or foreign files under the names to be replaced."""
+        """Raise if the folder contains changed or foreign files that output would replace."""
         self.check_kind()
         named = (name for name in _names_in(self._place) if _matches(name, self.kind.names))
         for name in sorted({*named, *self._sums}):
@@ -485,7 +485,7 @@ class OwnFiles:
         self._write({name: content}, keep=True)
 
     def _write(self, files: Mapping[str, str | bytes | PiecesFile], *, keep: bool) -> None:
-        """Hold the folder and write files into it."""
+        """Check that the folder may be written, and write files into it."""
         made: list[Path] = []
         try:
             made = make_folder(self.folder)
@@ -507,7 +507,7 @@ class OwnFiles:
             remove_empty(made)
 
     def _write_held(self, files: Mapping[str, str | bytes | PiecesFile], *, keep: bool) -> None:
-        """Write files under temporary names, list their sums, and rename them."""
+        """Write files under temporary names, list their checksums, and rename them."""
         contents = {n: c.encode() if isinstance(c, str) else c for n, c in files.items()}
         for name in contents:
             if not self.kind.writes(name):
@@ -553,7 +553,7 @@ class OwnFiles:
                 _remove(partials.values())
 
     def _put_in_place(self, partials: Mapping[str, Path], old: Iterable[str]) -> None:
-        """Rename the new files; remove old ones, and leftovers of killed processes."""
+        """Rename the new files to their final names; remove old files and leftovers of crashes."""
         *_, last = partials
         _remove(self._place / name for name in (*([last] if last in self._sums else ()), *old))
         for name in [*_names_in(self._place)]:
@@ -564,7 +564,7 @@ class OwnFiles:
             put_in_place(partial, self._place / name, replace=self._is_ours(name))
 
     def _list_sums(self, sums: Mapping[str, set[str]]) -> None:
-        """Write the list of sums; its files are ours from then on, even after a crash."""
+        """Write the list of checksums, which marks its files as ours even after a crash."""
         lines = [f"{one}  {name}" for name, some in sums.items() for one in sorted(some)]
         text = "\n".join([_HEAD.format(self.kind.title), *lines, ""])
         data = text.encode(errors="surrogateescape")
@@ -573,7 +573,7 @@ class OwnFiles:
 
 
 def _in_the_way(path: Path, what: str) -> InputError:
-    """Return the error for a file or folder that is not replaced."""
+    """Return the error that a file or folder may not be replaced by output."""
     return InputError(
         f"{path}: {what}, so it is not replaced; move it away, or name another folder"
     )
@@ -591,7 +591,7 @@ def _list_in(folder: Path) -> bytes | None:
 
 
 def _sums_of(text: bytes | None) -> tuple[str | None, dict[str, set[str]]]:
-    """Parse a list of sums: its kind, and the sums by file name; None if it is not ours.
+    """Parse a list of checksums; return the folder's kind, None if not ours, and sums by file.
 
     While files are replaced, the list has the old and the new sums.
     """

@@ -14,7 +14,7 @@ from pipistrelle.jit import substituted
 
 @substituted
 def wrap_angle(angle: float) -> float:
-    """Wrap one angle to [-pi, pi) [rad]; for kernels (see `wrap`)."""
+    """Wrap one angle to [-pi, pi) [rad]; for compiled functions (see `wrap`)."""
     if -math.pi <= angle < math.pi:
         return angle
     wrapped = angle - 2.0 * math.pi * math.floor((angle + math.pi) / (2.0 * math.pi))
@@ -71,7 +71,7 @@ def circular_mean(
 def poses_at(
     time: Float[np.ndarray, " k"], known: Float[np.ndarray, " n"], path: Float[np.ndarray, "n 3"]
 ) -> Float[np.ndarray, "k 3"]:
-    """Interpolate poses linearly at other times; NaN outside.
+    """Interpolate poses linearly at other times; NaN outside the known times.
 
     `time`, `known` [s]: the latter increasing, of the `path` [m, m, rad], its heading unwrapped.
 
@@ -87,7 +87,7 @@ def poses_at(
 def path_at(
     time: Float[np.ndarray, " k"], known: Float[np.ndarray, " n"], path: Float[np.ndarray, "n 3"]
 ) -> Float[np.ndarray, "k 3"]:
-    """Interpolate poses of a path with wrapped headings at other times; NaN outside."""
+    """Interpolate poses with wrapped headings at other times; NaN outside the known times."""
     x, y, heading = path.T
     poses = poses_at(time, known, np.column_stack((x, y, np.unwrap(heading))))
     poses[:, 2] = wrap(poses[:, 2])
@@ -97,5 +97,5 @@ def path_at(
 def points_at(
     time: Float[np.ndarray, " k"], known: Float[np.ndarray, " n"], points: Float[np.ndarray, "n d"]
 ) -> Float[np.ndarray, "k d"]:
-    """Interpolate points linearly at other times; the ends are held outside."""
+    """Interpolate points linearly at other times; outside, the first or last point is held."""
     return np.column_stack([np.interp(time, known, column) for column in points.T])

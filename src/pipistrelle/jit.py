@@ -49,7 +49,7 @@ _Function = TypeVar("_Function", bound=Callable[..., Any])
 
 
 def _compiler(*, twice: bool = True, **options: bool | str) -> Callable[[_Function], _Function]:
-    """Return a decorator that compiles functions, and caches them in checked files."""
+    """Return a decorator that compiles functions by Numba, and caches them in checked files."""
     public: dict[str, Any] = {name: value for name, value in options.items() if name == "inline"}
     public |= {"nopython": True, "error_model": "numpy"}
     options |= public | {"no_cfunc_wrapper": True}

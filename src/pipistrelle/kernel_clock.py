@@ -23,7 +23,7 @@ _COMPILE, _LOCK = "numba:compile", "numba:compiler_lock"
 
 
 class _Clock(_events.Listener if _events else object):  # pyrefly: ignore[invalid-inheritance]
-    """Listener that sums the time of compilation and loading, and announces the first."""
+    """Numba's listener that sums the time of compiling and loading, and announces the first."""
 
     def __init__(self) -> None:
         self.tell: Callable[[str], object] | None = _say
@@ -32,7 +32,7 @@ class _Clock(_events.Listener if _events else object):  # pyrefly: ignore[invali
         self._began, self._depth = (0.0, 0.0), 0
 
     def on_start(self, event: Any) -> None:
-        """Stop the clocks."""
+        """Stop the clocks as Numba begins to compile or load; announce the first compilation."""
         held = self.said or self.judging
         if event.kind == _COMPILE and self.tell is not None and not held:
             self.said = True
@@ -42,7 +42,7 @@ class _Clock(_events.Listener if _events else object):  # pyrefly: ignore[invali
         self._depth += 1
 
     def on_end(self, event: Any) -> None:
-        """Restart the clocks at the end of the outermost event."""
+        """Restart the clocks as Numba's outermost compilation or loading ends."""
         self._depth -= 1
         if not self._depth:
             (wall, cpu), began = _now(), self._began
@@ -67,13 +67,13 @@ def _say(line: str) -> None:
 
 
 def announce(tell: Callable[[str], object] | None = _say) -> None:
-    """Set the function that is called once, at the first compilation; None for none."""
+    """Set the function that announces the first compilation of kernels; None for silence."""
     _CLOCK.tell = tell
 
 
 @contextmanager
 def judging() -> Iterator[None]:
-    """Suppress the announcement while input is checked; its few kernels compile quickly."""
+    """Suppress the announcement of compilation while input is checked, as that is quick."""
     _CLOCK.judging += 1
     try:
         yield

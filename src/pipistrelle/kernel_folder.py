@@ -40,7 +40,7 @@ _said: set[str] = set()
 
 
 def say(line: str) -> None:
-    """Print a message once, if standard error is open."""
+    """Print a message to standard error, each only once."""
     if line not in _said:
         _said.add(line)
         with suppress(OSError, AttributeError):
@@ -48,13 +48,13 @@ def say(line: str) -> None:
 
 
 class Turn:
-    """The lock of this process to compile a kernel; one at a time."""
+    """File lock that lets only one process at a time compile a kernel."""
 
     def __init__(self) -> None:
         self._file: int | None = None
 
     def take(self, kernel: Path) -> None:
-        """Wait for the lock of a kernel's file, and hold it."""
+        """Wait for the lock on compiling a kernel, and take it."""
         self.end()
         if fcntl is None:
             return
@@ -70,7 +70,7 @@ class Turn:
                     return
 
     def end(self) -> None:
-        """Release the lock."""
+        """Release the lock on compiling a kernel, if it is held."""
         if self._file is not None:
             os.close(self._file)
             self._file = None
@@ -80,7 +80,7 @@ TURN = Turn()
 
 
 def place_kernels(*, plain: bool = False) -> bool:
-    """Set Numba's cache folder, ``NUMBA_CACHE_DIR``, below the user's if that is already set.
+    """Set ``NUMBA_CACHE_DIR`` to the kernels' cache folder; return whether it was inherited.
 
     Processes started by this one inherit it; returns whether this process has inherited it.
     ``plain``: whether Numba compiles and caches kernels in its own way.
@@ -115,7 +115,7 @@ def sources_key(plain: bool = False) -> str:
 
 
 def _unfit(folder: Path) -> str | None:
-    """Create the cache folder; return the reason if it cannot be used."""
+    """Create the cache folder of kernels; return the reason if it cannot be used."""
     try:
         for one in (*reversed(folder.parents), folder):
             if not one.exists():
@@ -162,7 +162,7 @@ def _is_mine(folder: Path, *, writable: bool = False) -> bool:
 
 
 def _is_private(group: int) -> bool:
-    """Return whether a group has this user as only member, by its name."""
+    """Return whether a Unix group has this user's name and no other member."""
     if pwd is None or grp is None:
         return False
     try:
@@ -187,12 +187,12 @@ def _temporary() -> Path:
 
 
 def _of_user() -> str:
-    """Return the name of this user's folder in a shared folder."""
+    """Return the name of this user's cache folder within a shared folder."""
     return f"pipistrelle-{os.getuid() if hasattr(os, 'getuid') else ''}"
 
 
 def _wanted(plain: bool) -> Path:
-    """Return the preferred cache folder."""
+    """Return the preferred cache folder of kernels, by the environment and a hash of sources."""
     key = sources_key(plain)
     if chosen := os.environ.get("NUMBA_CACHE_DIR"):
         folder = Path(chosen).absolute()
@@ -210,7 +210,7 @@ def _wanted(plain: bool) -> Path:
 
 
 def _drop_old(folder: Path) -> None:
-    """Mark a state's kernels as used; remove all but the three most recently used states."""
+    """Mark a cache folder as used; remove all but the three most recently used in its parent."""
     try:
         os.utime(folder)
         states = [other for other in folder.parent.iterdir() if re.fullmatch(_KEY, other.name)]

@@ -31,10 +31,10 @@ from pipistrelle.kernel_folder import TURN, say
 
 
 class CheckedFiles(IndexDataCacheFile):
-    """The cache files of a kernel, with checksums."""
+    """The files that cache a compiled kernel, each with a checksum."""
 
     def load(self, key: Any) -> Any:
-        """Load a kernel; None if it must be compiled, with the lock for it taken."""
+        """Load a kernel from the cache; None, with its lock taken, if it must be compiled."""
         found = super().load(key)
         if found is None:
             TURN.take(Path(self._index_path))
@@ -42,7 +42,7 @@ class CheckedFiles(IndexDataCacheFile):
         return found
 
     def save(self, key: Any, data: Any) -> None:
-        """Save a compiled kernel; without room it is compiled again next time."""
+        """Save a compiled kernel in the cache; without room it is compiled again next time."""
         try:
             super().save(key, data)
         except OSError as error:
@@ -53,17 +53,17 @@ class CheckedFiles(IndexDataCacheFile):
             )
 
     def _load_index(self) -> dict[Any, str]:
-        """Load the index of kernels; empty if the file is damaged."""
+        """Load the index of a function's cached kernels; empty if the file is damaged."""
         return super()._load_index() if self._is_sound(Path(self._index_path)) else {}
 
     def _load_data(self, name: str) -> Any:
-        """Load a kernel's code; raise if the file is damaged, as Numba then compiles."""
+        """Load a cached kernel's code; raise if the file is damaged, as Numba then compiles."""
         if not self._is_sound(Path(self._data_path(name))):
             raise FileNotFoundError(name)
         return super()._load_data(name)
 
     def _is_sound(self, path: Path) -> bool:
-        """Return whether a file is undamaged or missing; remove a damaged file."""
+        """Return whether a cache file is undamaged or missing; remove a damaged file."""
         try:
             state = path.stat()
             if S_ISREG(state.st_mode):  # a pipe would be waited for
@@ -81,7 +81,7 @@ class CheckedFiles(IndexDataCacheFile):
 
     @contextmanager
     def _open_for_write(self, filepath: str) -> Iterator[BytesIO]:  # pyrefly: ignore[bad-override]
-        """Write a file, followed by its checksum."""
+        """Yield a buffer, and write it to a cache file with its checksum at the end."""
         buffer = BytesIO()
         yield buffer
         content = buffer.getvalue()
@@ -90,7 +90,7 @@ class CheckedFiles(IndexDataCacheFile):
 
 
 def checked(dispatcher: Any) -> Any:
-    """Make a compiled function use checked cache files.
+    """Make a compiled function use cache files with checksums.
 
     They are named only after the function, without its line and the package's folder, as the cache
     folder belongs to one state of all code. If compilation is disabled, `dispatcher` is the
@@ -114,7 +114,7 @@ TESTED = (0, 68)
 
 
 class Kernel(CPUDispatcher):
-    """A compiled function; kernels that call it use its linked form."""
+    """A compiled function that other kernels include as LLVM code when they call it."""
 
     def __init__(self, function: Any, options: dict[str, Any], *, twice: bool) -> None:
         pipeline = _Compiling if twice else _CompilingOnce
@@ -122,18 +122,18 @@ class Kernel(CPUDispatcher):
 
     @cached_property
     def linked(self) -> CPUDispatcher:
-        """The same function, without machine code."""
+        """The same function compiled only to LLVM code, for its callers."""
         return CPUDispatcher(
             self.py_func, targetoptions=self.targetoptions, pipeline_class=_Linking
         )
 
     @property
     def _numba_type_(self) -> types.Dispatcher:
-        """The type that a calling kernel uses."""
+        """The Numba type that kernels use to call this function as LLVM code."""
         return types.Dispatcher(self.linked)
 
     def compile(self, sig: Any) -> Any:
-        """Load or compile a kernel without garbage collection, a seventh of the time."""
+        """Load or compile a kernel while garbage collection is off, which saves time."""
         collecting = gc.isenabled()
         gc.disable()
         try:
@@ -145,10 +145,10 @@ class Kernel(CPUDispatcher):
 
 
 class _CodeOnce(JITCodeLibrary):
-    """The machine code of a kernel with all that it calls."""
+    """Code library of a kernel: the machine code of the kernel and all that it calls."""
 
     def _finalize_specific(self) -> None:
-        """Compile, and set the linked kernels' environments, as Numba does when loading."""
+        """Compile the library, and set the Numba environments of the kernels linked into it."""
         super()._finalize_specific()
         for variable in self._final_module.global_variables:
             if (environment := lookup_environment(variable.name)) is not None:
@@ -156,45 +156,45 @@ class _CodeOnce(JITCodeLibrary):
 
 
 class _Code(_CodeOnce):
-    """Machine code that is optimised twice: callees first, then their inlined code in callers."""
+    """Code library with machine code optimised twice: callees, then their code in callers."""
 
     def _optimize_final_module(self) -> None:
-        """Optimise twice."""
+        """Optimise the LLVM code twice."""
         super()._optimize_final_module()
         super()._optimize_final_module()
 
 
 class _LinkedCode(JITCodeLibrary):
-    """The unoptimised LLVM code of a linked kernel."""
+    """Code library of a kernel that others call: unoptimised LLVM code."""
 
     @property
     def codegen(self) -> Any:
-        """The receiver of the kernel's environment, which is ignored."""
+        """Return this library, which receives and ignores the kernel's environment."""
         return self
 
     def set_env(self, *_: Any) -> None:
-        """Ignore the environment, as the machine code's library has it."""
+        """Ignore the kernel's environment, as the caller's machine code has it."""
 
     def get_pointer_to_function(self, name: str) -> int:
-        """Return no address, as there is no machine code."""
+        """Return 0 in place of the function's address, as there is no machine code."""
         self._ensure_finalized()
         return 0
 
     def _optimize_final_module(self) -> None:
-        """Skip the optimisation."""
+        """Leave the LLVM code unoptimised, as its callers optimise it."""
 
     def _finalize_final_module(self) -> None:
-        """Mark the code as ready to be linked."""
+        """Mark the LLVM code as ready to be linked into its callers."""
         self._finalized = True
 
 
 class _Compiling(Compiler):
-    """Numba's compiler with a custom code library."""
+    """Numba's compiler with a code library of this module."""
 
     library: type[JITCodeLibrary] = _Code
 
     def define_pipelines(self) -> Any:
-        """Create the library, and return Numba's passes, which use it."""
+        """Create the code library, and return Numba's compiler passes, which use it."""
         state = self.state
         state.library = self.library(state.targetctx.codegen(), state.func_id.func_qualname)
         state.library.enable_object_caching()
@@ -202,18 +202,18 @@ class _Compiling(Compiler):
 
 
 class _CompilingOnce(_Compiling):
-    """The compiler for code that is optimised once."""
+    """Numba's compiler for kernels that are optimised only once."""
 
     library = _CodeOnce
 
 
 class _Linking(_Compiling):
-    """The compiler for a linked kernel, which Python never calls."""
+    """Numba's compiler to LLVM code, for a kernel that only other kernels call."""
 
     library = _LinkedCode
 
     def define_pipelines(self) -> Any:
-        """Skip the wrapper for Python."""
+        """Return Numba's compiler passes without a wrapper for calls from Python."""
         self.state.flags.no_cpython_wrapper = True
         return super().define_pipelines()
 
@@ -233,5 +233,5 @@ def check() -> None:
 
 
 def _halved(x: float) -> float:
-    """Be compiled within another kernel."""
+    """Return half of a number: the test kernel that another kernel calls."""
     return 0.5 * x

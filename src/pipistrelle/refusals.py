@@ -30,7 +30,7 @@ def refusal(where: object, found: str, expected: str, fix: str) -> InputError:
 
 
 def shown(value: Any) -> str:
-    """Return the text of a found value, shortened to one line.
+    """Format a found value for an error, shortened to 80 characters.
 
     >>> shown("left"), shown([1] * 1000)[-10:]
     ("'left'", '1, 1, 1...')
@@ -40,7 +40,7 @@ def shown(value: Any) -> str:
 
 
 def expectation(fault: Any) -> str:
-    """Describe the expected value of a setting.
+    """Return a description of the expected value, from an error of pydantic.
 
     `fault` is one of the errors of pydantic's ValidationError.
     """
@@ -51,7 +51,7 @@ def expectation(fault: Any) -> str:
 
 
 def values_expected(fault: Any, field: FieldInfo) -> int | None:
-    """Return the expected number of values of a tuple, if a wrong number is the error.
+    """Return how many values a setting must have, if a wrong number is the error; else None.
 
     `field`: the rejected setting.
     """
@@ -62,7 +62,7 @@ def values_expected(fault: Any, field: FieldInfo) -> int | None:
 def table_refusal(
     where: object, error: ValidationError, model: type[BaseModel], *first: str
 ) -> InputError:
-    """Return the error of a table of keys that a model rejects, from its first fault.
+    """Convert pydantic's validation error of a table to an `InputError` about the first fault.
 
     Faults of the keys `first` precede those of unknown keys, and these all others. The missing keys
     of a table are named at once. Tables in a list are numbered from 1.

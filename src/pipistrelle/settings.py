@@ -45,7 +45,7 @@ _MAX_DEPTH = 8
 
 
 class Given(NamedTuple):
-    """A value, and its place in words."""
+    """A setting's value, and the place where the user gave it, in words."""
 
     value: Any
     where: str
@@ -56,7 +56,7 @@ Layer = dict[Key, Given]
 
 @cache
 def known_settings() -> dict[Key, FieldInfo]:
-    """Return every setting by its key, in the order of `Config`."""
+    """Return the pydantic field of every setting by its key, in the order of `Config`."""
     found = {}
     for name, field in Config.model_fields.items():
         if isinstance(field.default, Section):
@@ -80,19 +80,19 @@ OWN: Key = ("own",)
 
 
 def derived(config: Config) -> dict[Key, Any]:
-    """Return the values of all settings that are derived if omitted."""
+    """Return the values of all settings that are computed from others if omitted."""
     return {
         (name, "speed_of_sound"): getattr(config, name).sound_speed for name in ("air", "water")
     }
 
 
 def from_file(path: Path) -> Layer:
-    """Read the settings of a TOML file."""
+    """Read a TOML file of settings as a layer: values and their places by key."""
     return with_places(path, from_table(read_toml(path), f"{path}: "))
 
 
 def with_places(path: Path, layer: Layer) -> Layer:
-    """Resolve the paths of world, array, calls and routes in a layer relative to its file."""
+    """Resolve all file names in a layer of settings relative to the folder of its file."""
     for key, given in layer.items():
         if key == CALLERS:
             layer[key] = given._replace(value=beside(path, given.value))
@@ -104,7 +104,7 @@ def with_places(path: Path, layer: Layer) -> Layer:
 
 
 def beside(path: Path, callers: Any) -> Any:
-    """Resolve the routes and calls of callers, valid or not, relative to a file."""
+    """Resolve the route and call files of callers, valid or not, relative to a file's folder."""
     if not isinstance(callers, list):
         return callers
 
@@ -121,7 +121,7 @@ def beside(path: Path, callers: Any) -> Any:
 
 
 def from_table(values: Mapping[str, Any], where: str, above: str = "") -> Layer:
-    """Return the layer of a table of settings and sections of settings.
+    """Convert a nested table of settings to a layer: values and their places by key.
 
     `where`: name of the file in messages; `above`: prefix of a setting's name in the file.
     """
@@ -130,7 +130,7 @@ def from_table(values: Mapping[str, Any], where: str, above: str = "") -> Layer:
 
 
 def from_environment(environment: Mapping[str, str]) -> Layer:
-    """Return the layer of the variables of the environment; text there needs no quotes."""
+    """Convert environment variables to a layer of settings; text there needs no quotes."""
     given = (
         (tuple(name.removeprefix(PREFIX).lower().split("__")), from_text(environment[name]))
         for name in sorted(environment)
@@ -140,13 +140,13 @@ def from_environment(environment: Mapping[str, str]) -> Layer:
 
 
 def from_flags(values: Mapping[str, Any]) -> Layer:
-    """Return the layer of flags: settings, and sections of settings."""
+    """Convert command-line flags, of settings and sections, to a layer of settings."""
     given = leaves(values, known_settings())
     return _layer(given, lambda key: "--" + ".".join(key).replace("_", "-"))
 
 
 def from_keywords(values: Mapping[str, Any], others: Iterable[str] = ()) -> Layer:
-    """Return the layer of the keywords of a call: settings, and sections of settings.
+    """Convert the keywords of a call, settings and sections, to a layer of settings.
 
     `others`: further keywords of the call, for suggestions.
 
@@ -161,7 +161,7 @@ def from_keywords(values: Mapping[str, Any], others: Iterable[str] = ()) -> Laye
 
 
 def spread(table: Mapping[str, Any], parts: str) -> dict[str, Any]:
-    """Convert names of several parts to nested tables, given the separator of the parts.
+    """Split names such as `rays__power` at a separator, and nest the values in tables.
 
     >>> spread({"seed": 3, "rays.power": 8.0, "rays": {"prune": 0.1}}, ".")
     {'seed': 3, 'rays': {'power': 8.0, 'prune': 0.1}}
@@ -182,7 +182,7 @@ def spread(table: Mapping[str, Any], parts: str) -> dict[str, Any]:
 
 
 def resolve(layer: Layer) -> Config:
-    """Validate a layer and complete it with the defaults.
+    """Validate a layer of settings; return the `Config`, completed with the defaults.
 
     >>> resolve(from_flags({"seed": 3})).seed
     3
@@ -206,7 +206,7 @@ def resolve(layer: Layer) -> Config:
 
 
 def _plain(value: Any) -> Any:
-    """Convert settings and NumPy's numbers to values of JSON, other values to text."""
+    """Convert settings and NumPy's numbers to JSON values, other values to text."""
     if isinstance(value, BaseModel):
         return value.model_dump(mode="json", exclude_none=True)
     return value.tolist() if hasattr(value, "tolist") else str(value)
@@ -250,7 +250,7 @@ def to_toml(config: BaseModel) -> str:
 
 
 def _remarked(assignment: str, field: FieldInfo) -> str:
-    """Append the meaning of a setting as a comment."""
+    """Append the meaning of a setting to its TOML line, as a comment."""
     meaning = " ".join((field.description or "").split())
     return f"{assignment:<39} # {meaning}" if meaning else assignment
 
@@ -261,7 +261,7 @@ def read_toml(path: Path) -> dict[str, Any]:
 
 
 def parse_toml(text: str, where: object) -> dict[str, Any]:
-    """Read TOML; raise above 64 bits in an integer or `_MAX_DEPTH` levels."""
+    """Parse TOML; raise if an integer exceeds 64 bits or tables exceed `_MAX_DEPTH` levels."""
     found, expected = f"more than {_MAX_DEPTH} levels", "tables of settings, or lists of them"
     deep = found, expected, "mend the file"
     try:
@@ -305,7 +305,7 @@ def _layer(
     prefix: str = "",
     others: Iterable[str] = (),
 ) -> Layer:
-    """Return the layer of values, each with its place; raise for names that are no settings."""
+    """Build a layer of settings with each value's place; raise for unknown names."""
     layer = {}
     for key, value in given:
         where = prefix + spell(key)
@@ -330,7 +330,7 @@ def _layer(
 
 
 def _own_layer(tables: Any, where: str) -> Layer:
-    """Return the layer of settings for one estimator each."""
+    """Build the layer of settings that apply to single estimators, a table for each."""
     if not isinstance(tables, Mapping):
         expected = "a table for each estimator, as {iekf = {rays.power = 8.0}}"
         raise InputError(f"{where}: found {shown(tables)}, expected {expected}")
@@ -345,7 +345,7 @@ def _own_layer(tables: Any, where: str) -> Layer:
 
 
 def from_text(text: str) -> Any:
-    """Read a TOML value or a number in Python's spelling; return other text unchanged."""
+    """Convert text to a TOML value or a Python number; return other text unchanged."""
     with suppress(InputError):
         read = parse_toml(f"value = {text}", "")
         if read.keys() == {"value"}:

@@ -19,7 +19,7 @@ from pipistrelle.refusals import refusal
 
 
 class Column(NamedTuple):
-    """A column of text tables."""
+    """Unit, meaning and bounds of a column in text tables."""
 
     unit: str
     meaning: str
@@ -98,7 +98,7 @@ class Table:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Schema:
-    """The columns of a text file."""
+    """Name, row meaning, and required and optional columns of a kind of text file."""
 
     file: str
     row: str
@@ -111,11 +111,11 @@ class Schema:
     """Columns of `columns` whose fields may be empty."""
 
     def read(self, path: Path, words: Mapping[str, Sequence[str]] = MappingProxyType({})) -> Table:
-        """Read a file of this schema, as `read_table` does."""
+        """Read a text file with the columns of this schema (`read_table`)."""
         return read_table(path, self.columns, optional=(*self.empty, *self.optional), words=words)
 
     def readme(self, names: Sequence[str] = ()) -> str:
-        """Return the part of a README on the file; `names`: columns that it has, by default all."""
+        """Return a README's description of this file; `names`: its columns, by default all."""
         names = names or (*self.columns, *self.optional)
         lines = [f"{self.file}: {','.join(names)}", f"  {self.row}"]
         for name in names:
@@ -195,7 +195,7 @@ def table_of(
     words: Mapping[str, Sequence[str]] = MappingProxyType({}),
     former: tuple[str, ...] = (),
 ) -> Table:
-    """Check the fields of rows, each with its line, and convert them to a table (`read_table`)."""
+    """Check and convert rows of text fields, each with its line, to a table (`read_table`)."""
     for line, fields in rows:
         if len(fields) != len(names):
             found = f"{len(fields)} fields in {','.join(fields)[:80]!r}"
@@ -243,7 +243,7 @@ def _values(
 
 
 def check_columns(table: Table) -> None:
-    """Check times, labels and bounded columns; convert labels to integers."""
+    """Raise if a time, label or bounded value of a table is invalid; make labels integers."""
     for name, values in table.column.items():
         if values.dtype.kind == "U":
             continue
@@ -303,7 +303,7 @@ def table_text(column: Mapping[str, np.ndarray]) -> str:
 
 
 def place_of(table: Table, row: int) -> str:
-    """Return the file and line of a row, for an error message."""
+    """Return the file and line of a table's row, for an error message."""
     return f"{table.path}, {table.unit} {table.line[row]}"
 
 
@@ -314,12 +314,12 @@ def rows_kept(table: Table, kept: Bool[np.ndarray, " n"] | Int[np.ndarray, " k"]
 
 
 def points_of(table: Table) -> Float[np.ndarray, "n 2"]:
-    """Return the positions in the columns ``x`` and ``y``."""
+    """Return the positions in the columns ``x`` and ``y`` of a table."""
     return np.column_stack((table.column["x"], table.column["y"]))
 
 
 def check_unique(table: Table, *names: str, besides: str | None = None) -> None:
-    """Raise if two rows of a table agree in all of these columns.
+    """Raise if two rows of a table have equal values in all given columns.
 
     `besides`: a further column of whole numbers, which the error does not name.
 

@@ -15,7 +15,7 @@ UNKNOWN = "0.0"
 
 @cache
 def find_version() -> str:
-    """Return the version by PEP 440; cached, as git and metadata are slow.
+    """Return the package's version by PEP 440; cached, as git and metadata are slow.
 
     "0.1.0" is a release, "0.1.1.dev3+g1a2b3c4d5" three commits later, with ".d" and a date after it
     if there are uncommitted changes.
@@ -34,7 +34,7 @@ def find_version() -> str:
 
 
 def version_of_clone(folder: Path) -> str | None:
-    """Return the version of a clone by git, or None.
+    """Return the package's version from git if a folder is its clone; None otherwise.
 
     None if the folder is not a clone of this project, or git or hatch-vcs is missing.
     """
