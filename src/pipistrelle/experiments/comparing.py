@@ -91,7 +91,7 @@ STUDIES = (
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PathView:
-    """A path as recorded, and fitted to its reference by a rigid motion."""
+    """Estimated path before and after alignment to a reference path, with both position errors."""
 
     time: Float[np.ndarray, " k"]
     """[s] From the path's own start."""
@@ -108,7 +108,7 @@ class PathView:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ComparedEstimate:
-    """An estimate that all folders have."""
+    """The same estimate (strategy and filter) from every compared folder: scores and paths."""
 
     title: str
     """Strategy and filter that the estimates share."""
@@ -121,7 +121,7 @@ class ComparedEstimate:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Compared:
-    """Folders by letter, compared with the first."""
+    """Base of a comparison: result folders by letter, settings that differ, and remarks."""
 
     folders: Mapping[str, Path]
     settings: Mapping[str, tuple[str | None, ...]]
@@ -132,7 +132,7 @@ class Compared:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ComparedMissions(Compared):
-    """Folders of `run` or `slam`, compared with the first."""
+    """Comparison of result folders of `run` or `slam`: matched estimates and true paths."""
 
     estimates: tuple[ComparedEstimate, ...]
     truths: tuple[StoredPath | None, ...]
@@ -142,7 +142,7 @@ class ComparedMissions(Compared):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ComparedStudies(Compared):
-    """Folders of studies, compared with the first."""
+    """Comparison of study folders: score differences with intervals, by case and averaged."""
 
     worlds: tuple[tuple[int, int], ...]
     """Numbers of finished and of planned worlds."""
@@ -153,7 +153,7 @@ class ComparedStudies(Compared):
 
 
 def kind_of(folders: Sequence[Path]) -> Literal["missions", "studies"]:
-    """Return whether folders hold missions or studies.
+    """Return whether all folders hold missions or all hold studies.
 
     Raises InputError if they are too few or too many, repeated, or not of one kind.
     """
@@ -182,7 +182,7 @@ def kind_of(folders: Sequence[Path]) -> Literal["missions", "studies"]:
 
 
 def distinguishing(folders: Iterable[Iterable[Estimate]]) -> tuple[bool, bool]:
-    """Return whether strategies, and whether filters, differ within any folder.
+    """Return two booleans: whether any folder has several strategies, and several filters.
 
     Others do not name an estimate: folders of a single filter are compared strategy by strategy.
     """
@@ -192,19 +192,19 @@ def distinguishing(folders: Iterable[Iterable[Estimate]]) -> tuple[bool, bool]:
 
 
 def named(estimate: Estimate, parts: tuple[bool, bool]) -> Estimate:
-    """Return the key of an estimate, without parts that `distinguishing` excludes."""
+    """Replace strategy or filter of an estimate by "" unless `parts` marks it as distinguishing."""
     strategy, name = estimate
     return strategy * parts[0], name * parts[1]
 
 
 def shared_name(estimates: Sequence[Estimate]) -> str:
-    """Return the strategy and filter that estimates share."""
+    """Return the strategy and filter names that all given estimates have in common, as text."""
     parts = [set(part) for part in zip(*estimates, strict=True)]
     return " ".join(short_name(only) for (only, *others) in map(sorted, parts) if not others)
 
 
 def matched(keys: Sequence[Iterable[K]]) -> tuple[tuple[K, ...], dict[K, tuple[int, ...]]]:
-    """Return the keys of all folders in the order of the first, and the owners of other keys."""
+    """Return the keys that all folders contain, and for each other key the folders that have it."""
     owners: dict[K, tuple[int, ...]] = {}
     for i, own in enumerate(keys):
         for key in own:
@@ -214,7 +214,7 @@ def matched(keys: Sequence[Iterable[K]]) -> tuple[tuple[K, ...], dict[K, tuple[i
 
 
 def differing(settings: Sequence[Mapping[str, Any]]) -> dict[str, tuple[str | None, ...]]:
-    """Return the settings that differ between folders, with their texts (None if missing)."""
+    """Return the settings with unequal values in the folders, each value as text or None."""
     unlike = {}
     for name in dict.fromkeys(name for one in settings for name in one):
         values = [one.get(name) for one in settings]
@@ -228,7 +228,7 @@ def differing(settings: Sequence[Mapping[str, Any]]) -> dict[str, tuple[str | No
 def _lettered(
     folders: Sequence[Path], versions: Sequence[str], settings: Sequence[Mapping[str, Any]]
 ) -> dict[str, Any]:
-    """Return folders by letter, and the settings and versions that differ."""
+    """Return the fields `folders` (by letter) and `settings` (that differ) of a comparison."""
     version = [{"version of Pipistrelle": version or None} for version in versions]
     return {
         "folders": dict(zip(LETTERS, folders, strict=False)),
@@ -237,7 +237,7 @@ def _lettered(
 
 
 def _letters(who: Iterable[int]) -> str:
-    """Return the letters of some folders."""
+    """Format folder indices as letters, such as "A and C" for 0 and 2."""
     return " and ".join(LETTERS[i] for i in who)
 
 
@@ -289,7 +289,7 @@ def compare_missions(folders: Sequence[Path]) -> ComparedMissions:
 
 
 def _compared(missions: Sequence[StoredMission], estimates: Sequence[Estimate]) -> ComparedEstimate:
-    """Return one estimate of each folder with scores and paths."""
+    """Collect the scores and paths of an estimate that is in every mission's folder."""
     chosen = list(zip(missions, estimates, strict=True))
     truths = (mission.truth for mission in missions if mission.truth is not None)
     whole = next(truths, missions[0].paths[estimates[0]])
@@ -317,7 +317,7 @@ def _compared(missions: Sequence[StoredMission], estimates: Sequence[Estimate]) 
 def path_view(
     path: StoredPath, placed: Float[np.ndarray, "n 2"], reference: StoredPath
 ) -> PathView:
-    """Fit a path to a reference by a rigid motion; return it before and after.
+    """Align a path to a reference by a rigid motion; return both versions and their errors.
 
     `placed` [m]: landmarks, moved with it. `reference`: compared at common times, except the start.
     Returns: unmoved if fewer than two poses can be compared.
@@ -342,7 +342,7 @@ def path_view(
 
 
 def _one_drive(missions: Sequence[StoredMission]) -> bool:
-    """Return whether all folders hold the same drive, up to rounding, from truths and times."""
+    """Return whether missions have equal times and, up to rounding, equal true paths."""
     truths = [mission.truth for mission in missions if mission.truth is not None]
     paths = [path for mission in missions for path in mission.paths.values()]
     for group in (paths, truths):
@@ -354,7 +354,7 @@ def _one_drive(missions: Sequence[StoredMission]) -> bool:
 
 
 def compare_studies(folders: Sequence[Path], *, drop_diverged: bool = False) -> ComparedStudies:
-    """Compare the scores of two or more studies.
+    """Compare the scores of two or more studies, case by case.
 
     `drop_diverged`: leave out worlds where either of two cases diverged; otherwise all worlds
     with a number count. Raises InputError if a folder cannot be read, has no finished world, or no
@@ -414,7 +414,7 @@ def compare_studies(folders: Sequence[Path], *, drop_diverged: bool = False) -> 
 
 
 def _read(folder: Path) -> tuple[Plan, "pl.DataFrame"]:
-    """Read a study's plan and trials; raise InputError if a file was changed."""
+    """Read a study's plan and its table of trials; raise InputError if a file was changed."""
     import polars as pl
 
     worlds = sorted(done_worlds(folder))
@@ -436,7 +436,7 @@ def _read(folder: Path) -> tuple[Plan, "pl.DataFrame"]:
 
 
 def _nothing_in_common(folders: Sequence[Path], plans: Sequence[Plan]) -> InputError:
-    """Return the error of studies without a common case."""
+    """Return the InputError for studies without a common case (strategy, filter, settings)."""
     tried = []
     for folder, plan in zip(folders, plans, strict=True):
         ways = f"{', '.join(plan.strategies)} by {', '.join(map(short_name, plan.filters))}"
@@ -449,7 +449,7 @@ def _nothing_in_common(folders: Sequence[Path], plans: Sequence[Plan]) -> InputE
 
 
 def _values(case: PlannedCase, varied: Sequence[str]) -> dict[str, Any]:
-    """Return a case's values of some settings; None for the beam of passive sensing."""
+    """Return a case's values of the varied settings; a passive case has no emitter radius."""
     values, table = {}, case.config.model_dump(mode="json")
     for name in varied:
         value: Any = table
@@ -460,7 +460,7 @@ def _values(case: PlannedCase, varied: Sequence[str]) -> dict[str, Any]:
 
 
 def _label(cases: Sequence[PlannedCase], varied: Sequence[str], widths: Mapping[int, float]) -> str:
-    """Name matched cases by their common properties; `widths`: of the first study [deg]."""
+    """Return a label for a group of matched cases: shared strategy and filter, varied values."""
     first, words = cases[0], [shared_name([(case.strategy, case.filter) for case in cases])]
     for name, value in _values(first, varied).items():
         if name == RADIUS and first.number in widths:
@@ -471,7 +471,7 @@ def _label(cases: Sequence[PlannedCase], varied: Sequence[str], widths: Mapping[
 
 
 def draw_of(config: Config) -> str:
-    """Return the settings that draw the worlds, as text.
+    """Return as JSON the settings that determine the worlds: seed, scenario and motion.
 
     Worlds of equal text are the same, even if other things are heard in them.
     """
@@ -481,7 +481,7 @@ def draw_of(config: Config) -> str:
 def _frame(
     matches: Sequence[Sequence[PlannedCase]], trials: "Sequence[pl.DataFrame]", drop_diverged: bool
 ) -> "pl.DataFrame":
-    """Return the scores of matched cases that all studies keep, for `contrasts`.
+    """Return the scores of matched cases as a table with a row per study, world and score.
 
     `matches`: of each study one case. `trials`: of each study. Column `lost`: the trial diverged or
     failed. A case without any trial has a row without a world.
@@ -529,7 +529,7 @@ def _judged(
     varied: Sequence[str],
     widths: Mapping[int, float],
 ) -> tuple[tuple[dict[str, Any], ...], tuple[Contrast, ...]]:
-    """Compare every score case by case, and the position RMSE averaged over the cases.
+    """Judge the differences between studies: each score by case, and the mean position RMSE.
 
     `frame`: of the matched cases. `widths`: beamwidths of the cases of the first study [deg].
     """
@@ -578,7 +578,7 @@ def _judged(
 
 
 def _version(folder: Path) -> str:
-    """Return the version that wrote a study, from its README; empty if it is missing."""
+    """Return the version of Pipistrelle that wrote a study, from its README; "" if unknown."""
     try:
         text = read_file(folder / "README.md").decode()
     except (OSError, UnicodeDecodeError, InputError):
@@ -588,12 +588,12 @@ def _version(folder: Path) -> str:
 
 
 def less(value: float | None, first: float | None) -> float | None:
-    """Return the difference of two values; None if any is missing."""
+    """Return `value` minus `first`; None if either is missing."""
     return None if value is None or first is None else value - first
 
 
 def comparison_table(compared: ComparedMissions | ComparedStudies) -> "pl.DataFrame":
-    """Return all numbers of a comparison as a table; null for missing numbers."""
+    """Return all numbers of a comparison as a Polars table, with null for missing numbers."""
     import polars as pl
 
     if isinstance(compared, ComparedStudies):
@@ -622,7 +622,7 @@ def comparison_table(compared: ComparedMissions | ComparedStudies) -> "pl.DataFr
 
 
 def settings_table(compared: Compared) -> "pl.DataFrame":
-    """Return the settings that differ, a row each, with a column for each folder."""
+    """Return a table of the settings that differ: a row per setting, a column per folder."""
     import polars as pl
 
     rows = [(name, *values) for name, values in compared.settings.items()]
@@ -638,7 +638,7 @@ def write_comparison(
     notes: Sequence[str],
     draw: Callable[[Path], None] = lambda _: None,
 ) -> None:
-    """Write a comparison into a folder, in place of an earlier comparison.
+    """Write a comparison (tables, figure, README) into a folder, over any earlier comparison.
 
     `own`: the folder, as `pipistrelle.files.claim` gives it. `command`: the command line.
     `notes`: remarks for the README. `draw`: writes the figure into a folder. Raises InputError if a
@@ -667,7 +667,7 @@ def write_comparison(
 
 
 def _quoted(text: str) -> str:
-    """Return text as Markdown code, whatever backticks it contains."""
+    """Format text as inline Markdown code, also if it contains backticks."""
     ticks = "`" * (1 + max(map(len, re.findall("`+", text)), default=0))
     pad = " " if "`" in text else ""
     return f"{ticks}{pad}{text}{pad}{ticks}"

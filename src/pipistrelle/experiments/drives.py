@@ -37,7 +37,7 @@ NO_TRUTH = Truth(time=np.empty(0))
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Drive:
-    """Input of an estimator for a drive, simulated or recorded, with the truth for scoring."""
+    """Input of an estimator (motion model, start, controls, callers), and the truth for scoring."""
 
     motion: Motion
     start: Gaussian
@@ -58,7 +58,7 @@ class Drive:
 
 
 def split_at(drive: Drive, times: Sequence[float]) -> tuple[Drive, Int[np.ndarray, " t"]]:
-    r"""Split control steps at scan times [s] that fall inside them.
+    r"""Split the control steps of a drive at scan times [s] that fall inside them.
 
     The part that covers a share :math:`\lambda` of a step's time has that share of its
     displacement, turn and covariance. The controls of the result are relative motions with
@@ -95,7 +95,7 @@ def split_at(drive: Drive, times: Sequence[float]) -> tuple[Drive, Int[np.ndarra
 
 
 def at_sensor(drive: Drive) -> Drive:
-    """Convert a vehicle's drive to the drive of its sensor, mounted at `drive.sensor`.
+    """Convert a vehicle's drive to the drive of its sensor, which is mounted at `drive.sensor`.
 
     With the sensor at pose :math:`S` in the vehicle, a vehicle motion D becomes the sensor motion
     :math:`S^{-1} D S`. The controls of the result are relative motions with covariances
@@ -133,7 +133,7 @@ def at_sensor(drive: Drive) -> Drive:
 
 
 def at_vehicle(track: Track, sensor: Pose) -> Track:
-    """Convert the track of a sensor, mounted at pose `sensor`, to the track of its vehicle."""
+    """Convert a sensor's estimated track to its vehicle's; `sensor` is the mounting pose."""
     if not any(sensor):
         return track
     vehicle = vehicle_in(sensor)
@@ -150,14 +150,14 @@ def at_vehicle(track: Track, sensor: Pose) -> Track:
 
 
 def vehicle_in(sensor: Pose) -> Pose:
-    """Invert a sensor's pose in the vehicle: return the vehicle's pose in the sensor's axes."""
+    """Invert a sensor's mounting pose: return the vehicle's pose in the sensor's axes."""
     x, y, turned = sensor
     c, s = np.cos(turned), np.sin(turned)
     return -c * x - s * y, s * x - c * y, -turned
 
 
 def carried(path: Gaussian, place: Pose) -> Gaussian:
-    """Compose each Gaussian pose with a fixed offset in the pose's axes, to first order."""
+    """Compose each Gaussian pose of a path with a fixed relative pose, to first order."""
     x, y, turned = place
     heading = path.mean[..., 2]
     c, s = np.cos(heading), np.sin(heading)

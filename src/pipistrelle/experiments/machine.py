@@ -38,7 +38,7 @@ def check_memory(
     passive: bool,
     workers: int = 1,
 ) -> None:
-    """Raise if the maps of the estimators may need more memory than this machine has.
+    """Raise if an estimator's map may need more memory than this machine has.
 
     With passive bearings each landmark may be a whole ray of hypotheses. `workers` processes on
     this machine each need as much; 0 skips the check.
@@ -72,7 +72,7 @@ def check_recording(
     *,
     workers: int = 1,
 ) -> None:
-    """Raise if the recording of a frame may need more memory than this machine has."""
+    """Raise if recording a frame's sound may need more memory than this machine has."""
     setup, path = config.scenario, _farthest(scenario.path[:, :2])
     driven = "scenario.start" if math.hypot(*setup.start[:2]) > path / 2.0 else "scenario.step"
     reach = {
@@ -109,7 +109,7 @@ def _farthest(places: Any) -> float:
 
 
 def _refuse_beyond(what: str, need: float, workers: int) -> None:
-    """Raise if all workers together need more memory [bytes] than this machine has."""
+    """Raise if all workers together need more memory than there is; `need` [bytes] is for each."""
     if need * workers <= (have := installed()):
         return
     each = f" in each of {workers} workers" if workers > 1 else ""

@@ -28,7 +28,7 @@ from pipistrelle.settings import (
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Case:
-    """A sensing strategy and an estimator (`estimation.catalogue.entry`) to try in a world."""
+    """A sensing strategy and an estimator (`estimation.catalogue.entry`) to run in a world."""
 
     strategy: Strategy
     filter: str
@@ -36,7 +36,7 @@ class Case:
 
 
 def shipped(room: str) -> tuple[str, ...]:
-    """List the TOML files of a folder of this package by name, in alphabetical order."""
+    """List the names of the TOML files in a folder of this package, in alphabetical order."""
     files_there = (files("pipistrelle.experiments") / room).iterdir()
     return tuple(sorted(each.name[:-5] for each in files_there if each.name.endswith(".toml")))
 
@@ -47,7 +47,7 @@ PLANS = tuple(name for name in shipped("studies") if not name.endswith("_calibra
 
 
 def settings_of(word: str, where: str) -> Layer:
-    """Return the settings of a preset or a TOML file; `where` is the option that names it."""
+    """Return settings from a preset's name or a TOML file's path; `where` names the option."""
     if word in NAMES:
         return {SETTINGS: Given(word, where)}
     path = Path(word)
@@ -62,7 +62,7 @@ def settings_of(word: str, where: str) -> Layer:
 
 
 def _unknown(given: Given, other: str = "") -> InputError:
-    """Return the error for an unknown preset, with the nearest known name."""
+    """Return the InputError for an unknown preset, with the most similar known name."""
     near = meant(str(given.value), NAMES)
     fix = f"did you mean {near}?" if near else "choose one"
     expected = f"{', '.join(NAMES)}{other}"
@@ -70,7 +70,7 @@ def _unknown(given: Given, other: str = "") -> InputError:
 
 
 def over_named(*layers: Layer, default: str | None = None) -> tuple[Layer, tuple[str, ...]]:
-    """Merge settings over the preset that they name, else over `default`.
+    """Merge layers of settings over the preset that they name, else over the preset `default`.
 
     Also returns the estimators that the preset is meant for; none without a preset.
     """
@@ -88,7 +88,7 @@ def over_named(*layers: Layer, default: str | None = None) -> tuple[Layer, tuple
 
 
 def laid(*layers: Layer) -> Layer:
-    """Merge layers of settings; later layers win, also over values for single estimators."""
+    """Merge layers of settings; later layers override earlier, also estimator-specific values."""
     found: Layer = {}
     for layer in layers:
         beneath = {key: one for key, one in found.items() if not (_own(key) and key[2:] in layer)}
@@ -102,7 +102,7 @@ def _own(key: tuple[str, ...]) -> bool:
 
 
 def parted(layer: Layer) -> tuple[Layer, dict[str, Layer]]:
-    """Separate common settings from settings for single estimators, by estimator name."""
+    """Split a layer of settings into common and estimator-specific settings, by estimator."""
     own: dict[str, Layer] = {}
     for key, given in layer.items():
         if _own(key):
@@ -123,7 +123,7 @@ def check_own(layer: Layer) -> None:
 
 
 def own_config(config: Config, name: str) -> Config:
-    """Return the settings of an estimator: the common ones with its overrides applied."""
+    """Return the common settings with the overrides for an estimator applied."""
     if config.own is None:
         return config
     own = from_flags(config.own.get(name, {}))
@@ -131,7 +131,7 @@ def own_config(config: Config, name: str) -> Config:
 
 
 def of_estimators(config: Config, names: Sequence[str]) -> Config:
-    """Return the settings of a mission; overrides are merged if all its estimators agree."""
+    """Return a mission's settings, with the overrides merged in if all its estimators agree."""
     first, *others = (own_config(config, name) for name in names)
     if all(other == first for other in others):
         return first
@@ -140,7 +140,7 @@ def of_estimators(config: Config, names: Sequence[str]) -> Config:
 
 
 def each_its_own(config: Config, names: Sequence[str]) -> Iterator[tuple[Config, tuple[str, ...]]]:
-    """Group estimators that have equal settings; yield the settings and the names of each group."""
+    """Yield groups of estimators with equal settings: the settings and the estimators' names."""
     left = list(names)
     while left:
         own = own_config(config, left[0])

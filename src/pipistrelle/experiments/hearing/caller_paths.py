@@ -59,7 +59,7 @@ Points = Float[np.ndarray, "_ 2"]
 
 
 def with_routes(layer: Layer) -> Layer:
-    """Replace the file names of callers' routes by the rows of these files."""
+    """Replace the file names of callers' routes in a layer of settings by the files' rows."""
     if CALLERS not in layer:
         return layer
     given = layer[CALLERS]
@@ -67,7 +67,7 @@ def with_routes(layer: Layer) -> Layer:
 
 
 def routes_read(callers: Any, where: str) -> Any:
-    """Replace route files by their rows in an unvalidated list of callers; errors name `where`."""
+    """Replace names of route files by their rows in an unvalidated list of callers."""
     if not isinstance(callers, (list, tuple)):
         return callers
     tables = [
@@ -83,7 +83,7 @@ def routes_read(callers: Any, where: str) -> Any:
 
 
 def _rows(path: str, where: str) -> list[list[float]]:
-    """Read the rows of a route file: time [s], x, y [m] and, if given, heading [rad]."""
+    """Read a caller's route file: rows of time [s], x, y [m] and, if given, heading [rad]."""
     try:
         table = ROUTE.read(Path(path))
         check_unique(table, "time")
@@ -99,7 +99,7 @@ def _rows(path: str, where: str) -> list[list[float]]:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Surroundings:
-    """Settings, path and landmarks of the world that callers join."""
+    """The world that callers are added to: settings, and the vehicle's path and landmarks."""
 
     config: Config
     time: Float[np.ndarray, " t"]
@@ -116,7 +116,7 @@ def callers_among(
     rng: np.random.Generator,
     first: np.random.Generator | None = None,
 ) -> tuple[Caller, ...]:
-    """Create the callers of the settings, and draw the positions that are not given.
+    """Create the callers that the settings list, and draw the positions that are not given.
 
     `first` replaces the random stream of the first caller by the state of `rng` before the beacon
     was drawn. Each caller has a position, or one for each time; the vehicle is excluded.
@@ -163,7 +163,7 @@ def callers_among(
 def _placeless(
     one: CallerConfig, name: str, before: Sequence[Caller], around: Surroundings
 ) -> Caller:
-    """Return the next caller with its name, call and level, but no position yet."""
+    """Return a caller with name, call and level from its settings, but without a position."""
     config, key = around.config, f"callers.{len(before) + 1}"
     fields = set(CallConfig.model_fields)
     call = config.beacon.model_dump(include=fields)
@@ -194,7 +194,7 @@ def place_at(
     rng: np.random.Generator,
     clear_of: Iterable[Points],
 ) -> Float[np.ndarray, "2"] | None:
-    """Draw a position at a distance [m] from the centre, clear of points [m], or None."""
+    """Draw a position at `distance` [m] from the centre, clear of points; None if that fails."""
     clear_of = [*clear_of]
     for _ in range(MAX_DRAWS):
         direction = rng.uniform(-math.pi, math.pi)
@@ -207,7 +207,7 @@ def place_at(
 def _stand(
     one: CallerConfig, around: Surroundings, taken: Sequence[Points], rng: np.random.Generator
 ) -> Float[np.ndarray, "2"] | None:
-    """Return the position of a fixed caller: given, or drawn clear of path and landmarks."""
+    """Return a fixed caller's position: given, or drawn clear of vehicle, landmarks and callers."""
     if one.place is not None:
         return np.array(one.place)
     setup = around.config.scenario
@@ -217,7 +217,7 @@ def _stand(
 def _circle(
     one: CallerConfig, around: Surroundings, taken: Sequence[Points], rng: np.random.Generator
 ) -> Float[np.ndarray, "t 2"] | None:
-    """Return a path on a circle at constant speed, with a drawn start."""
+    """Return a caller's path on a circle at constant speed, from a random starting angle."""
     setup = around.config.scenario
     radius = setup.beacon_distance if one.radius is None else one.radius
     turned = (setup.speed if one.speed is None else one.speed) / radius * around.time
@@ -233,7 +233,7 @@ def _circle(
 def _walk(
     one: CallerConfig, around: Surroundings, taken: Sequence[Points], rng: np.random.Generator
 ) -> Float[np.ndarray, "t 2"] | None:
-    """Return the path of a random walk, reflected at the edge of the landmarks' disc."""
+    """Return a caller's random walk, reflected at the edge of the disc of landmarks."""
     setup = around.config.scenario
     std = WALK_STD if one.speed_std is None else one.speed_std
     kept = math.exp(-setup.step / (WALK_MEMORY if one.memory is None else one.memory))
@@ -258,7 +258,7 @@ def _walk(
 
 
 def _line(one: CallerConfig, around: Surroundings, *_: Any) -> Float[np.ndarray, "t 2"]:
-    """Return the path along the closed line through way-points at constant speed."""
+    """Return a caller's path along the closed line through its way-points, at constant speed."""
     speed = around.config.scenario.speed if one.speed is None else one.speed
     points = np.array([*(one.waypoints or ()), *(one.waypoints or ())[:1]])
     along = np.append(0.0, np.hypot(*np.diff(points, axis=0).T).cumsum())
@@ -271,7 +271,7 @@ def _line(one: CallerConfig, around: Surroundings, *_: Any) -> Float[np.ndarray,
 def _route(
     one: CallerConfig, around: Surroundings
 ) -> tuple[Float[np.ndarray, "t 2"], Float[np.ndarray, " t"] | None]:
-    """Return positions, and headings [rad] if given; it rests before and after its times."""
+    """Interpolate a caller's route at all times: positions [m], and headings [rad] if given."""
     rows: Any = _rows(one.route, "callers") if isinstance(one.route, str) else one.route
     time, x, y, *heading = np.array(rows).T
     place = points_at(around.time, time, np.column_stack((x, y)))
@@ -283,7 +283,7 @@ def _route(
 def _mission(
     around: Surroundings, taken: Sequence[Points], rng: np.random.Generator
 ) -> tuple[Float[np.ndarray, "t 3"], Float[np.ndarray, "t-1 2"]] | None:
-    """Draw the poses and controls of a second vehicle; None if no draw keeps the clearance."""
+    """Draw a second vehicle's poses and controls, clear of the first; None if every draw fails."""
     setup, drive = around.config.scenario, around.config.motion
     motion, bias = motion_of(drive), (drive.speed_bias, drive.turn_bias)
     course = around.course or course_of(setup, motion)
@@ -308,14 +308,14 @@ _WAYS: dict[str, Callable[..., np.ndarray | None]] = {
 
 
 def _distance(one: CallerConfig, setup: ScenarioConfig) -> float:
-    """Return the distance of a caller from the centre [m]; the beacon's by default."""
+    """Return a caller's distance from the centre [m], by default the beacon's distance."""
     return setup.beacon_distance if one.distance is None else one.distance
 
 
 def _times(
     key: str, one: CallerConfig, around: Surroundings, rng: np.random.Generator
 ) -> Float[np.ndarray, " m"] | None:
-    """Return the call times of a caller on an independent clock [s]; None without such a clock."""
+    """Return the call times [s] of a caller with an independent clock; None for other callers."""
     if not one.own_clock:
         return None
     if one.times is not None:
@@ -333,7 +333,7 @@ def _times(
 
 
 def _check_apart(callers: Sequence[Caller], around: Surroundings, where: str) -> None:
-    """Raise if the last caller is at the vehicle or another caller when the vehicle calls."""
+    """Raise if the last caller coincides with the vehicle or a caller when the vehicle calls."""
     *others, last = callers
     calls = slice(
         around.config.scenario.steps_per_frame, None, around.config.scenario.steps_per_frame
@@ -353,7 +353,7 @@ def _check_apart(callers: Sequence[Caller], around: Surroundings, where: str) ->
 
 
 def _check_speed(key: str, one: CallerConfig, config: Config) -> None:
-    """Raise if the speed of a caller is near or above the speed of sound."""
+    """Raise if a caller's speed or random speed is too near the speed of sound, or above it."""
     c = config.medium.sound_speed
     for name, most in (("speed", c), ("speed_std", c / 5.0)):
         speed = getattr(one, name)
@@ -367,7 +367,7 @@ def _check_speed(key: str, one: CallerConfig, config: Config) -> None:
 def _away_from_vehicle(
     drawn: Callable[[], Float[np.ndarray, "t 2"]], around: Surroundings
 ) -> Float[np.ndarray, "t 2"] | None:
-    """Draw a path until it keeps the clearance from the vehicle at all times."""
+    """Repeat drawing a caller's path until it is clear of the vehicle; None if every draw fails."""
     for _ in range(MAX_DRAWS):
         path = drawn()
         offset = path - around.path
@@ -377,7 +377,7 @@ def _away_from_vehicle(
 
 
 def _no_place(key: str, one: CallerConfig, around: Surroundings) -> InputError:
-    """Return the error for a caller without a possible position, with the fix."""
+    """Return the InputError for a caller without any position or path that is clear enough."""
     setup = around.config.scenario
     if one.way == "mission":
         what = "it comes nearer than that to the vehicle, a landmark or a caller in every drive"

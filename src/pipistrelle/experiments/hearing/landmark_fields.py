@@ -52,7 +52,7 @@ def landmarks_in(
 
 
 def nearest(points: Points, place: Float[np.ndarray, "2"]) -> float:
-    """Return the distance from a position to the nearest of some points [m], else infinity."""
+    """Return the distance from a position to the nearest of some points; infinity without any."""
     offset = points - place
     return math.sqrt(np.min(np.sum(offset * offset, axis=1), initial=math.inf))
 
@@ -60,7 +60,7 @@ def nearest(points: Points, place: Float[np.ndarray, "2"]) -> float:
 def _scattered(
     setup: ScenarioConfig, path: Points, callers: Points, rng: np.random.Generator
 ) -> Points:
-    """Draw landmarks over the disc or annulus; repeat each until it keeps all distances."""
+    """Draw landmarks at random over the disc or annulus, each with the required distances."""
     placed, inner = np.empty((setup.landmarks, 2)), setup.inner_radius / setup.radius
     for i in range(setup.landmarks):
         for _ in range(MAX_DRAWS):
@@ -81,7 +81,7 @@ def _scattered(
 
 
 def _rows(setup: ScenarioConfig, rng: np.random.Generator) -> Iterator[tuple[float, float]]:
-    """Yield the trees of rows along x, halfway between the lanes of a lawn-mower course."""
+    """Yield tree positions in rows along x, halfway between the lanes of a lawn-mower course."""
     if setup.spacing == 0.0:
         raise InputError(
             "scenario.spacing: found 0, expected the distance of two trees of a row [m]"
@@ -96,7 +96,7 @@ def _rows(setup: ScenarioConfig, rng: np.random.Generator) -> Iterator[tuple[flo
 
 
 def _corners(setup: ScenarioConfig, rng: np.random.Generator) -> Iterator[tuple[float, float]]:
-    """Yield the corners of rooms of drawn size on both sides of a corridor along x."""
+    """Yield the corner positions of rooms of random size on both sides of a corridor along x."""
     for side in (-1.0, 1.0):
         x, wall = -setup.radius, 0.5 * side * setup.lane
         while x < setup.radius:
@@ -111,13 +111,13 @@ def _is_clear(
     path: Points,
     callers: Points,
 ) -> bool:
-    """Return whether a position is clear of the path and of all callers."""
+    """Return whether a position keeps the clearance from the vehicle's path and the callers."""
     at, least = np.asarray(place), setup.clearance
     return nearest(path, at) >= least and nearest(callers, at) >= least
 
 
 def _refuse_crowd(setup: ScenarioConfig) -> None:
-    """Raise if there are more landmarks than the disc can hold, or if it has no room at all."""
+    """Raise if the disc of the settings has no room for the requested number of landmarks."""
     if setup.field == "disc" and setup.inner_radius >= setup.radius:
         raise InputError(
             f"scenario.inner_radius: found {setup.inner_radius:g} m, expected less than "
@@ -130,7 +130,7 @@ def _refuse_crowd(setup: ScenarioConfig) -> None:
 
 
 def _too_many(setup: ScenarioConfig, limit: str) -> InputError:
-    """Return the error for landmarks that do not fit, with the fix."""
+    """Return the InputError for more landmarks than fit into the world."""
     return InputError(
         f"scenario.landmarks: found {setup.landmarks}, but {limit} at {setup.spacing:g} m from "
         f"each other within {setup.radius:g} m of the centre; expected fewer landmarks, a smaller "

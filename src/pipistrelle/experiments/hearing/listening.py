@@ -65,7 +65,7 @@ EMISSIONS_AT_ONCE = 25
 
 
 class CallHeard(NamedTuple):
-    """Arrivals at the vehicle from a single call of a caller on an independent clock."""
+    """Arrivals at the vehicle of a single call from a caller with an independent clock."""
 
     number: int
     """Number among all such calls of the world."""
@@ -79,7 +79,7 @@ class CallHeard(NamedTuple):
 
 
 class Frame(NamedTuple):
-    """All arrivals from a call of the vehicle until its next call."""
+    """All arrivals at the vehicle between one of its calls and the next."""
 
     time: float
     """Time of the vehicle's call [s]."""
@@ -96,7 +96,7 @@ def frames_of(
     beam: Callable[..., Arrivals],
     medium: Medium | None = None,
 ) -> Iterator[Frame]:
-    """Yield the arrivals in each frame of a path, for pistons of several radii [m]."""
+    """Yield each frame's arrivals at the vehicle, for several radii [m] of its piston emitter."""
     setup, medium = config.scenario, medium or medium_of(config.medium)
     calls = calls_heard(scenario, setup, medium.speed_of_sound)
     begin = scenario.time[setup.steps_per_frame :: setup.steps_per_frame]
@@ -124,7 +124,7 @@ def _together(
     calls: Sequence[tuple[float, Arrivals]],
     span: float,
 ) -> Arrivals:
-    """Replace the arrivals of callers with clocks by the arrivals of `calls`, delayed by [s]."""
+    """Replace the arrivals of independent callers in a frame by arrivals of their timed `calls`."""
     parts = [arrivals_at(sounds, ~np.isin(sounds.caller, own_clock))]
     for after, heard in calls:
         shifted = replace(heard, delay=heard.delay + after)
@@ -138,7 +138,7 @@ def _calls_heard(
     emissions: Callable[[Int[np.ndarray, " k"]], Iterator[list[Arrivals]]],
     speed_of_sound: float,
 ) -> list[CallHeard]:
-    """Return the arrivals at the vehicle of each call from callers on independent clocks."""
+    """Compute the arrivals at the vehicle of every call from callers with independent clocks."""
     following = dict.fromkeys(range(len(world.callers)), np.inf)
     until = []
     for time, caller in reversed(calls):
@@ -164,7 +164,7 @@ def _emissions(
     beam: Callable[..., Arrivals],
     medium: Medium,
 ) -> Iterator[list[Arrivals]]:
-    """Yield the arrivals of simultaneous calls of all callers, per given step and piston."""
+    """Yield the arrivals of all emitters' calls at each given step, for each piston radius."""
     for first in range(0, len(steps), EMISSIONS_AT_ONCE):
         now = steps[first : first + EMISSIONS_AT_ONCE]
         poses, took = scenario.path[now], scenario.time[now] - scenario.time[now - 1]
@@ -206,7 +206,7 @@ def listen(
     keep: Keep | None = None,
     progress: Progress | None = None,
 ) -> tuple[tuple[FrameMeasurements, ...], ...]:
-    """Simulate and detect the echoes of every frame of a path, for all beamwidths at once.
+    """Simulate and detect the echoes in every frame of a drive, for several beamwidths.
 
     Bradley & Abaid, Sec. II.
 
@@ -290,7 +290,7 @@ def listen(
 
 
 class _Record(NamedTuple):
-    """Matched-filter output of a frame, in buffers that the next frame overwrites."""
+    """A frame's matched-filter output with its time axis; the next frame reuses the buffers."""
 
     matched: Complex[np.ndarray, "l f c e"]
     start: float
@@ -306,12 +306,12 @@ class _Record(NamedTuple):
 
     @property
     def lags(self) -> dict[str, Any]:
-        """Start, interval and pulse length, as a detector's keyword arguments."""
+        """Start, interval and pulse length of the lags, as keyword arguments of a detector."""
         return {"start": self.start, "interval": self.interval, "pulse": self.pulse}
 
 
 class _Rig:
-    """Settings, arrays, detector and buffers shared by all frames of a path."""
+    """Simulator and detector of sound: settings, arrays and buffers that all frames use."""
 
     def __init__(
         self,
@@ -339,7 +339,7 @@ class _Rig:
     def of_call(
         self, call: CallHeard, time: float, record: _Record, found: Detections
     ) -> Detections:
-        """Select the detections of a caller's call in a frame; delays count from the call."""
+        """Select the detections from a caller's timed call; delays count from that call."""
         after, early = call.time - time, 0.5 * record.interval * record.pulse
         stretch = after - early, call.until - time - early
         part = call_in(record.matched, self.front_end, found, call.caller, stretch, **record.lags)
@@ -347,7 +347,7 @@ class _Rig:
         return replace(part, delay=part.delay - after, direct=direct)
 
     def heard(self, time: float, detections: Detections, arrivals: Arrivals) -> FrameMeasurements:
-        """Label a frame's detections and average them over the faces, by label and caller."""
+        """Label a frame's detections and average them over the array's faces into measurements."""
         config = self.config
         label = self.oracle(
             detections,
@@ -378,7 +378,7 @@ class _Rig:
         label: Int[np.ndarray, " d"],
         heard: FrameMeasurements,
     ) -> FrameMeasurements:
-        """Add the measurements without labels to a frame, with the true label of each.
+        """Add to a frame its measurements without labels, and the true label of each.
 
         An echo's label is taken from its strongest labelled detection, a direct call's from its
         caller.
@@ -392,7 +392,7 @@ class _Rig:
         return replace(heard, unlabelled=scan, causes=causes)
 
     def blocks(self, aimed: Sequence[Arrivals], key: int) -> Iterator[_Record]:
-        """Yield the matched-filter output of each beam's arrivals, from block sums."""
+        """Simulate block sums of each beam's arrivals, and yield their matched-filter output."""
         layout, settled, space = self.layout, self.sampling, self.workspace
         pulse = settled.pulse
         own, others = _parted(aimed[0])
@@ -416,7 +416,7 @@ class _Rig:
             yield _Record(matched, start=pulse * BLOCK, interval=BLOCK, pulse=pulse, sums=signal)
 
     def dense(self, aimed: Sequence[Arrivals], key: int) -> Iterator[_Record]:
-        """Yield the matched-filter output of each beam's arrivals, in single precision."""
+        """Simulate the samples of each beam's arrivals, and yield their matched-filter output."""
         settled, setup, filters = self.sampling, self.config.scenario, self.filters
         period = math.floor(setup.steps_per_frame * setup.step / settled.interval) - settled.pulse
         start = settled.pulse * settled.interval
@@ -445,7 +445,7 @@ class _Rig:
 def _faintest_db(
     end: FrontEnd, layout: Layout | Scattered, settled: Sampling, config: Config
 ) -> float:
-    """Return the level of the faintest arrival that can be labelled [dB]."""
+    """Return the level [dB] of the faintest arrival that a detection may be matched with."""
     if isinstance(end, Detector):
         threshold, elements = end.threshold, layout.shape[1]
     else:
@@ -463,7 +463,7 @@ def _faintest_db(
 
 
 def _parted(arrivals: Arrivals) -> tuple[slice | np.ndarray, slice | np.ndarray]:
-    """Split arrivals into two groups: through a piston, and shared by all beamwidths."""
+    """Return the rows of arrivals that depend on the beam, and the rows that all beams share."""
     if arrivals.departure is None:
         own = np.count_nonzero(arrivals.caller == VEHICLE)  # they come first
         return slice(own), slice(own, None)

@@ -86,7 +86,7 @@ def faintest_level_db(
 
 
 class _True(NamedTuple):
-    """True arrivals, (a) rows, as arguments of the kernel."""
+    """Columns of the true arrivals, as arguments of the matching kernel."""
 
     caller: Int8[np.ndarray, " a"]
     delay: Float[np.ndarray, " a"]
@@ -96,7 +96,7 @@ class _True(NamedTuple):
 
 
 class _Gates(NamedTuple):
-    """Gates in delay [s] and bearing [rad], and the level of the faintest arrival [dB]."""
+    """Limits of delay [s] and bearing [rad] for a match, and an arrival's least level [dB]."""
 
     delay: float
     bearing: float
@@ -111,7 +111,7 @@ def _label(
     normal: Float[np.ndarray, " f"],
     gates: _Gates,
 ) -> Int[np.ndarray, " d"]:
-    """Match each detection to at most one arrival, greedily in falling order of power."""
+    """Return a label per detection by matching each to at most one arrival, strongest first."""
     found, true = Columns(*detections), _True(*arrivals)
     face, bearing = found.face, found.bearing
     label = np.full(face.size, UNLABELLED, dtype=np.int64)

@@ -31,7 +31,7 @@ from pipistrelle.settings import Layer
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class World:
-    """Known parts of a world; the rest is drawn."""
+    """Known parts of a simulated world, such as landmarks or the course; the rest is drawn."""
 
     name: str
     landmarks: Float[np.ndarray, "n 2"] | None = None
@@ -53,7 +53,7 @@ ALL_DRAWN = World(name="any")
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Scenario:
-    """A drawn world: landmark i (from 0) has the label i + 1, caller j (from 1) the label n + j."""
+    """A drawn world; its n landmarks have the labels 1 to n, caller j (1, 2, ...) has n + j."""
 
     time: Float[np.ndarray, " t"]
     path: Float[np.ndarray, "t 3"]
@@ -68,13 +68,13 @@ class Scenario:
 
 
 def world_of(config: Config, iteration: int = 0, world: World = ALL_DRAWN) -> Scenario:
-    """Draw the world of the settings' seed and a number, as `draw_scenario` does."""
+    """Draw the world that the settings' seed and a world number determine."""
     key = stream_key(config.seed, iteration, "scenario")
     return draw_scenario(config, np.random.default_rng(key), world)
 
 
 def draw_scenario(config: Config, rng: np.random.Generator, world: World = ALL_DRAWN) -> Scenario:
-    """Draw a world: the path, then the beacon, the landmarks and the callers of the settings.
+    """Draw a world: the vehicle's path, then the beacon, the landmarks and any listed callers.
 
     Listed callers are drawn last, so path and landmarks do not depend on them; landmarks keep clear
     of caller positions given by a world's folder. Parts known to `world` are not drawn.
@@ -119,7 +119,7 @@ def draw_scenario(config: Config, rng: np.random.Generator, world: World = ALL_D
 
 
 def _mission_of(world: Scenario, vehicle: int) -> Scenario:
-    """Exchange the vehicle with a caller that has a mission; each keeps its tone and level."""
+    """Swap the roles of the vehicle and a second vehicle; each keeps its tone and level."""
     if vehicle == 1:
         return world
     others = [j for j, caller in enumerate(world.callers) if caller.mission is not None]
@@ -145,12 +145,12 @@ def _mission_of(world: Scenario, vehicle: int) -> Scenario:
 
 
 def _voice(caller: Caller) -> dict[str, Any]:
-    """Return the tone, level, key and sound of a caller, by field."""
+    """Return the fields that describe a caller's call: frequency, level, key and sound."""
     return {name: getattr(caller, name) for name in ("frequency", "level_db", "key", "sound")}
 
 
 def standing_landmarks(scenario: Scenario) -> LabelledPoints:
-    """Return labels, rising, and positions [m] of the landmarks and of callers that do not move."""
+    """Return labels and positions [m] of all landmarks and fixed callers, by rising label."""
     landmarks, others = scenario.landmarks, _others(scenario).items()
     standing = {label: np.asarray(c.place) for label, c in others if not moves(c)}
     labels = np.array([*range(1, len(landmarks) + 1), *standing])
@@ -158,24 +158,24 @@ def standing_landmarks(scenario: Scenario) -> LabelledPoints:
 
 
 def moving_callers(scenario: Scenario) -> dict[int, Caller]:
-    """Return the callers that move, by rising label; they are no landmarks of a map."""
+    """Return the callers that move, by rising label; the map does not contain them."""
     return {label: caller for label, caller in _others(scenario).items() if moves(caller)}
 
 
 def _others(scenario: Scenario) -> dict[int, Caller]:
-    """Return all callers except the vehicle, by landmark label."""
+    """Return all callers except the vehicle, by their labels as landmarks."""
     return dict(enumerate(scenario.callers[VEHICLE + 1 :], start=len(scenario.landmarks) + 1))
 
 
 def caller_labels(scenario: Scenario) -> Int[np.ndarray, " c"]:
-    """Return each caller's label as a landmark, by caller number; the vehicle's is UNLABELLED."""
+    """Return the landmark label of each caller, by caller number; UNLABELLED for the vehicle."""
     labels = len(scenario.landmarks) + np.arange(len(scenario.callers))
     labels[VEHICLE] = UNLABELLED
     return labels
 
 
 def assumed_motion(config: Config) -> Motion:
-    """Return the motion model of the estimators: the true model with the `assumed` settings."""
+    """Return the motion model that estimators assume: the true model with `assumed` settings."""
     given = config.assumed.model_dump(exclude_none=True, exclude={"speed_of_sound"})
     return motion_of(config.motion.model_copy(update=given))
 
@@ -183,7 +183,7 @@ def assumed_motion(config: Config) -> Motion:
 def _place_beacon(
     setup: ScenarioConfig, clear_of: Sequence[Float[np.ndarray, "_ 2"]], rng: np.random.Generator
 ) -> Float[np.ndarray, "2"]:
-    """Draw the bearing of the beacon, clear of the path and of bodies with a size."""
+    """Draw the beacon's position, clear of the vehicle's path and of bodies with a radius."""
     beacon = place_at(setup.beacon_distance, setup, rng, clear_of)
     if beacon is not None:
         return beacon
@@ -201,7 +201,7 @@ MICROSECOND = 1e-6
 def calls_heard(
     scenario: Scenario, setup: ScenarioConfig, speed_of_sound: float
 ) -> list[tuple[float, int]]:
-    """List time of direct arrival [s] and caller of each call from an independent clock.
+    """List each call from an independent clock as (time of its direct arrival [s], caller).
 
     Arrivals before the vehicle's first call, which begins the first frame, or after the end of the
     path are excluded.
@@ -223,7 +223,7 @@ def calls_heard(
 
 
 def with_times(scenario: Scenario, times: Sequence[float]) -> Scenario:
-    """Interpolate the paths of a world at additional times; controls are unchanged."""
+    """Return a world with its paths interpolated at additional times; controls are unchanged."""
     time = np.union1d(scenario.time, np.array(times))
     path = path_at(time, scenario.time, scenario.path)
     callers = tuple(
@@ -236,7 +236,7 @@ def with_times(scenario: Scenario, times: Sequence[float]) -> Scenario:
 def _with_times(
     caller: Caller, time: Float[np.ndarray, " t"], clock: Float[np.ndarray, " n"]
 ) -> Caller:
-    """Interpolate the path, velocity and heading of a caller at other times."""
+    """Return a caller with path, velocity and heading interpolated at other times."""
     heading, velocity = caller.heading, caller.velocity
     return replace(
         caller,
@@ -249,7 +249,7 @@ def _with_times(
 def _places_at(
     times: Float[np.ndarray, " m"], clock: Float[np.ndarray, " t"], place: np.ndarray
 ) -> Float[np.ndarray, "m 2"]:
-    """Interpolate the position of a caller at given times."""
+    """Interpolate a caller's positions at given times; a fixed position is repeated."""
     if place.ndim == 1:
         return np.tile(place, (len(times), 1))
     return points_at(times, clock, place)

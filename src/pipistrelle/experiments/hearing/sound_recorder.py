@@ -46,7 +46,7 @@ SHA256SUMS        what was written here: nothing else is ever overwritten
 
 @dataclass(kw_only=True)
 class SoundRecorder:
-    """Writer of the microphones' samples, frame by frame."""
+    """Writer of the microphones' samples into a WAV file, frame by frame."""
 
     own: OwnFiles
     config: Config
@@ -62,7 +62,7 @@ class SoundRecorder:
     _made: list[Path] = field(default_factory=list)
 
     def __post_init__(self) -> None:
-        """Compute the first sample of each frame."""
+        """Compute the array's layout, the period and the first sample of each frame."""
         setup = self.config.scenario
         self.layout = layout_of(self.config)
         self.channels = math.prod(self.layout.shape)
@@ -74,11 +74,11 @@ class SoundRecorder:
 
     @property
     def size(self) -> int:
-        """Size of the samples in bytes."""
+        """Size of all recorded samples in bytes."""
         return int(self.first[-1]) * self.channels * self.bits // 8
 
     def check_room(self) -> None:
-        """Raise if the disk has no room for the recording."""
+        """Raise if the disk has too little free space for the recording."""
         places = (self.own.folder, *self.own.folder.absolute().parents)
         there = next(place for place in places if place.exists())
         free = shutil.disk_usage(there).free
@@ -89,7 +89,7 @@ class SoundRecorder:
             )
 
     def begin(self, scenario: Scenario) -> None:
-        """Create the file and write its header."""
+        """Create the sound file with its header; raise if the settings give no real samples."""
         settled = sampling(self.config, scenario.callers)
         if settled.dense and not settled.real:
             raise InputError(
@@ -129,19 +129,19 @@ class SoundRecorder:
         self._file.write(samples.astype("<f4" if self.bits == 32 else "<i2").tobytes())
 
     def finish(self) -> PiecesFile:
-        """Close the file and return it."""
+        """Close the sound file and return it."""
         assert self._file is not None
         self._file.close()
         return self._file
 
     def discard(self) -> None:
-        """Delete the file, unless it has been moved to its final place."""
+        """Delete the sound file, unless it has been moved to its final place."""
         if self._file is not None:
             self._file.discard()
             remove_empty(self._made)
 
     def notes(self) -> list[str]:
-        """Return warnings about clipped and late samples, a line each."""
+        """Return warnings about clipped samples and about arrivals after the next call."""
         notes = []
         if self.clipped:
             notes.append(
@@ -155,7 +155,7 @@ class SoundRecorder:
         return notes
 
     def files(self, scenario: Scenario, log: dict[str, Any]) -> dict[str, str | bytes | PiecesFile]:
-        """Return the files of the recording, except odometry and truth; `log` describes the log."""
+        """Return the recording's files except odometry and truth; `log` describes the log."""
         import tomli_w
 
         calls = {
@@ -174,7 +174,7 @@ class SoundRecorder:
         }
 
     def _description(self, scenario: Scenario) -> dict[str, Any]:
-        """Return the table of ``recording.toml`` without the section of the log."""
+        """Return the content of ``recording.toml`` as a table, without its section ``log``."""
         config, labels = self.config, caller_labels(scenario).tolist()
         own, *others = scenario.callers
         medium = config.medium.model_dump(exclude_none=True)
@@ -211,18 +211,18 @@ class SoundRecorder:
 
 
 def _call_file(caller: Caller) -> str:
-    """Return the name of the file with a caller's call."""
+    """Return the name of the sound file for a caller's recorded call."""
     return f"call_{caller.name}.wav"
 
 
 def _told(caller: Caller) -> dict[str, Any]:
-    """Return the call of a caller as settings, or the name of its sound file."""
+    """Return the settings of a caller's call or, for a recorded call, its file name."""
     recorded = isinstance(caller.sound, RecordedCall)
     return {"call": _call_file(caller)} if recorded else settings_of(caller.sound)
 
 
 def wav_header(size: int, channels: int, rate: float, bits: int) -> bytes:
-    """Return the bytes before the samples of a WAV file, or of an RF64 file for 64-bit sizes.
+    """Return the header of a WAV file, or of an RF64 file if 32 bits cannot hold the size.
 
     `size` is the bytes of the samples; `rate` [Hz] is rounded; `bits` is 32 for floats, 16 for
     integers.

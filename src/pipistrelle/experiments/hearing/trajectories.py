@@ -27,7 +27,7 @@ TIME_TOLERANCE = 1e-6
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Commands:
-    """Timed control commands; the vehicle starts at the settings' pose."""
+    """A course given by timed control commands; the vehicle starts at the settings' pose."""
 
     time: Float[np.ndarray, " n"]
     """Times since the start [s], rising: a row holds until the next; the last only ends the
@@ -38,7 +38,7 @@ class Commands:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Waypoints:
-    """A closed line through points, repeated until the drive ends."""
+    """A course along the closed line through way-points, repeated until the drive ends."""
 
     points: Float[np.ndarray, "n 2"]
     """At least two points [m]; the vehicle starts at the first."""
@@ -46,7 +46,7 @@ class Waypoints:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Poses:
-    """Timed poses [m, m, rad] of the vehicle, and the controls that its estimators assume."""
+    """A course given by timed poses [m, m, rad], and the controls that estimators assume."""
 
     time: Float[np.ndarray, " n"]
     """Times since the start [s], rising; poses between them are interpolated."""
@@ -72,7 +72,7 @@ def motion_of(motion: MotionConfig) -> Motion:
 
 
 def course_of(setup: ScenarioConfig, motion: Motion) -> Course:
-    """Return the course that the settings name.
+    """Return the course that the settings name: circle, eight, corridor or lawn-mower.
 
     A circle gives constant controls; a unicycle turns at the rate of the bicycle of its wheelbase.
 
@@ -95,7 +95,7 @@ def course_of(setup: ScenarioConfig, motion: Motion) -> Course:
 
 
 def steps_of(course: Course, setup: ScenarioConfig) -> int:
-    """Return the number of control steps of a course; way-points count from the first to the last.
+    """Return the number of control steps of a course (way-points: from the first to the last).
 
     `setup` gives the length of a step and the speed between way-points.
     """
@@ -113,7 +113,7 @@ def driven(
     rng: np.random.Generator,
     bias: tuple[float, float] = (0.0, 0.0),
 ) -> tuple[Float[np.ndarray, "t 3"], Float[np.ndarray, "t-1 2"]]:
-    """Simulate a drive along a course, with noise on both controls.
+    """Simulate a drive along a course, with noise on both controls of the vehicle.
 
     `bias` is a constant error of speed [m/s] and of steering angle [rad] or angular rate [rad/s].
     Returns the true poses [m, m, rad], the start first, and the controls that the estimators know.
@@ -139,7 +139,7 @@ def driven(
 
 
 def _lanes(extent: float, lane: float) -> Float[np.ndarray, "n 2"]:
-    """Return the corners of parallel lanes that cover a square."""
+    """Return the way-points of parallel lanes that cover a square."""
     across = np.arange(-extent, extent + 0.5 * lane, lane)
     ends = np.tile([[-extent, extent], [extent, -extent]], (len(across), 1))[: len(across)]
     return np.column_stack((ends.ravel(), np.repeat(across, 2)))
@@ -148,18 +148,18 @@ def _lanes(extent: float, lane: float) -> Float[np.ndarray, "n 2"]:
 def _noise(
     setup: ScenarioConfig, motion: Motion, rng: np.random.Generator, bias: tuple[float, float]
 ) -> Float[np.ndarray, "k 2"]:
-    """Draw the noise of both controls, with mean `bias`."""
+    """Draw the random errors of both controls at every step, with mean `bias`."""
     return rng.standard_normal((setup.steps, 2)) * motion.control_std + bias
 
 
 def _held(time: Float[np.ndarray, " t"], commands: Commands) -> Float[np.ndarray, "t-1 2"]:
-    """Return the controls commanded at the start of each step."""
+    """Return the controls of each step: the command in force when the step starts."""
     rows = np.searchsorted(commands.time, time[:-1] + TIME_TOLERANCE, side="right") - 1
     return commands.rows[rows]
 
 
 def _poses_at(time: Float[np.ndarray, " t"], course: Poses) -> Float[np.ndarray, "t 3"]:
-    """Interpolate the poses of a course; at its recorded times they are returned bit for bit."""
+    """Interpolate a course's poses at given times, bit for bit at its recorded times."""
     if np.array_equal(time, course.time[: len(time)]):
         return course.path[: len(time)].copy()
     return path_at(time, course.time, course.path)
@@ -171,7 +171,7 @@ def _steered(
     setup: ScenarioConfig,
     motion: Motion,
 ) -> tuple[Float[np.ndarray, "t 3"], Float[np.ndarray, "k 2"]]:
-    """Simulate a pure-pursuit drive along the closed line through way-points."""
+    """Simulate a vehicle that follows the closed line through way-points by pure pursuit."""
     _check_speed(setup)
     line = np.vstack((points, points[:1]))
     along = np.append(0.0, np.hypot(*np.diff(line, axis=0).T).cumsum())
@@ -192,7 +192,7 @@ def _ahead(
     line: Float[np.ndarray, "n 2"],
     along: Float[np.ndarray, " n"],
 ) -> float:
-    """Advance the aim along a line until it is `LOOK_AHEAD` from the vehicle; at most a round."""
+    """Advance an aim point's arc length along a closed line to `LOOK_AHEAD` from the vehicle."""
     for _ in range(math.ceil(10.0 * along[-1] / LOOK_AHEAD)):
         x, y = _at(aim, line, along)
         if math.hypot(x - pose[0], y - pose[1]) >= LOOK_AHEAD:
@@ -204,7 +204,7 @@ def _ahead(
 def _at(
     aim: float, line: Float[np.ndarray, "n 2"], along: Float[np.ndarray, " n"]
 ) -> tuple[float, float]:
-    """Return the point of a closed line at a given arc length."""
+    """Return the point x, y of a closed line at the arc length `aim` [m]."""
     here = aim % along[-1]
     return float(np.interp(here, along, line[:, 0])), float(np.interp(here, along, line[:, 1]))
 
@@ -212,7 +212,7 @@ def _at(
 def _towards(
     pose: Float[np.ndarray, "3"], point: tuple[float, float], speed: float, motion: Motion
 ) -> tuple[float, float]:
-    """Return controls that turn the vehicle towards a point ahead, within the steering limit."""
+    """Return speed and steering that turn the vehicle towards a point, within the limits."""
     off = wrap_angle(math.atan2(point[1] - pose[1], point[0] - pose[0]) - pose[2])
     if motion.model == "bicycle":
         return speed, min(max(off, -MAX_STEERING), MAX_STEERING)
@@ -221,7 +221,7 @@ def _towards(
 
 
 def _check_speed(setup: ScenarioConfig) -> None:
-    """Raise if the speed is not positive."""
+    """Raise if the speed in the settings is not positive, as way-points need."""
     if setup.speed <= 0.0:
         raise InputError(
             f"scenario.speed: found {setup.speed:g} m/s, expected more than 0 to drive between "
@@ -230,7 +230,7 @@ def _check_speed(setup: ScenarioConfig) -> None:
 
 
 def _check_length(course: Commands | Poses, setup: ScenarioConfig) -> None:
-    """Raise if a course ends before the drive."""
+    """Raise if a course of commands or poses ends before the drive does."""
     if course.time[-1] < setup.steps * setup.step - TIME_TOLERANCE:
         raise InputError(
             f"scenario.steps: found {setup.steps}, but the path of {setup.world} ends after "

@@ -95,13 +95,13 @@ class _WorldTable(Section):
 
 
 def named_world(layer: Layer) -> World | None:
-    """Read the world that the settings name; None if they name none."""
+    """Read the folder of the world that the settings name; None if they name none."""
     given = layer.get(WORLD_KEY)
     return None if given is None or given.value is None else read_world(Path(str(given.value)))
 
 
 def settled(world: World, layer: Layer) -> Layer:
-    """Merge a world's settings below `layer`, and set the numbers of its landmarks and steps."""
+    """Merge a world's settings below `layer`, and add its numbers of landmarks and steps."""
     beneath = world.settings | _decided(world, layer) | layer
     if world.course is not None and _STEPS not in beneath:
         steps = steps_of(world.course, resolve(beneath).scenario)
@@ -110,7 +110,7 @@ def settled(world: World, layer: Layer) -> Layer:
 
 
 def laid_over(world: World, layer: Layer, values: Layer) -> Layer:
-    """Merge settings with a world that a grid varies: `values` over the world's, over `layer`.
+    """Merge settings for a world from a plan's grid: `layer`, then the world's, then `values`.
 
     `values` are the settings of the rest of the grid. The drive ends with the world's course if
     that is shorter.
@@ -126,7 +126,7 @@ def laid_over(world: World, layer: Layer, values: Layer) -> Layer:
 
 
 def _decided(world: World, layer: Layer) -> Layer:
-    """Return the settings that a world's files fix; raise if a layer contradicts them."""
+    """Return the number of landmarks that a world's file fixes; raise if `layer` contradicts it."""
     if world.landmarks is None:
         return {}
     count, given = len(world.landmarks), layer.get(_COUNT)
@@ -139,7 +139,7 @@ def _decided(world: World, layer: Layer) -> Layer:
 
 
 def read_world(folder: Path) -> World:
-    r"""Read a world, named after its folder.
+    r"""Read a world from the files in a folder (landmarks, path, callers, settings).
 
     >>> from tempfile import TemporaryDirectory
     >>> with TemporaryDirectory() as place:
@@ -191,7 +191,7 @@ def read_world(folder: Path) -> World:
 
 
 def kept_world(config: Config, world: World) -> tuple[Config, dict[str, bytes]]:
-    """Return the settings that name a result folder's copy of a world, and the copy's files."""
+    """Return settings that name a result folder's copy of a world, and the files of the copy."""
     place = f"worlds/{world.name}"
     scenario = config.scenario.model_copy(update={"world": place})
     files = {f"{place}/{name}": content for name, content in world.files.items()}
@@ -199,7 +199,7 @@ def kept_world(config: Config, world: World) -> tuple[Config, dict[str, bytes]]:
 
 
 def world_files(scenario: Scenario, config: Config) -> dict[str, str]:
-    """Return the files of a drawn world, with non-default settings, to edit or simulate again."""
+    """Return the text files of a drawn world, by name, to edit or to simulate again."""
     import tomli_w
 
     names = _CONTROLS[config.motion.model]
@@ -239,7 +239,7 @@ def world_files(scenario: Scenario, config: Config) -> dict[str, str]:
 
 
 def _refuse_misspelt(folder: Path, there: Sequence[str]) -> None:
-    """Raise if a file is nearly named like a missing file, as it would be ignored."""
+    """Raise if a file in a world's folder has nearly the name of a missing file."""
     missing = [name for name in FILES if name not in there]
     for path in sorted(folder.iterdir()):
         near = get_close_matches(path.name.lower(), missing, n=1, cutoff=0.85)
@@ -248,7 +248,7 @@ def _refuse_misspelt(folder: Path, there: Sequence[str]) -> None:
 
 
 def _own_settings(config: Config) -> dict[str, Any]:
-    """Return the settings of a world that differ from the defaults."""
+    """Return the non-default settings that describe a world, as nested tables."""
     decides = {"world", "landmarks", "steps", "vehicle"}
     others = {"seed", "bag", *SETTINGS, *OWN, *CALLERS, *SECTIONS}
     said = config.model_dump(mode="json", exclude_defaults=True, exclude=others)
@@ -262,7 +262,7 @@ def _own_settings(config: Config) -> dict[str, Any]:
 def _read_landmarks(
     path: Path, usual: TargetConfig
 ) -> tuple[Float[np.ndarray, "n 2"], Bodies | None]:
-    """Read the positions of landmarks, and their bodies if the columns exist."""
+    """Read landmark positions, and bodies (radius, shape) if the file has them."""
     header, *rows = fields_in(path) or [(0, [])]
     if not rows and {*LANDMARKS.columns} <= {*header[1]} <= {
         *LANDMARKS.columns,
@@ -286,7 +286,7 @@ def _read_landmarks(
 
 
 def _read_course(path: Path, config: Config) -> Course:
-    """Read the course of the vehicle; the columns decide its kind."""
+    """Read the vehicle's course from a table; the columns decide its kind (`COURSES`)."""
     model, controls = config.motion.model, _CONTROLS[config.motion.model]
     others = {name for names in _CONTROLS.values() for name in names} - {*controls}
     line, fields = next(iter(fields_in(path)), (1, [""]))
@@ -315,7 +315,7 @@ def _read_course(path: Path, config: Config) -> Course:
 
 
 def _waypoints(table: Table) -> Float[np.ndarray, "n 2"]:
-    """Return the way-points; raise if there are too few or two successive ones coincide."""
+    """Return the way-points of a table; raise for fewer than two or equal successive points."""
     points = points_of(table)
     if len(points) < 2:
         raise refusal(table.path, "one way-point", "at least two", "add rows")
@@ -327,7 +327,7 @@ def _waypoints(table: Table) -> Float[np.ndarray, "n 2"]:
 
 
 def _callers(path: Path, tables: Any) -> tuple[tuple[CallerConfig, ...] | None, list[str]]:
-    """Return the validated callers of a world, and the files of their routes."""
+    """Validate the callers of a world's file; return them and the names of their route files."""
     if tables is None:
         return None, []
     files = []

@@ -29,14 +29,14 @@ SUMMARY = "summary.json"
 
 
 class RunEntry(BaseModel, extra="allow"):
-    """An estimate's entry in ``summary.json``, with its scores."""
+    """Entry of an estimate in ``summary.json``: strategy, filter and scores."""
 
     strategy: Strategy
     filter: str
 
 
 class LogEntry(BaseModel):
-    """The recorded log of a mission, in ``summary.json``."""
+    """Entry of a recorded log in ``summary.json``: path, robot, beamwidth, SHA-256 sums."""
 
     path: str
     """The folder; bytes that are not valid text are escaped."""
@@ -50,14 +50,14 @@ class LogEntry(BaseModel):
 
     @property
     def place(self) -> Path:
-        """The folder's path."""
+        """Path of the log's folder, also if its name is not valid text."""
         if self.path_bytes is None:
             return Path(self.path)
         return Path(os.fsdecode(bytes.fromhex(self.path_bytes)))
 
 
 class Summary(BaseModel):
-    """Content of ``summary.json``; no `log` if the mission was simulated."""
+    """Content of ``summary.json``; `log` is None if the mission was simulated."""
 
     format: Literal[1]
     version: str
@@ -67,7 +67,7 @@ class Summary(BaseModel):
 
 
 def read_summary(folder: Path) -> Summary:
-    """Read the summary of a result folder; raise if it is another kind of folder."""
+    """Read ``summary.json`` of a result folder; raise for another kind of folder."""
     path = folder / SUMMARY
     if not path.exists() or (folder / "plan.toml").exists():
         raise _no_results(folder)
@@ -91,7 +91,7 @@ def read_summary(folder: Path) -> Summary:
 
 
 def _no_results(folder: Path) -> InputError:
-    """Return the error for a folder without results: its kind, and the fix."""
+    """Return the InputError for a folder without a mission's results: its kind, and the fix."""
     expected = "the result folder of `pipistrelle run` or `pipistrelle slam`"
     if not folder.is_dir():
         found = "a file" if folder.exists() else "no such folder"
@@ -122,7 +122,7 @@ Estimate = tuple[str, str]
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class StoredPath:
-    """Times [s] and poses [m, m, rad] from a TUM file."""
+    """A path read from a TUM file: times [s] and poses [m, m, rad]."""
 
     time: Float[np.ndarray, " k"]
     pose: Float[np.ndarray, "k 3"]
@@ -130,7 +130,7 @@ class StoredPath:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class StoredMission:
-    """The results of `run` or `slam`, read from their folder, and the version that wrote them."""
+    """The results of `run` or `slam`, read from their folder."""
 
     folder: Path
     version: str
@@ -145,7 +145,7 @@ class StoredMission:
 
 
 def read_mission(folder: Path) -> StoredMission:
-    """Read the results in a folder; raise if a file was changed since."""
+    """Read a mission's results from a folder; raise if a file was changed since."""
     own, summary = results_in(folder), read_summary(folder)
     scores: dict[Estimate, dict[str, Any]] = {
         (run.strategy, run.filter): run.model_dump() for run in summary.runs
@@ -186,14 +186,14 @@ def results_in(folder: Path) -> OwnFiles:
 
 
 def _path(text: bytes) -> StoredPath:
-    """Parse a path in the TUM format."""
+    """Parse the text of a TUM file into times and poses."""
     rows = np.loadtxt(io.BytesIO(text), ndmin=2).reshape(-1, 8)
     heading = 2.0 * np.arctan2(rows[:, 6], rows[:, 7])
     return StoredPath(time=rows[:, 0], pose=np.column_stack([rows[:, 1:3], heading]))
 
 
 def _placed(text: bytes) -> Float[np.ndarray, "n 2"]:
-    """Parse the positions of the fully initialised landmarks of a map [m]."""
+    """Parse a map's CSV text; return the positions [m] of its fully initialised landmarks."""
     rows = csv.DictReader(io.StringIO(text.decode()))
     places = [(float(row["x"]), float(row["y"])) for row in rows if row["status"] == "full"]
     return np.array(places).reshape(-1, 2)

@@ -39,7 +39,7 @@ _END = 2**31
 
 
 class Told(NamedTuple):
-    """A message of a bag, with its topic, type and time [s]."""
+    """A message for a ROS bag, with its topic, type and time [s]."""
 
     topic: str
     type: str
@@ -48,7 +48,7 @@ class Told(NamedTuple):
 
 
 def header(time: float, frame: str) -> Fields:
-    """Return the header of a message: its time [s] as a stamp, and its coordinate frame."""
+    """Return a ROS message header: the time [s] as a stamp, and the coordinate frame."""
     if not 0.0 <= time < _END:
         found, expected = f"the time {time} s", f"0 s or more, below {_END}, as a stamp can tell"
         raise refusal("a message of ROS", found, expected, "count from another zero")
@@ -57,7 +57,7 @@ def header(time: float, frame: str) -> Fields:
 
 
 def _stamp(time: float) -> int:
-    """Convert a time [s] to nanoseconds."""
+    """Convert a time [s] to whole nanoseconds."""
     whole = math.floor(time)
     return whole * 10**9 + round((time - whole) * 1e9)
 
@@ -127,19 +127,19 @@ def map_fields(time: float, frame: str, table: "pl.DataFrame") -> Fields:
 
 
 def _turn(heading: float) -> Fields:
-    """Convert a heading [rad] to a quaternion."""
+    """Convert a heading [rad] to the quaternion of a ROS message."""
     return {"x": 0.0, "y": 0.0, "z": math.sin(heading / 2.0), "w": math.cos(heading / 2.0)}
 
 
 def _ellipse(xx: float, xy: float, yy: float) -> tuple[float, float, float]:
-    """Return the standard deviations along and across a covariance's major axis, and its angle."""
+    """Return a covariance's standard deviations along and across its major axis, and its angle."""
     middle, spread = 0.5 * (xx + yy), math.hypot(0.5 * (xx - yy), xy)
     least = max(middle - spread, 0.0)
     return math.sqrt(middle + spread), math.sqrt(least), 0.5 * math.atan2(2.0 * xy, xx - yy)
 
 
 def told_of(trials: Sequence[TrialResult], frame: str = "map") -> Iterator[Told]:
-    """Yield the messages of each estimate: its finite poses and its map, on separate topics."""
+    """Yield the ROS messages of each estimate: its poses, if finite, and its final map."""
     for trial in trials:
         track, name = trial.track, re.sub(r"\W", "_", short_name(trial.filter))
         rows = zip(track.time.tolist(), track.pose.mean, track.pose.covariance, strict=True)
@@ -153,7 +153,7 @@ def told_of(trials: Sequence[TrialResult], frame: str = "map") -> Iterator[Told]
 
 
 def write_bag(path: Path, messages: Sequence[Told]) -> None:
-    """Write messages, in order of time, into a new .mcap file; maps are latched."""
+    """Write ROS messages in order of time into a new .mcap file; map topics are latched."""
     need_rosbags(str(path))
     from rosbags.rosbag2 import StoragePlugin, Writer
     from rosbags.typesys import Stores, get_typestore
@@ -173,7 +173,7 @@ def write_bag(path: Path, messages: Sequence[Told]) -> None:
 
 
 def _latched() -> Any:
-    """Return a quality of service that sends the last message to late subscribers."""
+    """Return the ROS quality of service that repeats the last message for late subscribers."""
     from rosbags import interfaces as its
 
     never = its.QosTime(0, 0)
@@ -191,7 +191,7 @@ def _latched() -> Any:
 
 
 def _made(store: "Typestore", kind: str, fields: Fields) -> Any:
-    """Create a message from its fields; missing fields are zero. Raise if a field is unknown."""
+    """Create a ROS message from its fields, zero where missing; raise if a field is unknown."""
     types = store.fielddefs[kind][1]
     if unknown := fields.keys() - {name for name, _ in types}:
         raise ValueError(f"{kind}: has no field {', '.join(sorted(unknown))}")
@@ -199,7 +199,7 @@ def _made(store: "Typestore", kind: str, fields: Fields) -> Any:
 
 
 def _field(store: "Typestore", how: Any, value: Any) -> Any:
-    """Create a field of a message; a missing value gives zero or empty."""
+    """Convert a value to the field of a ROS message; a missing value gives zero or empty."""
     from rosbags.interfaces import Nodetype
 
     node, inner = how

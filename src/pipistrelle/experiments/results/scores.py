@@ -105,7 +105,7 @@ class Scores:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class TrialResult:
-    """An estimate and its scores: the scans of a strategy, the track and map of an estimator."""
+    """Result of an estimator run on the scans of a strategy: track, map and scores."""
 
     strategy: str
     filter: str
@@ -133,12 +133,12 @@ class TrialResult:
 
 
 def is_placed(trial: TrialResult) -> bool:
-    """Return whether the path of a trial is finite everywhere."""
+    """Return whether the estimated path of a trial is finite everywhere."""
     return bool(np.isfinite(trial.track.pose.mean).all())
 
 
 def judged(scans: Sequence[Scan]) -> int:
-    """Count the measurements that a gate tests: bearings, with their ranges, and excess paths.
+    """Count the measurements that the gate tests: bearings, with their ranges, and excess paths.
 
     `Scores.gated` counts bearing and excess path of a row separately.
     """
@@ -148,7 +148,7 @@ def judged(scans: Sequence[Scan]) -> int:
 
 @np.errstate(over="ignore", invalid="ignore")
 def score(track: Track, truth: Truth, scans: Sequence[Scan], limit: float) -> Scores:
-    """Score a track and its map against the truth at the same times.
+    """Score an estimated track and map against the truth at the same times.
 
     The scans are the estimator's input. A NEES above `limit` counts as divergence.
 
@@ -187,7 +187,7 @@ def score(track: Track, truth: Truth, scans: Sequence[Scan], limit: float) -> Sc
 def _followed(
     track: Track, truth: Truth
 ) -> tuple[Float[np.ndarray, "n 2"], Float[np.ndarray, "n 2"]]:
-    """Return estimated and true positions of all tracked callers, row by row [m]."""
+    """Return estimated and true positions [m] of all tracked callers, as matching rows."""
     both = [
         np.hstack((believed.mean, truth.callers[label]))
         for label, believed in track.callers.items()
@@ -205,7 +205,7 @@ def with_association(
     truth: Truth,
     motion: Float[np.ndarray, "3"] = STAY,
 ) -> Scores:
-    """Add the scores of a data association; ``landmarks`` has the labels of the association.
+    """Add the scores of data association, such as missed and false landmarks, to the scores.
 
     Landmarks are compared with the true ones by position after the rigid motion `motion`.
     """
@@ -235,7 +235,7 @@ def with_association(
 
 @np.errstate(over="ignore", invalid="ignore")
 def map_motion(track: Track, truth: Truth) -> Float[np.ndarray, "3"]:
-    """Return the rigid motion after which a map is compared with the true landmarks by position.
+    """Return the rigid motion that aligns a map before it is compared with the true landmarks.
 
     It is the alignment of the path or the identity, whichever brings the map nearer. No measurement
     determines the position of the map as a whole, so a common shift and turn makes no landmark
@@ -254,7 +254,7 @@ def map_motion(track: Track, truth: Truth) -> Float[np.ndarray, "3"]:
 
 
 def position_floor(drive: Drive, scans: Sequence[Scan]) -> float | None:
-    r"""Return the RMSE of position [m] of an estimate without errors after the first scan.
+    r"""Return the position RMSE [m] of an estimate that makes no errors after the first scan.
 
     Measurements give positions relative to the vehicle, never the motion before the first scan.
     Until then the vehicle is dead reckoned; at the first scan with a measurement, at step j, the
@@ -287,7 +287,7 @@ def position_floor(drive: Drive, scans: Sequence[Scan]) -> float | None:
 def drive_bound(
     drive: Drive, scans: Sequence[Scan], config: Config
 ) -> Float[np.ndarray, "t 3 3"] | None:
-    """Return the bound on the covariance of the pose at every step, in [m, rad] squared.
+    """Return the lower bound on the pose covariance at every step, in [m, rad] squared.
 
     None if the truth is not known at every step or no landmark is. The scans contain their standard
     deviations; the settings give the motion of callers and whether they are tracked.
@@ -311,7 +311,7 @@ def drive_bound(
 
 
 def with_bound(scores: Scores, bound: Float[np.ndarray, "t 3 3"] | None) -> Scores:
-    """Add the bounds of position and heading to scores."""
+    """Return scores with the lower bounds of the position and heading RMSE filled in."""
     if bound is None:
         return scores
     position, heading = path_bound(bound)
@@ -339,7 +339,7 @@ def with_shared(trials: Sequence[TrialResult], truth: Truth) -> tuple[TrialResul
 
 
 def score_path(pose: Gaussian, true_path: Float[np.ndarray, "k 3"] | None) -> PathScores:
-    """Score a path against the truth, excluding its start and true poses that are NaN.
+    """Score an estimated path against the true path, without the start and unknown true poses.
 
     Bradley & Abaid, Eqs. (23) and (26).
     """
@@ -361,12 +361,12 @@ def score_path(pose: Gaussian, true_path: Float[np.ndarray, "k 3"] | None) -> Pa
 
 
 def _rmse(error: Float[np.ndarray, " n"]) -> float | None:
-    """Return the RMSE; None without errors."""
+    """Return the root mean square of errors; None if there are none."""
     return rmse(error) if len(error) else None
 
 
 def _aligned_rmse(points: Float[np.ndarray, "n 2"], true: Float[np.ndarray, "n 2"]) -> float | None:
-    """Return the RMSE after the best rigid motion; None for fewer than two points."""
+    """Return the RMSE of points after the best rigid motion; None for fewer than two points."""
     if len(points) < 2:
         return None
     return rmse(position_error(moved(points, alignment(points, true)), true))

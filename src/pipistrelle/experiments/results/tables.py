@@ -63,7 +63,7 @@ def map_text(landmarks: Landmarks) -> str:
 
 @np.errstate(over="ignore", invalid="ignore")
 def step_table(track: Track, true_path: Float[np.ndarray, "k 3"] | None) -> "pl.DataFrame":
-    """Return a table of a track with standard deviations, errors and NEES, a row per pose.
+    """Return a track as a table, a row per pose: estimate, standard deviations, errors, NEES.
 
     Columns that need the truth are null without it.
 
@@ -86,7 +86,7 @@ def step_table(track: Track, true_path: Float[np.ndarray, "k 3"] | None) -> "pl.
 
 
 def path_table(time: Float[np.ndarray, " k"], path: Gaussian) -> "pl.DataFrame":
-    """Return a table of poses and their standard deviations, a row per time."""
+    """Return poses and their standard deviations as a table, a row per time."""
     import polars as pl
 
     std = np.sqrt(np.diagonal(path.covariance, axis1=1, axis2=2))
@@ -95,7 +95,7 @@ def path_table(time: Float[np.ndarray, " k"], path: Gaussian) -> "pl.DataFrame":
 
 
 def _pose_columns(name: str, poses: Float[np.ndarray, "k 3"]) -> dict[str, np.ndarray]:
-    """Name the columns of poses, or of their standard deviations."""
+    """Return x, y and heading of poses as table columns, named by the pattern `name`."""
     units = (("x", "m"), ("y", "m"), ("heading", "rad"))
     return {f"{name.format(part)}_{unit}": poses[:, i] for i, (part, unit) in enumerate(units)}
 
@@ -105,7 +105,7 @@ def landmark_table(
     true_landmarks: LabelledPoints | None,
     mapped: Landmarks | None = None,
 ) -> "pl.DataFrame":
-    """Return a table of a map, a row per hypothesis, with the true positions.
+    """Return a map as a table, a row per hypothesis of each landmark, with true positions.
 
     ``landmark`` is the label in the map. ``true_landmark`` is the true landmark that it represents:
     the same label, or by `mapped`, the same rows with true labels. ``status`` is full, partial or,
@@ -157,7 +157,7 @@ def measurement_table(
     labels: Sequence[Int[np.ndarray, " m"]] = (),
     causes: Causes | None = None,
 ) -> "pl.DataFrame":
-    """Return a table of scans, a row per measurement; null for a quantity that was not measured.
+    """Return scans as a table, a row per measurement; null for a quantity that was not measured.
 
     ``caller`` is the name of the emitter of an echo, number 1 being the first name; null for the
     vehicle. ``assigned`` is the label from an association, with an array of `labels` for each scan.
@@ -201,7 +201,7 @@ def measurement_table(
 
 
 def _name(number: int, callers: Sequence[str]) -> str | None:
-    """Return the name of a caller, or its number without a name; None for the vehicle."""
+    """Return a caller's name, or ``callerN`` if it has none; None for the vehicle."""
     if number == OWN:
         return None
     return callers[number - 1] if number <= len(callers) else f"caller{number}"

@@ -57,7 +57,7 @@ _OURS = re.compile(r"\d{8}-\d{6}-(run|slam)(-\d+)?")
 def result_folder(
     path: Path | None, name: str, *, overwrite: bool, flags: tuple[str, str] = COMMAND_LINE
 ) -> Iterator[OwnFiles]:
-    """Provide the folder for results; remove it if it stays empty.
+    """Provide the folder for a mission's results; remove a new folder if it stays empty.
 
     Without a path it is ``runs/<time>-<name>``; once complete, ``runs/latest`` links to it, if the
     file system has symbolic links and no other file has that name. Earlier results stay until the
@@ -75,7 +75,7 @@ def result_folder(
 
 
 def _new_folder(name: str) -> list[Path]:
-    """Create ``runs/<time>-<name>``; return it and, if it was created, ``runs``."""
+    """Create the folder ``runs/<time>-<name>``; return it and, if it was created, ``runs``."""
     runs = Path("runs")
     try:
         made = make_folder(runs)[:1]
@@ -176,7 +176,7 @@ def write_results(
     log: Mapping[str, object] | None = None,
     draw: Callable[[Path], None] = lambda _: None,
 ) -> None:
-    """Write all results into a folder, replacing earlier results, or change nothing.
+    """Write a mission's results into a folder, replacing earlier results, or change nothing.
 
     `beside` contains additional files by name; `draw` receives a folder for the figures.
 
@@ -219,7 +219,7 @@ def write_results(
 def _texts(
     trials: Sequence[TrialResult], truth: Truth, moving: Mapping[int, str]
 ) -> dict[str, str]:
-    """Return tracks, maps and true paths as text, by file name."""
+    """Return estimated tracks, maps and true paths as text files, by file name."""
     texts: dict[str, str] = {}
     for trial in trials:
         name, track = f"{trial.strategy}_{short_name(trial.filter)}", trial.track
@@ -289,7 +289,7 @@ def settings_hash(settings: Mapping[str, object]) -> str:
 
 
 def run_entry(trial: TrialResult, ignored_rows: Mapping[str, int]) -> dict[str, object]:
-    """Return the entry of a trial in the summary; non-finite numbers become None."""
+    """Return a trial's entry for ``summary.json``; non-finite scores become None."""
     scores = asdict(trial.scores)
     if all(scores[name] is None for name in OF_ASSOCIATION):
         scores = {name: score for name, score in scores.items() if name not in OF_ASSOCIATION}
@@ -309,7 +309,7 @@ def run_entry(trial: TrialResult, ignored_rows: Mapping[str, int]) -> dict[str, 
 
 
 def calibration_of(track: Track) -> dict[str, float]:
-    """Return the estimated calibration parameters, and ``NAME_std`` of each."""
+    """Return the estimated calibration parameters and their standard deviations, by name."""
     both = track.calibration.items()
     return {
         key: one

@@ -45,7 +45,7 @@ def compile_kernels(
     timings: Iterable[bool] = (False, True),
     associations: Iterable[str] = (KNOWN,),
 ) -> None:
-    """Compile kernels, or load them from the cache, by missions of two frames.
+    """Compile the kernels of estimators, or load them from the cache, by running tiny missions.
 
     `timings` are values of ``listening.timing``, `associations` of ``association.method``.
     Estimators outside the catalogue are skipped.
@@ -69,7 +69,7 @@ def compile_all() -> None:
 def in_two_processes(
     tell: Callable[[str], object] | None, config: Config, filters: Sequence[str]
 ) -> Iterator[None]:
-    """Let a second process compile kernels in parallel, if any must be compiled.
+    """Let a second process help to compile kernels while the body of the context runs.
 
     It starts with the first compilation in this process, which is announced. The processes do not
     repeat each other's work (`pipistrelle.kernel_folder`).
@@ -93,7 +93,7 @@ def in_two_processes(
 
 
 def _second_process(config: Config, filters: Sequence[str]) -> subprocess.Popen[str] | None:
-    """Start a process that compiles the kernels of estimators; None without a second core."""
+    """Start a process that compiles the kernels of estimators; None on a single core."""
     if cores() < 2:
         return None
     nowhere = subprocess.DEVNULL
@@ -111,7 +111,7 @@ def _second_process(config: Config, filters: Sequence[str]) -> subprocess.Popen[
 
 
 def compile_filters(config: Config, filters: Iterable[str]) -> None:
-    """Compile the kernels of estimators by a synthetic drive, without simulating sound."""
+    """Compile the kernels of estimators by running them on a short drive without sound."""
     each = config.scenario.steps_per_frame
     tiny = {"steps": each * _FRAMES, "landmarks": 4, "radius": 10.0, "steps_per_frame": each}
     config = config.model_copy(update={"scenario": ScenarioConfig(**tiny)})
@@ -126,7 +126,7 @@ def compile_filters(config: Config, filters: Iterable[str]) -> None:
 
 
 def _true_scan(drive: Drive, step: int, first: int, *, timing: bool) -> Scan:
-    """Return noise-free measurements of the landmarks from index `first` on; the last is a caller.
+    """Return a scan of noise-free measurements at a step; its last landmark is a caller.
 
     All have a bearing, odd labels a range, even labels with `timing` an excess path.
     """

@@ -78,7 +78,7 @@ _LABELS = {"association": AssociationConfig(method=KNOWN)}
 def scans_of(
     heard: Sequence[FrameMeasurements], strategy: Strategy, config: Config
 ) -> tuple[Scan, ...]:
-    """Return the measurements of a strategy in each frame, with the noise of the settings.
+    """Return the scans of a sensing strategy, with the noise of the settings.
 
     Frames between the vehicle's calls are omitted if they have no measurement for the strategy.
     With a data association (``association.method``) scans have no labels and only their measured
@@ -100,7 +100,7 @@ def scans_of(
 
 
 def _unlabelled(frame: FrameMeasurements) -> Scan:
-    """Return a frame's measurements without labels; raise if it was simulated with labels only."""
+    """Return a frame's measurements without labels; raise if the frame has only labelled ones."""
     if frame.unlabelled is None:
         raise InputError(
             "association.method: found frames that were heard with labels alone; expected some of "
@@ -110,7 +110,7 @@ def _unlabelled(frame: FrameMeasurements) -> Scan:
 
 
 def drive_of(scenario: Scenario, config: Config, iteration: int = 0) -> Drive:
-    """Return the input of an estimator for a simulated world, and the truth for scoring.
+    """Return the drive of a simulated world: an estimator's input, and the truth for scoring.
 
     `iteration`, the number of the world, is part of the key of a drawn start. The true landmarks
     are the world's, then the callers that do not move, so the beacon is last.
@@ -138,7 +138,7 @@ def drive_of(scenario: Scenario, config: Config, iteration: int = 0) -> Drive:
 
 
 class HeardWorld:
-    """A world, its frames for each beam, and a cache of the scans and bounds derived from them.
+    """A simulated world, its frames for each beam, and a cache of derived scans and bounds.
 
     Configurations passed to its methods may differ only in settings that change neither the world
     nor its recording.
@@ -157,7 +157,7 @@ class HeardWorld:
         self._bounds: dict[_Key, Float[np.ndarray, "t 3 3"]] = {}
 
     def scans(self, config: Config, strategy: Strategy) -> tuple[Scan, ...]:
-        """Return the scans of a strategy (`scans_of`)."""
+        """Return the scans of a sensing strategy, computed at most once for equal settings."""
         radius, noise = config.emitter.radius, _only(config.filter, _NOISE)
         key = (radius, strategy, noise, config.listening, config.association)
         if key not in self._scans:
@@ -165,7 +165,7 @@ class HeardWorld:
         return self._scans[key]
 
     def causes(self, config: Config, strategy: Strategy) -> Causes | None:
-        """Return the true label of each measurement of a strategy; None for known labels."""
+        """Return the true label of each measurement of a strategy; None if labels are known."""
         if config.association.method == KNOWN:
             return None
         frames = {frame.rows.time: frame for frame in self.beams[config.emitter.radius]}
@@ -173,7 +173,7 @@ class HeardWorld:
         return tuple(causes_of(scan, _unlabelled(frame), frame.causes) for scan, frame in pairs)
 
     def bound(self, config: Config, strategy: Strategy) -> Float[np.ndarray, "t 3 3"]:
-        """Return the bound on the covariance of the pose at every step, for the measured noise."""
+        """Return the lower bound on the pose covariance at every step, for the measured noise."""
         noise = config.filter.model_copy(update={"noise": "measured"})
         bound = self.stated_bound(config.model_copy(update={"filter": noise}), strategy)
         if config.filter.first_pose == "drawn":
@@ -181,7 +181,7 @@ class HeardWorld:
         return bound
 
     def stated_bound(self, config: Config, strategy: Strategy) -> Float[np.ndarray, "t 3 3"]:
-        """Return the bound of the pose at every step for an exact start and the settings' noise.
+        """Return the bound on the pose covariance for an exact start and the settings' noise.
 
         Labels count as known, also with a data association.
         """
@@ -195,17 +195,17 @@ class HeardWorld:
         return self._bounds[key]
 
     def _with(self, key: _Key) -> Config:
-        """Return the world's settings with the sections of a key replaced."""
+        """Return the world's settings with filter, listening and association from a cache key."""
         _, _, *sections = key
         names = ("filter", "listening", "association")
         return self._config.model_copy(update=dict(zip(names, sections, strict=True)))
 
 
 def _start_covariance(config: Config) -> Float[np.ndarray, "3 3"]:
-    """Return the covariance of the first pose that a filter assumes."""
+    """Return the covariance of the first pose that the settings let a filter assume."""
     return np.diag(np.square(np.array(config.filter.initial_pose_std)))
 
 
 def _only(settings: FilterConfig, names: Sequence[str]) -> FilterConfig:
-    """Return a filter's settings with all except the named ones at their defaults."""
+    """Return a filter's settings with all except the settings in `names` at their defaults."""
     return FilterConfig(**{name: getattr(settings, name) for name in names})

@@ -75,7 +75,7 @@ def load(
     readers: Sequence[Reader] = (),
     truths: Mapping[str, WithTruth] = {},
 ) -> tuple[Log, Truth]:
-    """Read a recorded log, and its truth if known.
+    """Read a recorded log, and its truth if it has any.
 
     `folder` may be a file for formats of a single file. `robot`, a number or a name, is needed only
     for formats with several, such as MRCLAM sets. `readers` of other formats are tried before the
@@ -112,7 +112,7 @@ def load(
 
 
 def _refuse_unknown(folder: Path, titles: str) -> None:
-    """Raise if a path is missing or holds something known that is no log; other folders pass."""
+    """Raise if a path is missing, or holds something recognised that is no log, as a study."""
     if folder.exists():
         what, _, fix = (recording_of(folder) or "").partition("; ")
         if what:
@@ -129,7 +129,7 @@ def _refuse_unknown(folder: Path, titles: str) -> None:
 def as_heard_by(
     scans: Sequence[Scan], strategy: Strategy, beamwidth: float | None = None
 ) -> tuple[Scan, ...]:
-    """Reduce recorded scans to the measurements of a strategy, scan by scan.
+    """Reduce the scans of a log to the measurements that a sensing strategy provides.
 
     Inside the beam, of full width `beamwidth` [rad] about the heading, range and bearing are
     measured actively. Outside it only the bearing is measured, passively; excess paths are measured
@@ -148,7 +148,7 @@ def as_heard_by(
 
 
 def motion_of(log: Log) -> Motion:
-    """Return the motion model of a log."""
+    """Return the motion model of a recorded log's odometry."""
     return Motion(
         model=log.motion,
         control_std=log.control_std,
@@ -220,7 +220,7 @@ def replay(
 
 
 def drive_of(log: Log, truth: Truth) -> Drive:
-    """Return the drive of a log; it starts with independent errors in x, y and heading."""
+    """Return a recorded log as the input of an estimator; x, y, heading start uncorrelated."""
     placed = [caller for caller in log.callers if caller.place is not None]
     stds = [np.maximum(caller.place_std or KNOWN_STD, LEAST_STD) for caller in placed]
     variance = np.square(np.array(log.initial_pose_std, dtype=float))
@@ -243,7 +243,7 @@ def drive_of(log: Log, truth: Truth) -> Drive:
 
 
 def without_unused(scan: Scan, config: Config) -> Scan:
-    """Remove the parts of a recorded scan that the settings hide: labels, noise, excess paths."""
+    """Remove from a recorded scan the labels, noise and excess paths that the settings exclude."""
     known = config.association.method == KNOWN
     rows = scan if known or scan.direct.size else without_labels(scan, scan.callers)
     timing = config.listening.timing
@@ -251,14 +251,14 @@ def without_unused(scan: Scan, config: Config) -> Scan:
 
 
 def with_noise(scan: Scan, config: Config) -> Scan:
-    """Merge the measurements of each landmark and set their noise, if labels are known."""
+    """Merge a scan's measurements of each landmark and set their noise, if labels are known."""
     if config.association.method != KNOWN:
         return scan
     return noise_of(config.filter)(labelled(scan, scan.landmark))
 
 
 def check_calibrated(log: Log, config: Config) -> None:
-    """Raise if the odometry is to be calibrated with a sensor offset from the vehicle's origin."""
+    """Raise if odometry is to be calibrated with a sensor off the vehicle's origin."""
     asked = [name for name in config.filter.calibrate if name in OF_ODOMETRY]
     if asked and any(log.sensor_pose):
         expected = f"none of {', '.join(OF_ODOMETRY)} beside a sensor_pose"
@@ -273,7 +273,7 @@ UNKNOWN = "add --association.method marginal"
 def _whose(
     reader: Reader, folder: Path, robot: Robot | None, formats: Sequence[Reader]
 ) -> tuple[Robot, ...]:
-    """Return the robot for the log's reader; () if its format has a single robot."""
+    """Return the robot to read from a log, in a tuple; empty if the format has a single robot."""
     if reader.robots is None:
         if robot is None:
             return ()
@@ -296,7 +296,7 @@ def rerun(
     progress: Progress | None = None,
     watch: Watch | None = None,
 ) -> Mission:
-    """Repeat a mission from its result folder, and compare its tracks with the stored ones.
+    """Repeat a mission from its result folder, and compare its tracks with the stored tracks.
 
     `log` is the new path of a log that was moved. Estimators and associations from outside
     (``module:Class``) run only if `trusted` lists them, as the folder may be another person's.
@@ -333,7 +333,7 @@ def rerun(
 
 
 def log_entry(log: Path, robot: Robot | None, beamwidth: float | None) -> dict[str, object]:
-    """Return the entry of a log in ``summary.json``: folder, sums of its files, beamwidth [rad]."""
+    """Return a log's entry for ``summary.json``: path, robot, beamwidth, SHA-256 of the files."""
     path = str(log.resolve())
     entry: dict[str, object] = {"path": text_of(path), "robot": robot, "beamwidth_rad": beamwidth}
     entry |= {"files": _sums(log)}
@@ -341,7 +341,7 @@ def log_entry(log: Path, robot: Robot | None, beamwidth: float | None) -> dict[s
 
 
 def _sums(log: Path) -> dict[str, str]:
-    """Return the SHA-256 of each file of a log and its truth, by name."""
+    """Return the SHA-256 of each file of a log and its truth, by file name."""
     patterns = (*reader_of(log).files, *truth_files.FILES)
     found = {text_of(path.name): path for pattern in patterns for path in log.glob(pattern)}
     found |= {text_of(log.name): log} if log.is_file() else {}
@@ -354,7 +354,7 @@ def _sums(log: Path) -> dict[str, str]:
 
 
 def _check_simulated(folder: Path, log: Path | None) -> None:
-    """Raise if a folder has neither log nor world, or if `log` is given for a simulated mission."""
+    """Raise if a mission without a log was not simulated, or if `log` is given for it."""
     if "scenario" not in read_toml(folder / "config.toml"):
         raise refusal(
             f"{folder / SUMMARY}: log",
@@ -372,7 +372,7 @@ def _check_simulated(folder: Path, log: Path | None) -> None:
 
 
 def _log_of(folder: Path, summary: Summary, log: Path | None) -> Path:
-    """Return the path of a mission's log; raise if it is missing or was changed."""
+    """Return the path of the log that a mission used; raise if it is missing or was changed."""
     assert summary.log
     path = summary.log.place if log is None else log
     where = f"{folder / SUMMARY}: log.path" if log is None else f"{folder}, option --log"
@@ -399,7 +399,7 @@ def _log_of(folder: Path, summary: Summary, log: Path | None) -> Path:
 
 
 def _difference(folder: Path, summary: Summary, trials: Sequence[TrialResult]) -> str:
-    """Describe in a line how tracks differ from the tracks of a folder; empty if equal."""
+    """Describe in a line how new tracks differ from a folder's stored tracks; "" if equal."""
     differences = {}
     for trial in trials:
         track = trial.track
@@ -425,7 +425,7 @@ def _difference(folder: Path, summary: Summary, trials: Sequence[TrialResult]) -
 
 
 def _apart(here: str, there: str) -> str:
-    """Format the largest distance between two tracks; empty if they cannot be compared."""
+    """Format the largest distance between two tracks in TUM text; "" if not comparable."""
     try:
         paths = [
             np.array([line.split()[1:3] for line in text.splitlines()], dtype=float)

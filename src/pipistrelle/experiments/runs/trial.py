@@ -77,7 +77,7 @@ def run_mission(
     progress: Progress | None = None,
     watch: Watch | None = None,
 ) -> Mission:
-    """Draw a world, simulate its scans once, and run each estimator with each strategy.
+    """Simulate the scans of a world once, and run each estimator with each sensing strategy.
 
     `keep` receives the sound of each frame (`listen`), `watch` each scan and the belief after it.
     Invalid settings, estimators and worlds, or a lack of memory, raise an `InputError` first.
@@ -132,7 +132,7 @@ def try_trial(
     progress: Progress | None = None,
     watch: Watch | None = None,
 ) -> TrialResult:
-    """Run a trial; if an estimator from outside fails, its poses are NaN, with the error."""
+    """Run a trial; if an external estimator fails, return NaN poses and the error's message."""
     try:
         return run_trial(case, drive, scans, config, causes=causes, progress=progress, watch=watch)
     except Exception as error:
@@ -165,7 +165,7 @@ def run_trial(
     progress: Progress | None = None,
     watch: Watch | None = None,
 ) -> TrialResult:
-    """Estimate path and map from the scans of a strategy, and score them.
+    """Run an estimator on the scans of a sensing strategy, and score its path and map.
 
     Parameters
     ----------
@@ -228,7 +228,7 @@ def run_trial(
 def with_moving(
     scans: Sequence[Scan], drive: Drive, *, follows: bool, known: bool = True
 ) -> Sequence[Scan]:
-    """Mark moving callers in scans, or remove their measurements.
+    """Mark moving callers in scans, or remove their measurements if no estimate follows them.
 
     Without known labels callers are marked by their numbers, and nothing is removed.
     """
@@ -245,7 +245,7 @@ def with_moving(
 
 
 def _named(track: Track, used: Sequence[Scan], drive: Drive) -> Track:
-    """Rename a track's callers from the association's labels to the labels of the drive."""
+    """Replace the association's labels of a track's callers by the labels of the drive."""
     if not track.callers:
         return track
     pairs = (zip(scan.callers.tolist(), drive.callers.tolist(), strict=False) for scan in used)
@@ -261,7 +261,7 @@ def _scored(
     causes: Causes | None,
     association: Association | None,
 ) -> tuple[Scores, Landmarks | None]:
-    """Score a track; after data association, also return its map with true labels."""
+    """Score a track; after data association, also return the map with true labels."""
     truth = drive.truth
     if association is None:
         return score(track, truth, used, limit), None
@@ -288,7 +288,7 @@ def run_filter(
     progress: Callable[[int, int], None] | None = None,
     watch: Callable[[Scan, B], None] | None = None,
 ) -> Track:
-    """Run an estimator over a drive: predict to each scan, update with it, keep every pose.
+    """Run an estimator over a drive: predict to each scan, update with it, store every pose.
 
     If the belief revises its path (it has ``path``), the track is the final revised path, and the
     poses estimated at each time are kept as ``online``. Revised tracks of callers (``tracks``)
@@ -342,7 +342,7 @@ def run_filter(
 
 
 def _steps_of(scans: Sequence[Scan], time: Float[np.ndarray, " t"]) -> list[int]:
-    """Return the time index of each scan; raise if scans are out of order or off the time steps."""
+    """Return the time step of each scan; raise if scans are out of order or between steps."""
     heard = np.array([scan.time for scan in scans], dtype=float)
     steps = np.searchsorted(time, heard)
     on_time = time[np.minimum(steps, time.size - 1)] == heard
@@ -359,7 +359,7 @@ def _steps_of(scans: Sequence[Scan], time: Float[np.ndarray, " t"]) -> list[int]
 
 
 def _check_known(drive: Drive, scans: Sequence[Scan]) -> None:
-    """Raise if landmarks known beforehand move."""
+    """Raise if a landmark with a position known beforehand is a moving caller."""
     moving = {*drive.moving, *(label for scan in scans for label in scan.moving.tolist())}
     if roving := sorted(moving.intersection(drive.known.landmark.tolist())):
         raise InputError(
@@ -368,7 +368,7 @@ def _check_known(drive: Drive, scans: Sequence[Scan]) -> None:
 
 
 def _move(session: Session[B], drive: Drive, first: int, last: int, path: Gaussian) -> None:
-    """Predict a session over some steps of a drive, and store the pose after each."""
+    """Predict an estimator over some control steps, and store the pose after each in `path`."""
     if last == first:
         return
     dt = np.diff(drive.time[first : last + 1])
@@ -377,7 +377,7 @@ def _move(session: Session[B], drive: Drive, first: int, last: int, path: Gaussi
 
 
 def _follow(callers: dict[int, Gaussian], scan: Scan, belief: Belief, at: tuple[int, int]) -> None:
-    """Store the positions of moving callers in sight at step k."""
+    """Store the estimated positions of moving callers in sight at the present step."""
     if not (scan.moving.size or scan.moving_callers.size):
         return
     moving, (k, steps) = in_sight(completed(belief, Belief).moving()), at
@@ -390,7 +390,7 @@ def _follow(callers: dict[int, Gaussian], scan: Scan, belief: Belief, at: tuple[
 def _track_of(
     belief: Belief, time: Float[np.ndarray, " k"], path: Gaussian, callers: dict[int, Gaussian]
 ) -> Track:
-    """Return the track of a drive from its final belief and its online estimates."""
+    """Return a drive's track, from the final belief and the estimates made at each time."""
     belief = completed(belief, Belief)
     online = replace(path, invariant=belief.pose().invariant)
     revised, cloud, sums = belief.path(), belief.cloud(), belief.innovations
@@ -411,7 +411,7 @@ def _track_of(
 
 
 def _retraced(callers: dict[int, Gaussian], belief: Belief, steps: int) -> Mapping[int, Gaussian]:
-    """Replace online tracks of callers by revised tracks, and fill the gaps of these."""
+    """Replace online tracks of callers by revised tracks; fill gaps from the online tracks."""
     revised = belief.tracks() if callers else None
     if revised is None:
         return callers

@@ -42,7 +42,7 @@ Read = Callable[..., Log]
 
 
 def with_files_beside(read: Read, folder: Path, *robot: Robot) -> tuple[Log, Truth]:
-    """Read a log, and the truth from ``truth.csv`` and ``landmarks.csv`` in its folder."""
+    """Read a log, and its truth from ``truth.csv`` and ``landmarks.csv`` in its folder."""
     log = read(folder, *robot)
     return log, read_truth(folder, log.time)
 
@@ -60,7 +60,7 @@ def with_mrclam_truth(read: Read, folder: Path, robot: int) -> tuple[Log, Truth]
 
 
 def with_bag_truth(read: Read, path: Path, settings: BagConfig) -> tuple[Log, Truth]:
-    """Read a ROS bag with the truth from a topic, if named; the log starts with the truth."""
+    """Read a ROS bag as a log, and the true path from a topic if named; it gives the first pose."""
     from pipistrelle.detection.logs.bag_log import Remarks, read_poses
 
     remarks = Remarks()
@@ -86,7 +86,7 @@ TRUTHS: Mapping[str, WithTruth] = {"mrclam": with_mrclam_truth, "bag": with_bag_
 
 
 def read_truth(folder: Path, time: Float[np.ndarray, " k"]) -> Truth:
-    """Read ``truth.csv`` and ``landmarks.csv`` of a log folder, if they exist.
+    """Read ``truth.csv`` and ``landmarks.csv`` from a log's folder, if they exist.
 
     The path is interpolated at the times `time` [s], the heading unwrapped; NaN outside the
     recorded poses.
@@ -126,7 +126,7 @@ def write_truth(folder: Path, truth: Truth) -> None:
 
 
 def truth_files(truth: Truth) -> dict[str, str]:
-    """Return ``truth.csv`` and ``landmarks.csv`` as text, as far as the truth is known."""
+    """Format the truth as the files ``truth.csv`` and ``landmarks.csv``, as far as known."""
     files = {}
     if truth.path is not None:
         rows = np.column_stack((truth.time, truth.path))[np.isfinite(truth.path).all(axis=1)]
@@ -141,7 +141,7 @@ def truth_files(truth: Truth) -> dict[str, str]:
 def read_path(
     path: Path, separator: str | None
 ) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, "n 3"]]:
-    """Read times [s] and poses [m, m, rad], with unwrapped heading, from a table.
+    """Read times [s] and poses [m, m, rad] from a table, with unwrapped headings.
 
     The later of two rows with equal time wins. Without a separator, columns are split at spaces and
     there is no header.

@@ -25,7 +25,7 @@ from pipistrelle.kernel_clock import judging
 def check_filters(
     filters: Sequence[str], motion: Motion, config: Config, moving: Iterable[str] = ()
 ) -> None:
-    """Raise if an estimator or association cannot be built or initialised.
+    """Raise if an estimator or association cannot be built, or does not fit the settings.
 
     `moving`: names of the moving callers.
     """
@@ -82,7 +82,7 @@ def failure_text(error: Exception) -> str:
 
 
 def let_interruptions_pass(error: Exception) -> None:
-    """Raise a KeyboardInterrupt that is the cause or context of another error."""
+    """Raise again a KeyboardInterrupt that is the cause or context of another error."""
     behind: BaseException | None = error
     while behind is not None:
         if isinstance(behind, KeyboardInterrupt):
@@ -91,7 +91,7 @@ def let_interruptions_pass(error: Exception) -> None:
 
 
 def located(error: Exception) -> str:
-    """Return the message of an error, with file and line."""
+    """Return the message of an error, with the file and line that raised it."""
     place = extract_tb(error.__traceback__)[-1]
     return f"{worded(error)} ({Path(place.filename).name}, line {place.lineno})"
 
@@ -113,7 +113,7 @@ def checked_scenario(
     filters: int = 1,
     workers: int = 1,
 ) -> Scenario:
-    """Draw the first world of a mission; raise if its sound cannot be simulated with the settings.
+    """Draw the first world of a mission; raise if its sound cannot be simulated.
 
     Memory is checked for the numbers of strategies and filters, and of workers on this machine (0
     for a cluster).
@@ -165,7 +165,7 @@ def warnings_of(config: Config, callers: Sequence[Caller] = ()) -> tuple[str, ..
 
 
 def _kilohertz(section: Section, place: str = "") -> list[str]:
-    """Warn of frequencies below 1 kHz, in all settings with the unit hertz."""
+    """Return warnings about frequencies below 1 kHz, probably given in kilohertz."""
     warnings = []
     for name, field in type(section).model_fields.items():
         key, value = f"{place}{name}", getattr(section, name)
@@ -183,7 +183,7 @@ def _kilohertz(section: Section, place: str = "") -> list[str]:
 
 
 def _of_the_other_medium(config: Config) -> list[str]:
-    """Warn of settings for an unused medium and, in water, of settings that fit only air."""
+    """Return warnings about settings of the unused medium and, in water, values meant for air."""
     medium = config.scenario.medium
     other = "air" if medium == "water" else "water"
     warnings = [
@@ -195,7 +195,7 @@ def _of_the_other_medium(config: Config) -> list[str]:
 
 
 def _left_from_air(config: Config) -> list[str]:
-    """Warn of call duration and spacing that fit the shorter waves and paths in air."""
+    """Return warnings about call duration and microphone spacing in water that suit only air."""
     pulse, spacing, c = config.emitter.pulse, config.receiver.spacing, config.medium.sound_speed
     nearest, deaf = config.rays.range_bounds[0], 0.5 * c * pulse
     wave, warnings = c / config.emitter.centre, []
@@ -215,7 +215,7 @@ def _left_from_air(config: Config) -> list[str]:
 
 
 def _cost(config: Config, callers: Sequence[Caller]) -> list[str]:
-    """Warn of the run time of recording every sample, if the settings do not request it."""
+    """Return a warning about the run time if every sample must be recorded without request."""
     why = off_raster(config, callers)
     swept = [caller.key or caller.name for caller in callers if caller.sound is not None]
     if config.receiver.engine != "auto" or not (why or swept):
@@ -227,7 +227,7 @@ def _cost(config: Config, callers: Sequence[Caller]) -> list[str]:
 
 
 def _doubles(layout: Scattered, frequency: float, tone: str, c: float) -> list[str]:
-    """Warn of groups of microphones with many ambiguous bearings."""
+    """Return warnings about groups of microphones with many ambiguous bearings."""
     warnings = []
     for g, name in enumerate(layout.name):
         found = pattern_of(layout, g, frequency=frequency, speed_of_sound=c)

@@ -35,7 +35,7 @@ Results = Generator[list[Outcome], None, None]
 def ended(
     executor: Executor, task: Task, waiting: deque[int], ahead: int
 ) -> Iterator[tuple[int, Future[list[Outcome]]]]:
-    """Keep an executor busy; yield each finished world with the future of its trials.
+    """Submit waiting worlds to an executor; yield each finished world's number and future.
 
     At most `ahead` worlds are pending. Once the executor is broken, no more are submitted, and the
     rest stays in ``waiting``.
@@ -57,7 +57,7 @@ def ended(
 
 
 def in_processes(task: Task, give_up: Task, waiting: deque[int], workers: int) -> Results:
-    """Run worlds in spawned processes, and yield the trials of each finished world.
+    """Run worlds in spawned processes, and yield each finished world's trial outcomes.
 
     The worlds of processes that died are tried again, in a single process; `give_up` is called for
     a world that has lost its process twice.
@@ -84,7 +84,7 @@ def in_processes(task: Task, give_up: Task, waiting: deque[int], workers: int) -
 
 @contextmanager
 def _pool(workers: int) -> Iterator[Executor]:
-    """Spawn worker processes; kill them if the caller fails."""
+    """Provide a pool of spawned processes; kill them if the body of the context raises."""
     from concurrent.futures import ProcessPoolExecutor
     from multiprocessing import active_children, get_context
 
@@ -109,7 +109,7 @@ def _pool(workers: int) -> Iterator[Executor]:
 
 @contextmanager
 def _held_interrupt() -> Iterator[None]:
-    """Block Ctrl-C in this context; processes started in it ignore Ctrl-C."""
+    """Block Ctrl-C while the context's body runs; processes started in it ignore Ctrl-C."""
     if not hasattr(signal, "pthread_sigmask"):
         yield
         return
@@ -121,7 +121,7 @@ def _held_interrupt() -> Iterator[None]:
 
 
 def _become_worker() -> None:
-    """Ignore Ctrl-C in a worker, and exit when its parent process has ended."""
+    """Make this worker process ignore Ctrl-C, and exit when its parent process has ended."""
     from multiprocessing import parent_process
 
     signal.signal(signal.SIGINT, signal.SIG_IGN)
@@ -139,7 +139,7 @@ def _become_worker() -> None:
 def on_cluster(
     task: Task, give_up: Task, waiting: deque[int], workers: int, address: str
 ) -> Results:
-    """Run worlds on Dask's workers, and yield the trials of each finished world.
+    """Run worlds on Dask's workers, and yield each finished world's trial outcomes.
 
     `address` is a scheduler's, or "local" for a cluster of `workers` on this machine. Dask retries
     the worlds of a dead worker; `give_up` is called for a world that it abandons.
@@ -179,7 +179,7 @@ def check_cluster(address: str) -> None:
 
 @contextmanager
 def _client(address: str, workers: int) -> Iterator[Any]:
-    """Connect to a cluster, started on this machine for the address "local"."""
+    """Connect to a Dask scheduler, or start a cluster on this machine for the address "local"."""
     from dask import config as dask_config
     from distributed import Client, LocalCluster
 
@@ -209,7 +209,7 @@ def _client(address: str, workers: int) -> Iterator[Any]:
 
 @contextmanager
 def _started_deaf() -> Iterator[None]:
-    """Make processes that are started in this context ignore Ctrl-C."""
+    """Ignore Ctrl-C while the context's body runs; processes started in it inherit this."""
     if threading.current_thread() is not threading.main_thread():
         yield
         return

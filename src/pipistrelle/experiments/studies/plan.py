@@ -73,7 +73,7 @@ MOST_WORLDS = 1_000_000
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Plan:
-    """A study's settings, their varied values, and its number of worlds."""
+    """A study's settings, varied values, strategies, filters and number of worlds."""
 
     name: str
     iterations: int
@@ -93,13 +93,13 @@ class Plan:
     read."""
 
     def world(self, config: Config) -> World:
-        """Return the user's world that the settings name, or a world without known parts."""
+        """Return the user's world that the settings name, or a world that is drawn as a whole."""
         return ALL_DRAWN if config.scenario.world is None else self.worlds[config.scenario.world]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PlannedCase(Case):
-    """A combination of a plan's grid, strategy and filter, with its settings, for any world."""
+    """A numbered combination of a plan's varied values, strategy and filter, with its settings."""
 
     number: int
     """Number of the case, from 0, in the order of the plan."""
@@ -110,7 +110,7 @@ class PlannedCase(Case):
 
 
 def cases_of(plan: Plan) -> tuple[PlannedCase, ...]:
-    """Return the cases of a plan, in order of their numbers."""
+    """Return the cases of a plan: each combination of varied values, strategy and filter."""
     settled = from_flags(plan.config.model_dump(mode="json"))
     narrowest = max(plan.grid.get(RADIUS, (plan.config.emitter.radius,)))
     cases: list[PlannedCase] = []
@@ -131,7 +131,7 @@ def cases_of(plan: Plan) -> tuple[PlannedCase, ...]:
 
 
 def own_config(plan: Plan, name: str, config: Config) -> Config:
-    """Return settings with a filter's overrides from the plan applied."""
+    """Return settings with a plan's overrides for one filter applied."""
     if name not in plan.own:
         return config
     own = _dotted(plan.own[name], f"own.{name}.")
@@ -139,7 +139,7 @@ def own_config(plan: Plan, name: str, config: Config) -> Config:
 
 
 def _dotted(values: Mapping[str, Any], prefix: str) -> Layer:
-    """Return the layer of settings by dotted names; `prefix` precedes a name in messages."""
+    """Convert settings by dotted name to a layer; `prefix` precedes a name in messages."""
     return {
         cast(Key, tuple(name.split("."))): Given(value, prefix + name)
         for name, value in values.items()
@@ -147,7 +147,7 @@ def _dotted(values: Mapping[str, Any], prefix: str) -> Layer:
 
 
 def common(plan: Plan, values: Mapping[str, Any]) -> Config:
-    """Return a plan's settings with some values of its grid, without overrides for single filters.
+    """Return a plan's settings with some values of its grid, without filter-specific overrides.
 
     >>> ways = {"strategies": ("fused",), "filters": ("ekf",), "config": Config()}
     >>> plan = Plan(name="one", iterations=1, grid={"filter.gate": (0.9,)}, **ways)
@@ -166,7 +166,7 @@ def combinations(
     prefix: str,
     worlds: Mapping[str, World] = MappingProxyType({}),
 ) -> Iterator[tuple[dict[str, Any], Config]]:
-    """Yield each combination of a grid: its values by name, and the settings with these values.
+    """Yield each combination of a grid's values by name, and the settings with these values.
 
     The values of the last name change fastest. `prefix` precedes a name in error messages.
 
@@ -196,7 +196,7 @@ the widest."""
 def with_radii(
     where: str, grid: Mapping[str, Any], strategies: Sequence[str], layer: Layer
 ) -> dict[str, Any]:
-    """Replace the beamwidths of a grid by piston radii, in the same order.
+    """Replace the beamwidths [deg] in a plan's grid by piston radii [m], in the same order.
 
     `layer` contains the plan's settings, which give the tone and the speed of sound.
     """
@@ -229,7 +229,7 @@ def with_radii(
 
 
 def _radius(where: str, width: Any, config: Config) -> float:
-    """Return the radius [m] of the piston with a beamwidth [deg]."""
+    """Return the radius [m] of the piston emitter with a beamwidth [deg]; raise if invalid."""
     from pipistrelle.acoustics.emitter import piston_radius
 
     number = isinstance(width, (int, float)) and not isinstance(width, bool)
@@ -244,7 +244,7 @@ FORMAT = 1
 
 
 def _checked(expected: str, valid: Callable[[Any], bool]) -> PlainValidator:
-    """Return the validator of a key of a plan file, which raises unless a value is `valid`."""
+    """Return a Pydantic validator that raises unless `valid` accepts the value of a plan's key."""
 
     def check(found: Any) -> Any:
         if valid(found):
@@ -255,14 +255,14 @@ def _checked(expected: str, valid: Callable[[Any], bool]) -> PlainValidator:
 
 
 def _names_filter(found: Any) -> bool:
-    """Return whether a value names an estimator, also if it is external and not installed."""
+    """Return whether a value is an estimator's name, in the catalogue or ``module:Class``."""
     with suppress(InputError):
         return bool(check_name(str(found)))
     return False
 
 
 def _is_table(found: Any, inner: type = object) -> bool:
-    """Return whether a value is a table with values of a type."""
+    """Return whether an object is a dict with values of a given type only."""
     return isinstance(found, dict) and all(isinstance(each, inner) for each in found.values())
 
 
@@ -275,7 +275,7 @@ _Tables = Annotated[
 
 
 class _PlanFile(Section):
-    """Keys of a plan file; the settings in its tables are validated with their places later."""
+    """Keys of a plan file, validated by Pydantic; the settings in its tables are checked later."""
 
     format: Literal[1]
     name: Annotated[str, Field(pattern=r"^\w[\w.-]*$")]
@@ -290,7 +290,7 @@ class _PlanFile(Section):
 
 
 def find_plan(word: str) -> Path:
-    """Return the path of a plan given by a name of `PLANS` or a path."""
+    """Return the path of a plan, from the name of a shipped plan (`PLANS`) or from a path."""
     path = Path(word)
     if word in PLANS:
         return Path(str(files("pipistrelle.experiments.studies") / f"{word}.toml"))
@@ -303,7 +303,7 @@ def find_plan(word: str) -> Path:
 
 
 def read_plan(path: Path, over: Layer | None = None, iterations: int | None = None) -> Plan:
-    """Read a plan, with `over` and `iterations` replacing its values, and check every combination.
+    """Read a plan's file, let `over` and `iterations` override it, and check every combination.
 
     >>> from pipistrelle.experiments.studies.plan import cases_of
     >>> plan = read_plan(find_plan("paper"))
@@ -319,7 +319,7 @@ def plan_of(
     over: Layer | None = None,
     iterations: int | None = None,
 ) -> Plan:
-    """Create a plan from the content of its file, and check every combination.
+    """Create a plan from the parsed content of its file, and check every combination.
 
     `path` is the file's name in error messages and the base of relative paths.
 
@@ -367,7 +367,7 @@ def plan_of(
 def _check_unvaried(
     path: Path, layer: Layer, grid: Mapping[str, Any], over: Layer, in_degrees: bool
 ) -> None:
-    """Raise if a value is given for a setting that the plan's grid varies."""
+    """Raise if a setting that the plan's grid varies is also given a single value."""
     for key in (key for key in layer if ".".join(key) in grid):
         # The plan in a study's folder lists every setting, so a default value is no conflict.
         if key in over or resolve({key: layer[key]}) != Config():
@@ -377,7 +377,7 @@ def _check_unvaried(
 
 
 def _beneath(path: Path, table: Mapping[str, Any], over: Layer) -> tuple[Layer, tuple[str, ...]]:
-    """Return the preset's settings below a plan, and the estimators that the preset names."""
+    """Return the settings and estimators of the preset that a plan's file or `over` names."""
     config = table.get("config")
     places = (config if isinstance(config, dict) else {}, table)
     words = [Given(one["settings"], f"{path}: settings") for one in places if "settings" in one]
@@ -386,7 +386,7 @@ def _beneath(path: Path, table: Mapping[str, Any], over: Layer) -> tuple[Layer, 
 
 
 def _laid(path: Path, table: Mapping[str, Any], over: Layer, worlds: dict[str, World]) -> Layer:
-    """Merge the settings of a world, a plan and `over`, in rising priority; read named files."""
+    """Merge settings of a world, a plan and `over`, in rising priority; read files they name."""
     layer: Layer = {
         key: Given(value, f"{path}: config.{name}")
         for key, name, value in _settings(path, "config", table)
@@ -400,7 +400,7 @@ def _laid(path: Path, table: Mapping[str, Any], over: Layer, worlds: dict[str, W
 
 
 def _read(path: Path, key: Key, values: Any, worlds: dict[str, World]) -> Any:
-    """Read the files that a grid names: worlds, arrays, and callers' routes."""
+    """Read the files in a grid's values (worlds, arrays, routes); return the new values."""
     if key == WORLD_KEY:
         return _worlds(path, values, worlds)
     if key not in (CALLERS, ARRAY_KEY) or not isinstance(values, list):
@@ -411,7 +411,7 @@ def _read(path: Path, key: Key, values: Any, worlds: dict[str, World]) -> Any:
 
 
 def _worlds(path: Path, folders: Any, worlds: dict[str, World]) -> Any:
-    """Read the worlds of a grid, and return their names."""
+    """Read a grid's world folders into `worlds`, and return the names of the worlds."""
     if not isinstance(folders, list) or not all(isinstance(one, str) for one in folders):
         return folders  # rejected later with all values
     names = []
@@ -434,7 +434,7 @@ def _own(
     layer: Layer,
     worlds: Mapping[str, World],
 ) -> dict[str, dict[str, Any]]:
-    """Merge settings for single filters, which must not change the simulated measurements.
+    """Merge filter-specific settings; raise if they would change the simulated measurements.
 
     `tables` are the plan's; `named` are the preset's, with lower priority.
     """
@@ -462,14 +462,14 @@ def _own(
 
 
 def plan_text(plan: Plan) -> str:
-    """Format a plan as TOML that lists every setting and can be read back as the same plan."""
+    """Format a plan as TOML that lists every setting and is read back as the same plan."""
     import tomli_w
 
     return tomli_w.dumps(_as_table(plan))
 
 
 def changed_settings(there: Plan, asked: Plan) -> list[str]:
-    """List the differences between two plans, except the number of worlds."""
+    """Describe each difference between two plans in a line, except the number of worlds."""
     old, new = plan_settings(there), plan_settings(asked)
 
     def worded(table: Mapping[str, Any], name: str) -> str:
@@ -483,7 +483,7 @@ def changed_settings(there: Plan, asked: Plan) -> list[str]:
 
 
 def plan_settings(plan: Plan) -> dict[str, Any]:
-    """Return a plan's settings by dotted names, with derived values and its worlds' digests."""
+    """Return a plan's settings by dotted name, with derived values and digests of its worlds."""
     table = {".".join(key): value for key, value in leaves(_as_table(plan)) if key != ("planned",)}
     worlds = {}
     for name, world in plan.worlds.items():
@@ -496,7 +496,7 @@ def plan_settings(plan: Plan) -> dict[str, Any]:
 
 
 def _as_table(plan: Plan) -> dict[str, Any]:
-    """Return a plan as nested tables and lists; settings varied by the grid keep their defaults."""
+    """Return a plan as nested tables for TOML; varied settings keep their defaults."""
     layer = from_flags(plan.config.model_dump(mode="json"))
     kept = {key: layer[key] for key in layer if ".".join(key) not in plan.grid}
     own = {name: dict(settings) for name, settings in plan.own.items()}
@@ -522,7 +522,7 @@ def _as_table(plan: Plan) -> dict[str, Any]:
 
 
 def _plan_file(path: Path, table: Mapping[str, Any], iterations: int | None) -> _PlanFile:
-    """Validate the keys of a plan file."""
+    """Validate the top-level keys of a plan file; raise InputError with all faults."""
     given = {"name": text_of(path.stem), **table}
     if iterations is not None:
         if isinstance(given.get("iterations"), int):
@@ -541,7 +541,7 @@ def _plan_file(path: Path, table: Mapping[str, Any], iterations: int | None) -> 
 
 
 def _problem(path: Path, error: Any) -> str:
-    """Format a validation error of a plan: the key, the value found and the value expected."""
+    """Format a validation error of a plan file: the key, the value found, the value expected."""
     name = ".".join(map(str, error["loc"]))
     if error["type"] == "missing":
         example = {"format": FORMAT, "iterations": 20}.get(name)
@@ -557,7 +557,7 @@ def _problem(path: Path, error: Any) -> str:
 def _settings(
     path: Path, table: str, settings: Mapping[str, Any]
 ) -> Iterator[tuple[Key, str, Any]]:
-    """Yield key, dotted name and value of each setting in a table."""
+    """Yield key, dotted name and value of each setting in a table; raise for unknown names."""
     keys_by_name = {".".join(key): key for key in known_settings()}
     for key, value in leaves(settings, (CALLERS,)):
         name = ".".join(key)
@@ -569,7 +569,7 @@ def _settings(
 
 
 def _values(path: Path, name: str, key: Key, values: Any, layer: Layer) -> tuple[Any, ...]:
-    """Validate and return the values of a setting in the grid."""
+    """Validate and return the values that a plan's grid lists for a setting."""
     where = f"{path}: grid.{name}"
     if key == ("seed",):
         raise InputError(f"{where}: every iteration is another world already; raise iterations")
@@ -590,7 +590,7 @@ def _values(path: Path, name: str, key: Key, values: Any, layer: Layer) -> tuple
 
 
 def _check_distinct(where: str, values: Sequence[Any]) -> None:
-    """Raise if a value occurs twice."""
+    """Raise if a list contains the same value twice."""
     seen = set()
     for value in values:
         before = len(seen)
@@ -600,7 +600,7 @@ def _check_distinct(where: str, values: Sequence[Any]) -> None:
 
 
 def _meant(name: str, names: Iterable[str]) -> str:
-    """Suggest the name that was probably meant, or list up to nine names."""
+    """Return a hint for an unknown name: the most similar name, else the allowed names."""
     names = list(names)
     near = meant(name, names)
     listed = ", ".join(names) if len(names) < 10 else "those of `pipistrelle config show`"

@@ -96,7 +96,7 @@ Two runs of one plan differ in wall_s and cpu_s alone.
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class StoredStudy:
-    """The plan of a study, and lazy tables of its finished worlds."""
+    """A study opened from its folder: its plan, and lazy tables of its finished worlds."""
 
     plan: Plan
     trials: "pl.LazyFrame"
@@ -105,7 +105,7 @@ class StoredStudy:
 
 
 def open_store(folder: Path, plan: Plan) -> None:
-    """Create a study's folder, or accept a folder of the same plan, also with fewer iterations."""
+    """Create a study's folder, or accept an existing folder of the same plan."""
     kept = folder / "plan.toml"
     try:
         folder.mkdir(parents=True, exist_ok=True)
@@ -140,7 +140,7 @@ def open_store(folder: Path, plan: Plan) -> None:
 
 
 def _keep_plan(folder: Path, there: Plan | None, plan: Plan) -> None:
-    """Write a plan and its worlds, with the larger of the old and new numbers of worlds."""
+    """Write a plan and its worlds' files, with the larger of old and new numbers of worlds."""
     kept = folder / "plan.toml"
     if there is not None:
         if not _is_ours(kept, there):
@@ -166,7 +166,7 @@ def _keep_plan(folder: Path, there: Plan | None, plan: Plan) -> None:
 
 
 def _refuse_strange(folder: Path, there: Plan | None, strange: Sequence[str]) -> None:
-    """Raise if a folder has content but no plan written by Pipistrelle."""
+    """Raise if a folder is not empty and no study's folder, so that nothing is overwritten."""
     if there is None and strange:
         raise InputError(
             f"{folder}: holds {min(strange)} and no plan.toml, so it is no study's folder; "
@@ -180,12 +180,12 @@ def _refuse_strange(folder: Path, there: Plan | None, strange: Sequence[str]) ->
 
 
 def _is_ours(kept: Path, plan: Plan) -> bool:
-    """Return whether a plan file is exactly as Pipistrelle writes it."""
+    """Return whether a plan file has exactly the text that Pipistrelle writes for the plan."""
     return read_file(kept) == plan_text(plan).encode()
 
 
 def load_study(folder: Path) -> StoredStudy:
-    """Open the plan and the tables of a study's finished worlds."""
+    """Open a study's folder: its plan, and the tables of its finished worlds."""
     import polars as pl
 
     if not (folder / "plan.toml").is_file():
@@ -217,7 +217,7 @@ KILLED = "its process ended without a word, twice: killed, or out of memory\n"
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class StudyProgress:
-    """Numbers of requested and finished worlds and trials of a study; trials by strategy."""
+    """Progress of a study: finished worlds, and ended and failed trials by strategy."""
 
     worlds: int
     done: int
@@ -240,7 +240,7 @@ def run_study(
     retry_failed: bool = False,
     progress: Callable[[StudyProgress], None] | None = None,
 ) -> StudyProgress:
-    """Run the unfinished worlds of a plan.
+    """Run the unfinished worlds of a plan and store their results in a folder.
 
     All workers must have access to the same folder. With several workers processes are spawned, so
     a calling script needs the guard ``if __name__ == "__main__"``. A shard (i, n) is every n-th
@@ -289,7 +289,7 @@ def run_study(
 
 
 def warnings_of_plan(plan: Plan) -> tuple[str, ...]:
-    """Return the warnings about the receivers of a plan (`warnings_of`), without repetition."""
+    """Return the warnings about all receivers in a plan (`warnings_of`), without repetition."""
     warnings = (line for cases in heard_together(plan) for line in warnings_of(cases[0].config))
     return tuple(dict.fromkeys(warnings))
 
@@ -315,7 +315,7 @@ def check_cases(plan: Plan, workers: int) -> None:
 
 @contextmanager
 def _named(case: PlannedCase) -> Iterator[None]:
-    """Add the grid's values to the message of an InputError."""
+    """Add a case's varied values to the message of an InputError raised in this context."""
     try:
         yield
     except InputError as error:
@@ -326,7 +326,7 @@ def _named(case: PlannedCase) -> Iterator[None]:
 
 
 def _nothing_done(plan: Plan, worlds: int) -> StudyProgress:
-    """Return the state of a study before its first world."""
+    """Return the progress of a study before its first world."""
     cases = Counter[str](case.strategy for case in cases_of(plan))
     return StudyProgress(
         worlds=worlds,
@@ -339,7 +339,7 @@ def _nothing_done(plan: Plan, worlds: int) -> StudyProgress:
 
 
 def _advanced(so_far: StudyProgress, trials: Sequence[Outcome]) -> StudyProgress:
-    """Return the state of a study after another finished world."""
+    """Return the progress of a study after the trials of another finished world."""
     errors = [error for _, error in trials if error is not None]
     ended = Counter(strategy for strategy, _ in trials)
     failed = Counter(strategy for strategy, error in trials if error is not None)
@@ -354,7 +354,7 @@ def _advanced(so_far: StudyProgress, trials: Sequence[Outcome]) -> StudyProgress
 
 
 def _work(folder: Path, plan: Plan, here: Path, iteration: int) -> list[Outcome]:
-    """Compute a world and write its results, in any worker."""
+    """Compute a world in a worker, write its results, and return the outcomes of its trials."""
     keep_freed_memory()
     if not CATALOGUE.keys() >= set(plan.filters):
         look_in(here)
@@ -362,13 +362,13 @@ def _work(folder: Path, plan: Plan, here: Path, iteration: int) -> list[Outcome]
 
 
 def _give_up(folder: Path, plan: Plan, iteration: int) -> list[Outcome]:
-    """Record all trials of a world as failed, as its process died."""
+    """Record all trials of a world as failed because its process died."""
     return _kept(folder, plan, iteration, failed_records(plan, KILLED))
 
 
 def _kept(
     folder: Path, plan: Plan, iteration: int, records: Sequence[TrialRecord]
 ) -> list[Outcome]:
-    """Write a world's results, and return the outcome of each trial."""
+    """Write a world's results, and return strategy and error of each trial."""
     write_world(folder, plan, iteration, records)
     return [(record.case.strategy, record.row.get("error")) for record in records]

@@ -70,7 +70,7 @@ STEPS = ("position_error_m", "heading_error_rad", "nees", "nees_expected", "nees
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class TrialRecord:
-    """Results of a trial that a study stores: its row, its frames and its landmarks."""
+    """Results of a trial as a study stores them: scores, errors at each frame, landmarks."""
 
     case: PlannedCase
     row: Mapping[str, Any]
@@ -86,7 +86,7 @@ class TrialRecord:
 
 
 def run_world(plan: Plan, iteration: int) -> tuple[TrialRecord, ...]:
-    """Draw a world, simulate its sound once for all beamwidths, and try every case of a plan.
+    """Draw a world, simulate its sound once for all beamwidths, and run every case of a plan.
 
     A trial that raises an exception becomes a failed record, as do all trials of a world that does.
     """
@@ -99,7 +99,7 @@ def run_world(plan: Plan, iteration: int) -> tuple[TrialRecord, ...]:
 
 
 def heard_together(plan: Plan) -> tuple[tuple[PlannedCase, ...], ...]:
-    """Group the cases of a plan that share the drawing and the simulated sound of a world."""
+    """Group the cases of a plan that can use the same drawn world and simulated sound."""
     together: dict[str, list[PlannedCase]] = {}
     for case in cases_of(plan):
         together.setdefault(heard_settings(case.config), []).append(case)
@@ -107,14 +107,14 @@ def heard_together(plan: Plan) -> tuple[tuple[PlannedCase, ...], ...]:
 
 
 def failed_records(plan: Plan, error: str) -> tuple[TrialRecord, ...]:
-    """Return a failed record for every case of a world that could not be computed."""
+    """Return a failed record for every case of a plan in a world that could not be computed."""
     return tuple(TrialRecord(case=case, row={"error": error}) for case in cases_of(plan))
 
 
 def world_tables(
     plan: Plan, iteration: int, records: Sequence[TrialRecord]
 ) -> "dict[str, pl.DataFrame]":
-    """Return a world's tables, by the names of `world_schemas`."""
+    """Return the tables of a world (trials, steps and landmarks), by name."""
     import polars as pl
 
     schemas = world_schemas(plan)
@@ -145,7 +145,7 @@ def world_tables(
 
 
 def world_schemas(plan: Plan) -> "dict[str, dict[str, Any]]":
-    """Return the columns of each table and their Polars types."""
+    """Return the Polars type of each column of a study's tables, by table and column."""
     import polars as pl
 
     world = {"iteration": pl.Int32, "case": pl.Int16}
@@ -186,7 +186,7 @@ def world_schemas(plan: Plan) -> "dict[str, dict[str, Any]]":
 
 
 def heard_settings(config: Config) -> str:
-    """Return as JSON all settings that affect a world and its simulated sound."""
+    """Return as JSON all settings that affect a world and its sound, except the beam's radius."""
     settings = config.model_dump(mode="json", exclude={*SECTIONS, "bag"})
     section, radius = RADIUS_KEY
     del settings[section][radius]
@@ -195,7 +195,7 @@ def heard_settings(config: Config) -> str:
 
 
 def _run_cases(cases: Sequence[PlannedCase], iteration: int, world: World) -> list[TrialRecord]:
-    """Draw and simulate a world for the cases that share it, and try each case."""
+    """Draw and simulate a world once for several cases, and run each case."""
     config = cases[0].config
     radii = sorted({case.config.emitter.radius for case in cases})
     try:
@@ -210,7 +210,7 @@ def _run_cases(cases: Sequence[PlannedCase], iteration: int, world: World) -> li
 
 
 def _try_case(case: PlannedCase, shared: HeardWorld, iteration: int) -> TrialRecord:
-    """Run a trial; an error becomes a failed record."""
+    """Run a case in a simulated world; an exception becomes a failed record."""
     config, strategy, scenario = case.config, case.strategy, shared.scenario
     try:
         drive, scans = drive_of(scenario, config, iteration), shared.scans(config, strategy)
@@ -244,7 +244,7 @@ def _try_case(case: PlannedCase, shared: HeardWorld, iteration: int) -> TrialRec
 
 
 def _consistent(case: PlannedCase, shared: HeardWorld) -> Float[np.ndarray, "k 2"]:
-    """Return mean and variance of a consistent filter's NEES at each frame."""
+    """Return mean and variance of the NEES that a consistent filter has at each frame."""
     config, settings = case.config, case.config.filter
     frames = slice(None, None, config.scenario.steps_per_frame)
     path = shared.scenario.path[frames]
@@ -258,7 +258,7 @@ def _consistent(case: PlannedCase, shared: HeardWorld) -> Float[np.ndarray, "k 2
 
 @np.errstate(over="ignore", invalid="ignore")
 def _frame_errors(track: Track, scenario: Scenario, config: Config) -> Float[np.ndarray, "k 3"]:
-    """Return position error [m], heading error [rad] and NEES at each frame."""
+    """Return a track's position error [m], heading error [rad] and NEES at each frame."""
     every = config.scenario.steps_per_frame
     frames = slice(every, None, every)
     epsilon = track_nees(track.pose, scenario.path)[frames]
@@ -268,7 +268,7 @@ def _frame_errors(track: Track, scenario: Scenario, config: Config) -> Float[np.
 
 
 def _row(iteration: int, record: TrialRecord) -> dict[str, Any]:
-    """Return a trial's row of the table of trials; missing columns are null."""
+    """Return a trial's row for the table of trials, as values by column."""
     case = record.case
     return {
         "iteration": iteration,
@@ -285,7 +285,7 @@ def _row(iteration: int, record: TrialRecord) -> dict[str, Any]:
 
 
 def _cell(value: Any) -> Any:
-    """Convert a grid's value to a table cell: a number, or text."""
+    """Convert a varied value to a table cell: a number, or text."""
     return value if value is None or isinstance(value, (int, float, str)) else json.dumps(value)
 
 
@@ -304,12 +304,12 @@ Outcome = tuple[str, str | None]
 
 
 def world_file(folder: Path, table: str, iteration: int) -> Path:
-    """Return the path of a table of a world, such as ``trials/iteration_00007.parquet``."""
+    """Return the path of a world's table, such as ``trials/iteration_00007.parquet``."""
     return folder / table / f"iteration_{iteration:05d}.parquet"
 
 
 def done_worlds(folder: Path) -> set[int]:
-    """Return the numbers of the finished worlds."""
+    """Return the numbers of the finished worlds in a study's folder."""
     names = (
         path.stem.partition("_")[2] for path in (folder / "trials").glob("iteration_*.parquet")
     )
@@ -353,7 +353,7 @@ def _write_held(folder: Path, iteration: int, files: dict[str, bytes]) -> None:
 
 
 def refuse_strange(folder: Path, plan: Plan, iterations: Iterable[int]) -> None:
-    """Raise if tables of unfinished worlds would replace files that no study wrote."""
+    """Raise if results of unfinished worlds would replace files that are no study's tables."""
     schemas = world_schemas(plan)
     for iteration, name in product(iterations, TABLES[:-1]):
         path = world_file(folder, name, iteration)
@@ -365,7 +365,7 @@ def refuse_strange(folder: Path, plan: Plan, iterations: Iterable[int]) -> None:
 
 
 def _is_table(path: Path, schema: "Mapping[str, pl.DataType]") -> bool:
-    """Return whether a file is a complete table with these columns, and not a link."""
+    """Return whether a file is a readable table with these columns, and not a link."""
     import polars as pl
 
     with contextlib.suppress(OSError, pl.exceptions.PolarsError):
@@ -376,7 +376,7 @@ def _is_table(path: Path, schema: "Mapping[str, pl.DataType]") -> bool:
 
 
 def with_sums(tables: "Mapping[str, pl.DataFrame]", plan: Plan, iteration: int) -> dict[str, bytes]:
-    """Return a world's tables as Parquet files; the trials' metadata has the SHA-256 of all."""
+    """Return a world's tables as Parquet files; metadata of ``trials`` has the SHA-256 of each."""
     files = {name: _parquet(tables[name]) for name in TABLES[:-1]}
     metadata = {_SUM.format(name): sha256(file).hexdigest() for name, file in files.items()}
     metadata |= {_SUM.format("trials"): _NO_SUM, _WORLD: str(iteration), _PLAN: _plan_sum(plan)}
@@ -386,14 +386,14 @@ def with_sums(tables: "Mapping[str, pl.DataFrame]", plan: Plan, iteration: int) 
 
 
 def _parquet(table: "pl.DataFrame", metadata: dict[str, str] | None = None) -> bytes:
-    """Return a table as a Parquet file with this metadata."""
+    """Return a table as the bytes of a Parquet file with this metadata."""
     buffer = io.BytesIO()
     table.write_parquet(buffer, metadata=metadata)
     return buffer.getvalue()
 
 
 def _make_way(folder: Path, iteration: int, files: dict[str, bytes]) -> None:
-    """Delete a world's trials if its other tables will change; the world is then unfinished."""
+    """Delete a world's file of trials if its other tables will change, so it is unfinished."""
     trials = world_file(folder, "trials", iteration)
     for name in TABLES[:-1]:
         with contextlib.suppress(FileNotFoundError):
@@ -402,7 +402,7 @@ def _make_way(folder: Path, iteration: int, files: dict[str, bytes]) -> None:
 
 
 def sweep(folder: Path, iterations: Iterable[int]) -> None:
-    """Delete the temporary files that killed processes left of finished worlds."""
+    """Delete the temporary files of finished worlds that killed processes left behind."""
     names = {world_file(folder, "", iteration).name for iteration in iterations}
     for path in chain.from_iterable((folder / name).glob("*.partial") for name in TABLES):
         if whole_name(path.name) in names:
@@ -411,7 +411,7 @@ def sweep(folder: Path, iterations: Iterable[int]) -> None:
 
 
 def _plan_sum(plan: Plan) -> str:
-    """Return the SHA-256 of all settings that affect a plan's worlds; defaults are omitted."""
+    """Return the SHA-256 of a plan's settings that affect its worlds, without default values."""
     config = plan.config.model_dump(mode="json", exclude_defaults=True)
     medium = config.pop(plan.config.scenario.medium, {})
     medium["speed_of_sound"] = plan.config.medium.sound_speed  # also if it is derived
@@ -423,7 +423,7 @@ def _plan_sum(plan: Plan) -> str:
 
 
 def read_outcomes(folder: Path, plan: Plan, iteration: int) -> list[Outcome]:
-    """Return the outcomes of a finished world's trials; raise if its files were changed."""
+    """Return strategy and error of a finished world's trials; raise if its files were changed."""
     import polars as pl
 
     file = check_world(folder, plan, iteration)
@@ -435,7 +435,7 @@ def read_outcomes(folder: Path, plan: Plan, iteration: int) -> list[Outcome]:
 
 
 def check_world(folder: Path, plan: Plan, iteration: int) -> bytes:
-    """Check the files of a finished world, and return the file of trials.
+    """Compare the files of a finished world with their SHA-256; return the file of trials.
 
     Raises InputError for a file that is missing, damaged or from another plan.
     """
@@ -455,7 +455,7 @@ def check_world(folder: Path, plan: Plan, iteration: int) -> bytes:
 
 
 def damaged(folder: Path, table: str, iteration: int, flaw: str) -> InputError:
-    """Return the error for a damaged file, with the commands that compute its world again."""
+    """Return the InputError for a damaged file of a world, with the way to compute it again."""
     return InputError(
         f"{world_file(folder, table, iteration)}: {flaw}; remove "
         f"{world_file(Path(), 'trials', iteration)} from {folder} and run the study again: its "
@@ -464,7 +464,7 @@ def damaged(folder: Path, table: str, iteration: int, flaw: str) -> InputError:
 
 
 def _flaw(name: str, found: dict[str, bytes], plan: Plan, iteration: int) -> str | None:
-    """Compare a file with the metadata of the trials' file; return its fault, or None."""
+    """Return the fault of a world's file according to its stored SHA-256; None if intact."""
     import polars as pl
 
     try:
@@ -484,7 +484,7 @@ def _flaw(name: str, found: dict[str, bytes], plan: Plan, iteration: int) -> str
 
 
 def scan_tables(folder: Path, table: str, worlds: Sequence[int]) -> "pl.LazyFrame":
-    """Open a table of several worlds as a lazy frame."""
+    """Open a study's table as a lazy Polars frame over the files of several worlds."""
     import polars as pl
 
     paths = [world_file(folder, table, world).absolute() for world in worlds]
