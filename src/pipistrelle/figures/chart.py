@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Mark:
-    """The style of a series."""
+    """Drawing style of a data series: line, symbol, band or error bars."""
 
     joined: bool = False
     """Whether a line joins the points."""
@@ -49,7 +49,7 @@ class Mark:
 
 
 def _star(outer: float, inner: float) -> tuple[tuple[float, float], ...]:
-    """Return the corners of a star with five points, the first upwards."""
+    """Return the corner points of a five-pointed star, the first at the top."""
     turn = np.pi * (np.arange(10) / 5.0 - 0.5)
     reach = np.where(np.arange(10) % 2, inner, outer)
     return tuple(zip((reach * np.cos(turn)).tolist(), (reach * np.sin(turn)).tolist(), strict=True))
@@ -79,7 +79,7 @@ PLAIN = {"text.parse_math": False}
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Series:
-    """Points of the same name and style."""
+    """A data series of a chart: points with optional intervals, a name and a style."""
 
     name: str
     role: str
@@ -105,7 +105,7 @@ class Series:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Axis:
-    """An axis of a panel."""
+    """An axis of a chart's panel: label, limits, scale and ticks."""
 
     label: str
     limits: tuple[float, float]
@@ -121,7 +121,7 @@ class Axis:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Panel:
-    """Series over two axes."""
+    """A panel of a chart: two axes and the data series to draw on them."""
 
     title: str
     role: str = "ink"
@@ -141,7 +141,7 @@ class Panel:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Chart:
-    """A figure as data."""
+    """A figure as plain data (title, caption and panels), before it is drawn."""
 
     name: str
     """Name of its files."""
@@ -152,7 +152,7 @@ class Chart:
 
 
 def ticks(low: float, high: float, log: bool = False) -> tuple[tuple[float, str], ...]:
-    """Return about five round numbers along an axis, with their texts.
+    """Return about five round numbers between two limits as ticks, each with its text.
 
     `low` is below `high`, and above 0 on a logarithmic axis. `log`: powers of ten, with 3 in
     between if they are fewer than three; linear ticks if fewer than two remain.
@@ -199,7 +199,7 @@ def log_axis(label: str, values: Iterable[float]) -> Axis:
 
 
 def ends(found: Iterable[Series]) -> list[float]:
-    """Return all y values of some series, with the ends of their bands."""
+    """Return all y values of several data series, including the ends of their intervals."""
     return [
         float(value)
         for series in found
@@ -210,7 +210,7 @@ def ends(found: Iterable[Series]) -> list[float]:
 
 
 def columns_of(count: int) -> int:
-    """Return the number of columns for a number of panels.
+    """Return how many columns a figure has for a number of panels.
 
     Up to `style.MAX_COLUMNS` panels are in a single row; more have that many columns if they fill
     their rows, otherwise two.
@@ -221,19 +221,19 @@ def columns_of(count: int) -> int:
 
 
 def legend_series(panels: Iterable[Panel]) -> dict[str, Series]:
-    """Return the series of a legend by name; empty for more than `MOST_NAMES` names."""
+    """Return the data series that a legend lists, by name; none for more than `MOST_NAMES`."""
     named = {s.name: s for panel in panels for s in panel.series if s.listed and explained(s)}
     return named if len(named) <= MOST_NAMES else {}
 
 
 def explained(series: Series) -> bool:
-    """Return whether a series is in the legend: neither pinned nor written."""
+    """Return whether the legend lists a data series: no text, no marks of single worlds."""
     mark = MARKS[series.style]
     return not (mark.pinned or mark.written)
 
 
 def csv_rows(chart: Chart, **constant: str) -> list[list[str]]:
-    """Return the numbers of a chart with nine digits, a row per point.
+    """Return the numbers of a chart as CSV rows with nine digits, a row per point.
 
     `constant`: first columns with the same value in all rows.
     """
@@ -254,21 +254,21 @@ def csv_rows(chart: Chart, **constant: str) -> list[list[str]]:
 
 
 def _place(axis: Axis, value: float) -> str:
-    """Return the nearest name on an axis of words, otherwise the number."""
+    """Format a position on an axis: the nearest name if the axis has words, else the number."""
     if axis.words:
         return min(axis.named, key=lambda name: abs(name[0] - value))[1]
     return "" if math.isnan(value) else f"{value:.9g}"
 
 
 def csv_text(rows: Sequence[Sequence[str]]) -> str:
-    """Return rows as CSV, with quotes around fields that need them."""
+    """Format rows as CSV text, with quotes around fields that need them."""
     text = io.StringIO()
     csv.writer(text, lineterminator="\n").writerows(rows)
     return text.getvalue()
 
 
 def draw_chart(chart: Chart) -> "Figure":
-    """Draw a chart; raise ValueError without panels."""
+    """Draw a chart with matplotlib; raise ValueError without panels."""
     import matplotlib
 
     count = len(chart.panels)
@@ -297,12 +297,12 @@ def draw_chart(chart: Chart) -> "Figure":
 
 
 def _colour(role: str) -> str:
-    """Return the colour of a role."""
+    """Return the colour of a role, such as a strategy, "ink", "truth" or "grid"."""
     return {"ink": INK, "truth": TRUTH, "grid": "#d8d8d8"}.get(role) or strategy_colour(role)
 
 
 def _draw_panel(axes: "Axes", panel: Panel) -> None:
-    """Draw a panel: band and thin lines, then the series."""
+    """Draw a panel of a chart on axes: background band and lines, then its data series."""
     from matplotlib.ticker import NullLocator
 
     if panel.title:
@@ -332,7 +332,7 @@ def _draw_panel(axes: "Axes", panel: Panel) -> None:
 
 
 def _draw_series(axes: "Axes", series: Series, top: float, order: float) -> None:
-    """Draw a series in the style of its mark."""
+    """Draw a data series on axes, in the style that it names in `MARKS`."""
     mark = MARKS[series.style]
     colour, alpha = _colour(series.role), series.strength
     given: dict[str, Any] = {"color": colour, "alpha": alpha, "zorder": order}
@@ -366,7 +366,7 @@ def _draw_series(axes: "Axes", series: Series, top: float, order: float) -> None
 
 
 def _handle(name: str, series: Series) -> Any:
-    """Return the legend entry of a series."""
+    """Return the matplotlib legend entry of a data series."""
     from matplotlib.lines import Line2D
 
     mark, colour = MARKS[series.style], _colour(series.role)

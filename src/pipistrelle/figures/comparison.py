@@ -34,7 +34,7 @@ folder's name."""
 
 
 def draw_comparison(compared: ComparedMissions | ComparedStudies) -> "Figure":
-    """Draw a comparison of missions or studies.
+    """Draw a comparison of missions (maps and errors) or of studies (score differences).
 
     Missions have a row for each estimate: paths and landmarks as recorded, the same after a rigid
     motion onto the truth, and the distance from it over time. Studies have a panel for each score
@@ -52,7 +52,7 @@ def draw_comparison(compared: ComparedMissions | ComparedStudies) -> "Figure":
 
 
 def _draw_missions(compared: ComparedMissions) -> "Figure":
-    """Draw a row of maps and errors for each estimate."""
+    """Draw for each compared estimate a row with maps, before and after alignment, and errors."""
     from matplotlib.figure import Figure
 
     rows = len(compared.estimates)
@@ -88,7 +88,7 @@ def _draw_missions(compared: ComparedMissions) -> "Figure":
 def _limits(
     compared: ComparedMissions, estimate: ComparedEstimate
 ) -> tuple[tuple[float, float], tuple[float, float]]:
-    """Return axis limits around the truths (or all paths) and the points near them."""
+    """Return a map's x and y limits around the true paths (or all paths) and points near them."""
     truths = [truth.pose[:, :2] for truth in compared.truths if truth is not None]
     paths = [points for view in estimate.views for points in (view.raw, view.aligned)]
     marks = [points for view in estimate.views for points in (view.placed, view.placed_aligned)]
@@ -107,7 +107,7 @@ def _limits(
 def _draw_paths(
     axes: "Axes", compared: ComparedMissions, estimate: ComparedEstimate, *, fitted: bool
 ) -> None:
-    """Draw the true path as a broad line, and each estimated path with its landmarks."""
+    """Draw on a map the true paths, broad, and each folder's estimated path and landmarks."""
     axes.grid(True)
     axes.set_axisbelow(True)
     truths = {i: truth for i, truth in enumerate(compared.truths) if truth is not None}
@@ -124,7 +124,7 @@ def _draw_paths(
 def _draw_errors(
     figure: "Figure", places: Sequence[Any], estimate: ComparedEstimate, *, known: bool
 ) -> None:
-    """Draw the distances over time of the recorded and the aligned paths."""
+    """Draw the position errors of paths over time, as recorded and after alignment."""
     first: Axes | None = None
     for place, name in zip(places, ("as it is", "aligned"), strict=True):
         axes = figure.add_subplot(place, sharex=first)
@@ -145,18 +145,18 @@ def _draw_errors(
 
 
 def _highest(errors: Sequence[Any]) -> float:
-    """Return the upper end of an error axis; errors of diverged paths are cut."""
+    """Return the upper limit of an error axis; it cuts the errors of diverged paths."""
     most = [np.max(e[np.isfinite(e)], initial=0.0) for e in map(np.asarray, errors)]
     return float(1.08 * min(max(most), 20.0 * max(min(most), 0.5))) or 1.0
 
 
 def _look(i: int) -> dict[str, Any]:
-    """Return colour and dashes of a folder."""
+    """Return the line colour and dash pattern of the folder with index `i`."""
     return {"color": RUNS[i % len(RUNS)], "ls": DASHES[i % len(DASHES)]}
 
 
 def _named(letter: str, folder: Path) -> str:
-    """Return the letter of a folder and the end of its name."""
+    """Return a folder's text for the legend: its letter and the end of its path."""
     name = spelt(folder)
     return f"{letter}  {name if len(name) <= LONGEST else f'…{name[1 - LONGEST :]}'}"
 
@@ -164,7 +164,7 @@ def _named(letter: str, folder: Path) -> str:
 def _draw_legend(
     figure: "Figure", entries: Sequence[tuple[str, dict[str, Any]]], most: int
 ) -> None:
-    """Draw a legend of names and looks below the panels, with at most so many columns."""
+    """Draw a legend of names and line styles below the panels, in at most `most` columns."""
     from matplotlib.lines import Line2D
 
     handles = [Line2D([], [], **look) for _, look in entries]
@@ -175,7 +175,7 @@ def _draw_legend(
 
 
 def _draw_studies(compared: ComparedStudies) -> "Figure":
-    """Draw the differences of each score in a panel, a line for each case."""
+    """Draw the differences between studies: a panel for each score, a line for each case."""
     from matplotlib.figure import Figure
     from matplotlib.ticker import MaxNLocator
 
@@ -225,7 +225,7 @@ def _draw_studies(compared: ComparedStudies) -> "Figure":
 
 
 def _draw_difference(axes: "Axes", row: Mapping[str, Any], place: float, colour: str) -> None:
-    """Draw a difference with its finite intervals."""
+    """Draw a difference of a score as a point, with each of its two intervals if it is finite."""
     for low, high, width in (("low", "high", 0.9), ("alone_low", "alone_high", 2.6)):
         if row[low] is not None and row[high] is not None:
             axes.hlines(place, row[low], row[high], color=colour, lw=width, zorder=2)

@@ -47,7 +47,7 @@ def animate_mission(
     beamwidth: float | None = None,
     pictures: int = 125,
 ) -> None:
-    """Write the film of a mission, a panel per strategy and filter, as GIF or MP4.
+    """Write a film of a mission as GIF or MP4, with a panel per strategy and filter.
 
     A panel shows the path so far (true: grey), the vehicle with its beam, the frame's measurements
     (a range: solid to its end; a bearing without range: dashed), the rays (each member at its
@@ -101,7 +101,7 @@ def animate_mission(
 def _play(
     figure: "Figure", panels: Sequence["FilmPanel"], times: Float[np.ndarray, " p"], start: float
 ) -> Iterator[UInt8[np.ndarray, "h w 3"]]:
-    """Yield the pictures: the artists that change, from back to front, on copies of the others."""
+    """Yield the pictures of a film as RGB arrays; only artists that change are drawn again."""
     from matplotlib.artist import Artist
     from matplotlib.backends.backend_agg import FigureCanvasAgg
 
@@ -129,7 +129,7 @@ def _play(
 
 
 class FilmPanel(MapPanel):
-    """A map with the measurements and the changes of each frame."""
+    """A map of an estimate in a film, with the measurements and changes of each frame."""
 
     def __init__(
         self,
@@ -146,7 +146,7 @@ class FilmPanel(MapPanel):
         self.truth, self.rows, self.first_picture = truth, frames[0].landmarks, {}
 
     def symbols(self) -> set[str]:
-        """Return the names of the symbols in any of the frames."""
+        """Return the names of the legend symbols that occur in any frame."""
         ranged = [np.isfinite(heard_from(frame.scan).range) for frame in self.frames]
         drawn = {
             "range and bearing": any(rows.any() for rows in ranged),
@@ -156,7 +156,7 @@ class FilmPanel(MapPanel):
         return super().symbols() | {name for name, is_drawn in drawn.items() if is_drawn}
 
     def draw_on(self, axes: "Axes") -> None:
-        """Add the artists of the map and of the changes, empty until they are shown."""
+        """Add the artists of map and measurements to axes, empty until a frame is shown."""
         from matplotlib.collections import LineCollection, PolyCollection
         from matplotlib.lines import Line2D
 
@@ -173,7 +173,7 @@ class FilmPanel(MapPanel):
         self.movers = self.add(Line2D([], [], ls="", zorder=5.4, **star))
 
     def show_picture(self, picture: int, time: float) -> None:
-        """Show the latest frame at a time, and its changes since the last picture."""
+        """Show the latest frame at a time [s], and the changes since the last picture."""
         now = max(int(np.searchsorted(self.times, time, side="right")) - 1, 0)
         frame, true_path = self.frames[now], None
         if self.truth.path is not None:
@@ -193,7 +193,7 @@ class FilmPanel(MapPanel):
         self._show_changes(frame.landmarks, picture)
 
     def _show_changes(self, rows: Landmarks, picture: int) -> None:
-        """Show members pruned since the last picture, and rings around new landmarks."""
+        """Show hypotheses pruned since the last picture, and rings around new landmarks."""
         full, gone = placed(rows), pruned(self.rows, rows)
         self.pruned.set(verts=ellipses(self.rows.mean[gone], self.rows.covariance[gone], RAY))
         labels = rows.landmark[full].tolist()
@@ -211,7 +211,7 @@ class FilmPanel(MapPanel):
 
 
 def film_writer(path: Path) -> Callable[[Pictures, Path], None]:
-    """Return the writer of a film by the ending of its name, .gif or .mp4.
+    """Return the function that writes a film, chosen by the file's ending .gif or .mp4.
 
     Raises InputError for another ending, or for an MP4 without ffmpeg.
     """
@@ -232,7 +232,7 @@ def film_writer(path: Path) -> Callable[[Pictures, Path], None]:
 
 
 def write_gif(pictures: Pictures, path: Path) -> None:
-    """Write a GIF that repeats after `HOLD` seconds, in a fixed palette against flicker."""
+    """Write pictures as a GIF that repeats after `HOLD` seconds, with a palette without flicker."""
     from PIL import Image
 
     palette = _palette()
@@ -246,7 +246,7 @@ def write_gif(pictures: Pictures, path: Path) -> None:
 
 
 def write_mp4(pictures: Pictures, path: Path) -> None:
-    """Write an MP4 (H.264) through ffmpeg; raise InputError with its message if it fails."""
+    """Write pictures as an MP4 (H.264) by ffmpeg; raise InputError with its message on failure."""
     pictures = iter(pictures)
     first = next(pictures)
     height, width, _ = first.shape
@@ -269,7 +269,7 @@ def write_mp4(pictures: Pictures, path: Path) -> None:
 
 
 def _palette() -> "Image":
-    """Return the palette: the strategies' colours with gradients to white, to ink and between them.
+    """Return a GIF's palette: the strategies' colours, with gradients to white, ink and each other.
 
     Pillow compares colours by their upper six bits: steps towards white are wide enough to keep
     white.

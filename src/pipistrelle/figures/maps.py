@@ -54,7 +54,7 @@ TIED = "placed landmark, 95 %, and its error"
 def ellipses(
     mean: Float[np.ndarray, "h 2"], covariance: Float[np.ndarray, "h 2 2"], probability: float
 ) -> Float[np.ndarray, "h 49 2"]:
-    r"""Return the closed ellipses that contain a share of each Gaussian.
+    r"""Return for each Gaussian the outline of the ellipse that contains a given probability.
 
     .. math:: (x - \mu)^T P^{-1} (x - \mu) = -2 \ln(1 - p)
 
@@ -72,7 +72,7 @@ def ellipses(
 
 
 def beam(pose: Float[np.ndarray, "3"], beamwidth: float, length: float) -> Float[np.ndarray, "n 2"]:
-    """Return the sector of the vehicle's beam [rad], from the vehicle along the arc.
+    """Return the outline of the vehicle's beam: a sector of a circle with its tip at the vehicle.
 
     Half-power beamwidth of Bradley & Abaid, Eq. (1).
     """
@@ -82,7 +82,7 @@ def beam(pose: Float[np.ndarray, "3"], beamwidth: float, length: float) -> Float
 
 
 def vehicle(pose: Float[np.ndarray, "3"], length: float) -> Float[np.ndarray, "4 2"]:
-    """Return the outline of the vehicle, a dart along its heading, the tip first."""
+    """Return the outline of the vehicle's symbol: a dart along its heading, the tip first."""
     shape = length * np.array([[0.58, 0.0], [-0.42, 0.36], [-0.2, 0.0], [-0.42, -0.36]])
     cos, sin = np.cos(pose[2]), np.sin(pose[2])
     return pose[:2] + shape @ np.array([[cos, sin], [-sin, cos]])
@@ -91,7 +91,7 @@ def vehicle(pose: Float[np.ndarray, "3"], length: float) -> Float[np.ndarray, "4
 def excess_path_ellipse(
     vehicle: Float[np.ndarray, "2"], caller: Float[np.ndarray, "2"], excess_path: float
 ) -> Float[np.ndarray, "121 2"]:
-    r"""Return the ellipse of all points with an excess path, around vehicle and caller [m].
+    r"""Return the ellipse of all points with a given excess path; its foci are vehicle and caller.
 
     .. math:: |b - l| + |l - p| = d + e, \qquad d = |b - p|
 
@@ -110,7 +110,7 @@ def excess_path_ellipse(
 def shades(
     colour: str, weight: Float[np.ndarray, " h"], *, least: float = 0.05, most: float = 0.5
 ) -> Float[np.ndarray, "h 4"]:
-    """Return a colour (red, green, blue, opacity) per weight, opaque for large weights."""
+    """Return an RGBA colour for each weight; the larger the weight, the more opaque."""
     from matplotlib.colors import to_rgba
 
     rgba = np.tile(to_rgba(colour), (len(weight), 1))
@@ -125,7 +125,7 @@ def view(
     paths: Sequence[Float[np.ndarray, "_ 3"]],
     maps: Sequence[Landmarks],
 ) -> tuple[tuple[float, float], tuple[float, float]]:
-    """Return the limits [m] of a map of the truth, or of the estimates without it.
+    """Return x and y limits [m] of a map that shows the truth or, without it, the estimates.
 
     Ellipses of landmarks and of rays widen the map by at most a quarter to each side; of rays only
     the ellipses count, not the means. The map is at most twice as wide as high, and at most 1.2
@@ -160,7 +160,7 @@ def view(
 def drawn_excess_paths(
     frame: Snapshot, label: int
 ) -> tuple[list[Float[np.ndarray, "121 2"]], list[Float[np.ndarray, "3 2"]]]:
-    """Return at most two ellipses of a landmark's excess paths, and their sound paths [m].
+    """Return at most two excess-path ellipses of a landmark, and the sound path of each [m].
 
     A sound path leads from the caller by way of the likeliest member to the vehicle.
     """
@@ -176,7 +176,7 @@ def drawn_excess_paths(
 def draw_truth(
     axes: "Axes", true_landmarks: LabelledPoints | None, callers: Sequence[Caller]
 ) -> None:
-    """Draw true landmarks as open circles, fixed callers as stars, moving callers as paths.
+    """Draw true landmarks as open circles, fixed callers as stars and moving callers as paths.
 
     Callers have labels, except a single beacon. `true_landmarks` [m]: callers may be among them.
     `callers`: without the vehicle.
@@ -198,14 +198,14 @@ def draw_truth(
 
 
 def callers_shown(callers: Sequence[Caller]) -> set[str]:
-    """Return the names of the legend's symbols for callers, without the vehicle."""
+    """Return the names of the legend symbols that a map needs for its callers."""
     standing = [caller.name for caller in callers if not moves(caller)]
     star = "beacon" if standing == ["beacon"] else "caller"
     return {"moving caller" if moves(caller) else star for caller in callers}
 
 
 def cells(cases: Sequence[tuple[str, str]]) -> list[tuple[int, int]]:
-    """Return row and column of each panel: a column per strategy, a row per filter.
+    """Return the grid position of each panel: a column per strategy, a row per filter.
 
     A single strategy or filter, or more than `MAX_COLUMNS` strategies, fill row after row.
     """
@@ -216,7 +216,7 @@ def cells(cases: Sequence[tuple[str, str]]) -> list[tuple[int, int]]:
 
 
 def head(axes: "Axes", strategy: str, estimator: str, name: str = "") -> "Annotation":
-    """Write strategy, or `name`, and estimator above a panel; return the empty line below them."""
+    """Write strategy and estimator above a panel; return the empty text line below them."""
     above: dict[str, Any] = {"xy": (0, 1), "xycoords": "axes fraction"}
     above["textcoords"] = "offset points"
     style = {"color": strategy_colour(strategy), "fontsize": 13, "weight": "bold"}
@@ -227,7 +227,7 @@ def head(axes: "Axes", strategy: str, estimator: str, name: str = "") -> "Annota
 
 
 class MapPanel:
-    """An estimate at its frames, and the artists of its map.
+    """A map panel: the snapshots of an estimate at its frames, and the artists that show them.
 
     `case`: strategy and filter. `frames`: not empty. `beamwidth` [rad]: None for no beam; a
     passive strategy has none.
@@ -255,7 +255,7 @@ class MapPanel:
         self.closeup: Closeup | None = None
 
     def symbols(self) -> set[str]:
-        """Return the names of the symbols in any of the frames."""
+        """Return the names of the legend symbols that occur in any frame."""
         full = [placed(frame.landmarks) for frame in self.frames]
         drawn = {
             "placed landmark, 95 %": any(rows.any() for rows in full),
@@ -267,17 +267,17 @@ class MapPanel:
         return {name for name, is_drawn in drawn.items() if is_drawn}
 
     def _stars(self, frame: Snapshot) -> Float[np.ndarray, "c 2"]:
-        """Return the estimated positions of callers to mark."""
+        """Return the estimated positions [m] of callers to mark with stars at a frame."""
         mean = callers_at(frame).mean if self.marked else frame.moving.mean
         return mean[np.isfinite(mean).all(axis=1)]
 
     def add(self, artist: "Artist") -> Any:
-        """Add an artist that `show` changes to the map."""
+        """Add an artist to the map and to the list of artists that `show` changes."""
         self.artists.append(artist)
         return self.axes.add_artist(artist)
 
     def draw_on(self, axes: "Axes") -> None:
-        """Add the artists to a map, empty until they are shown."""
+        """Add this estimate's artists to the axes of a map, empty until a frame is shown."""
         from matplotlib.collections import LineCollection, PolyCollection
         from matplotlib.lines import Line2D
         from matplotlib.patches import Polygon
@@ -310,7 +310,7 @@ class MapPanel:
         true_path: Float[np.ndarray, "t 3"] | None,
         trails: Sequence[Float[np.ndarray, "_ 2"]],
     ) -> None:
-        """Show a frame at the end of a path [m, m, rad], with the tracks of callers so far [m]."""
+        """Show a frame on the map: paths so far, landmarks, and callers' tracks so far [m]."""
         frame = self.frames[now]
         rows, full = frame.landmarks, placed(frame.landmarks)
         self.estimated.set_data(*path[:, :2].T)
@@ -338,9 +338,9 @@ class MapPanel:
 
 
 class Closeup:
-    """The particles on a map, and enlarged in a window that follows the vehicle.
+    """The particles on a map, also enlarged in an inset that follows the vehicle.
 
-    The window shows particles as translucent darts, the estimated pose as an outline, the last part
+    The inset shows particles as translucent darts, the estimated pose as an outline, the last part
     of the estimated path, and the true path and pose in grey. `box`: in shares of the map.
     `reach` [m]: half the window's side.
     """
@@ -387,7 +387,7 @@ class Closeup:
         path: Float[np.ndarray, "k 3"],
         true_path: Float[np.ndarray, "t 3"] | None,
     ) -> None:
-        """Show particles and paths [m, m, rad] around the end of the estimated path."""
+        """Show the particles and the last part of the paths around the estimated pose."""
         cloud, pose = cloud[np.isfinite(cloud).all(axis=1)], path[-1]
         if not np.isfinite(pose).all():
             return
@@ -405,7 +405,7 @@ class Closeup:
 
 
 def add_closeups(panels: Sequence[MapPanel], true_landmarks: LabelledPoints | None) -> None:
-    """Give each panel with particles a window, all of the same scale and in the same corner.
+    """Add to each panel with particles an inset that enlarges them, with common scale and corner.
 
     `panels`: of common limits. The ends of the paths are not covered; landmarks, the true ones [m]
     and the rest of the paths are not covered if possible.
@@ -421,9 +421,9 @@ def add_closeups(panels: Sequence[MapPanel], true_landmarks: LabelledPoints | No
 
 
 def window_reach(clouds: Sequence[Float[np.ndarray, "p 3"]]) -> float:
-    """Return the reach [m] of a window: twice the median reach of the finite clouds.
+    """Return half the side [m] of the insets: twice the median extent of finite particle clouds.
 
-    The reach of a cloud contains 19 of 20 particles.
+    The extent of a cloud contains 19 of 20 particles.
     """
     points = [cloud[:, :2] for cloud in clouds if np.isfinite(cloud).all()]
     extents = [np.quantile(np.abs(p - p.mean(axis=0)).max(axis=1), 0.95) for p in points]
@@ -433,7 +433,7 @@ def window_reach(clouds: Sequence[Float[np.ndarray, "p 3"]]) -> float:
 def free_corner(
     axes: "Axes", *covered: Sequence[Float[np.ndarray, "_ d"]]
 ) -> tuple[float, float, float, float]:
-    """Return the box, in shares of the map, in the corner that hides the fewest points.
+    """Return the box of an inset, as fractions of the map, in the corner that hides fewest points.
 
     Points of the first kind count before the second kind, and so on.
     """
@@ -460,7 +460,7 @@ def draw_maps(
     names: Mapping[str, str] = MappingProxyType({}),
     rows: Mapping[str, float] = MappingProxyType({}),
 ) -> tuple["Figure", list[list["Axes"]]]:
-    """Draw the maps of panels on common scales, with a legend; their estimates are not yet shown.
+    """Create a figure of maps with common scales and a legend; the estimates are shown later.
 
     `names`: headings of strategies. `rows`: label and height [inch] of axes below each map.
     Returns the figure, and the axes below the map of each panel.
@@ -512,7 +512,7 @@ def draw_maps(
 
 
 def _draw_legend(figure: "Figure", drawn: set[str], columns: int) -> None:
-    """Draw the legend of all panels at the bottom of a figure."""
+    """Draw the common legend of all panels at the bottom of a figure."""
     symbols = legend_symbols()
     names = sorted(drawn, key=list(symbols).index)
     width, height = figure.get_size_inches()
@@ -529,7 +529,7 @@ def _draw_legend(figure: "Figure", drawn: set[str], columns: int) -> None:
 
 
 def legend_symbols() -> dict[str, "Artist | tuple[Artist, ...]"]:
-    """Return the symbol, or the superimposed symbols, of each name, in the legend's order."""
+    """Return the legend's symbols by name, in the order of the legend."""
     from matplotlib.lines import Line2D
     from matplotlib.path import Path
 

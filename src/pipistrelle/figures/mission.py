@@ -37,7 +37,7 @@ def draw_mission(
     beamwidth: float | None = None,
     names: Mapping[str, str] = MappingProxyType({}),
 ) -> "Figure":
-    """Draw the final maps of a world side by side, and below each its errors over time.
+    """Draw the final map of each trial and, below it, its errors over time.
 
     A map shows the true and the estimated path, true landmarks (open circles) with a line to their
     estimates (dots in their 95 % ellipses), the unresolved rays (members at their standard
@@ -82,7 +82,7 @@ def draw_mission(
 
 
 class _EndPanel(MapPanel):
-    """The map of a trial at its end, with the errors of landmarks and the lines of rays."""
+    """The map at the end of a trial, with lines from landmarks to their true positions."""
 
     def __init__(self, trial: TrialResult, truth: Truth, beamwidth: float | None) -> None:
         track = trial.track
@@ -114,7 +114,7 @@ class _EndPanel(MapPanel):
         self.truth, self.ties = truth, _ties(trial, truth.landmarks)
 
     def symbols(self) -> set[str]:
-        """Return the names of all symbols."""
+        """Return the names of the legend symbols that the map needs."""
         ends, truth = bool(np.isfinite(self.path[-1]).all()), self.truth
         drawn = {
             "true path": truth.path is not None,
@@ -128,7 +128,7 @@ class _EndPanel(MapPanel):
         return super().symbols() | {name for name, is_drawn in drawn.items() if is_drawn}
 
     def show_end(self) -> None:
-        """Show the estimate, its errors and the lines of its rays."""
+        """Show the final estimate, the landmarks' errors and lines along unresolved bearings."""
         from matplotlib.collections import LineCollection
 
         self.show(0, self.path, self.truth.path, self.tracks)
@@ -139,7 +139,7 @@ class _EndPanel(MapPanel):
 
 
 def _ties(trial: TrialResult, true_landmarks: LabelledPoints | None) -> list[np.ndarray]:
-    """Return a line from each fully initialised landmark to its true position."""
+    """Return a line from each fully initialised landmark's estimate to its true position."""
     if true_landmarks is None or (trial.track.labels and trial.mapped is None):
         return []
     true = dict(zip(true_landmarks[0].tolist(), true_landmarks[1], strict=True))
@@ -154,7 +154,7 @@ def _ties(trial: TrialResult, true_landmarks: LabelledPoints | None) -> list[np.
 
 
 def outcome(trial: TrialResult, truth: Truth) -> str:
-    """Return a line on an estimate: its error, if known, and its number of landmarks."""
+    """Return a line of text on a trial: position RMSE, if known, and number of landmarks."""
     scores = trial.scores
     total = scores.landmarks_total if truth.landmarks is None else len(truth.landmarks[0])
     parts = [f"{scores.landmarks_full} of {total} landmarks placed"]
@@ -166,7 +166,7 @@ def outcome(trial: TrialResult, truth: Truth) -> str:
 
 
 def _draw_errors(rows: Sequence["Axes"], trial: TrialResult, true_path: np.ndarray) -> None:
-    """Draw position error, heading error and NEES over time, with their bounds."""
+    """Draw a trial's position error, heading error and NEES over time, with their bounds."""
     colour, track = strategy_colour(trial.strategy), trial.track
     elapsed, covariance = track.time - track.time[0], track.pose.covariance
     variance = np.stack([covariance[:, 0, 0] + covariance[:, 1, 1], covariance[:, 2, 2]])
@@ -186,7 +186,7 @@ def _draw_errors(rows: Sequence["Axes"], trial: TrialResult, true_path: np.ndarr
 
 
 def _scale_errors(panels: Sequence[Sequence["Axes"]]) -> None:
-    """Give all error rows common scales; bounds far above the errors are cut."""
+    """Give the error axes of all trials common scales; bounds far above the errors are cut."""
     from matplotlib.ticker import LogLocator, MaxNLocator
 
     def highest(row: int) -> float:

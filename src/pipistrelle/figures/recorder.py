@@ -31,7 +31,7 @@ RECENT_FRAMES = 40
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Snapshot:
-    """Measurements and belief of an estimator at a frame."""
+    """An estimator's measurements and belief at a frame, for figures and films."""
 
     scan: Scan
     pose: Float[np.ndarray, "3"]
@@ -50,12 +50,12 @@ class Snapshot:
 
 
 def heard_from(scan: Scan) -> Scan:
-    """Return the measurements of a scan that have a bearing."""
+    """Return the measurements of a scan that contain a bearing."""
     return rows_of(scan, ~np.isnan(scan.bearing))
 
 
 class MissionRecorder:
-    """Keep a snapshot of each frame of estimators while they run, a few kilobytes each.
+    """Recorder of an estimator's state at each frame of a mission, for films and pages.
 
     An instance is called after each update, as the ``watch`` of a trial; ``snapshots`` contains a
     list for each (strategy, filter), in the order of their first frames.
@@ -74,7 +74,7 @@ class MissionRecorder:
         self._asked: dict[tuple[str, str], list[int]] = {}
 
     def __call__(self, strategy: str, estimator: str, scan: Scan, belief: Belief) -> None:
-        """Keep a snapshot."""
+        """Store a snapshot of an estimator after its update with a scan."""
         frames = self.snapshots.setdefault((strategy, estimator), [])
         path, landmarks = None, None
         if self._rest is not None and revises_path(belief):
@@ -99,7 +99,7 @@ class MissionRecorder:
 
 
 def pruned(before: Landmarks, after: Landmarks) -> Bool[np.ndarray, " h"]:
-    """Return a mask of the members without a successor: the nearest of the same landmark."""
+    """Return a mask of the hypotheses in `before` that have no successor in `after`."""
     gone = np.ones(len(before.landmark), dtype=bool)
     if len(gone):
         away = np.linalg.norm(before.mean[:, None] - after.mean, axis=2)
@@ -109,7 +109,7 @@ def pruned(before: Landmarks, after: Landmarks) -> Bool[np.ndarray, " h"]:
 
 
 def callers_at(frame: Snapshot) -> Gaussian:
-    """Return the estimated positions of callers at a frame by number, as `Scan.callers` [m].
+    """Return the estimated position [m] of each caller at a frame, by caller number.
 
     Callers are fully initialised landmarks or tracked; NaN for the vehicle and other callers.
     """
@@ -124,7 +124,7 @@ def callers_at(frame: Snapshot) -> Gaussian:
 
 
 def callers_marked(scans: Sequence[Scan]) -> bool:
-    """Return whether figures mark the estimated positions of callers.
+    """Return whether figures should mark the estimated positions of callers.
 
     They do with several callers, or with excess paths: their ellipses are around callers. A single
     beacon is drawn like any landmark.
@@ -134,7 +134,7 @@ def callers_marked(scans: Sequence[Scan]) -> bool:
 
 
 def excess_paths_at(frame: Snapshot) -> dict[int, list[int]]:
-    """Return at most two rows of a scan with excess paths that define ellipses, by landmark.
+    """Return for each landmark at most two rows of a scan with excess paths to draw as ellipses.
 
     Their landmarks are in the map and their callers have estimated positions. Two of more rows are
     the rows with ellipses that cross at the largest angle.
@@ -156,7 +156,7 @@ def excess_paths_at(frame: Snapshot) -> dict[int, list[int]]:
 def _squarest(
     frame: Snapshot, label: int, callers: Float[np.ndarray, "c 2"], rows: list[int]
 ) -> list[int]:
-    r"""Return two rows with the ellipses that cross at the largest angle.
+    r"""Return the two rows of a scan with excess-path ellipses that cross at the largest angle.
 
     The normal of an ellipse bisects the angle between the lines to its foci:
     :math:`(l - b)/|l - b| + (l - p)/|l - p|`.
@@ -175,13 +175,13 @@ def _squarest(
 
 
 def likeliest(frame: Snapshot, label: int) -> Float[np.ndarray, "2"]:
-    """Return the mean of the heaviest member of a landmark [m]."""
+    """Return the mean [m] of the landmark's hypothesis with the largest weight."""
     here = frame.landmarks.landmark == label
     return frame.landmarks.mean[here][np.argmax(frame.landmarks.weight[here])]
 
 
 def resolved(frames: Sequence[Snapshot]) -> list[int]:
-    """Select for each frame the landmark to draw with excess-path ellipses; or `UNLABELLED`.
+    """Select for each frame the landmark to draw with excess-path ellipses, or `UNLABELLED`.
 
     In this order: a landmark that the frame's excess paths have initialised; the ray with the
     fewest members that they update; the landmark initialised last, at most `RECENT_FRAMES` frames

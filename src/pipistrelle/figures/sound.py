@@ -31,7 +31,7 @@ def draw_array(
     frequency: float,
     speed_of_sound: float,
 ) -> "Figure":
-    """Draw microphones, beams and standard deviations of an array, the vehicle's heading up.
+    """Draw an array's microphones, two beam patterns, and the accuracy of its bearings.
 
     `patterns`: of each group; `frequency` [Hz]; `speed_of_sound` [m/s]. Two beams of the largest
     group are drawn: along its normal or ahead, and the beam with the highest side lobe.
@@ -56,7 +56,7 @@ def draw_array(
 
 
 def _draw_places(axes: "Axes", microphones: Microphones, layout: Scattered) -> None:
-    """Draw the microphones from above [mm]."""
+    """Draw the microphones of an array from above [mm], with channels and face normals."""
     x, y = 1e3 * layout.position.T
     for g, name in enumerate(layout.name):
         members, colour = layout.group == g, _COLOURS[g % len(_COLOURS)]
@@ -78,7 +78,7 @@ def _draw_places(axes: "Axes", microphones: Microphones, layout: Scattered) -> N
 
 
 def _turned(axes: "Axes") -> None:
-    """Turn a polar panel so that ahead is up."""
+    """Turn a polar panel so that the vehicle's heading points up."""
     axes.set_theta_zero_location("N")  # pyrefly: ignore[missing-attribute]
     axes.grid(True)
     axes.tick_params(labelsize=7)
@@ -87,7 +87,7 @@ def _turned(axes: "Axes") -> None:
 def _draw_beams(
     axes: "Axes", layout: Scattered, patterns: tuple[Pattern, ...], wave: dict[str, float]
 ) -> None:
-    """Draw two beam patterns: steered along the normal, and where the side lobe is highest."""
+    """Draw two beam patterns of an array: along its normal, and with the highest side lobe."""
     g = int(np.argmax([pattern.microphones for pattern in patterns]))
     around = np.linspace(-np.pi, np.pi, 3601)
     normal, (worst, _) = layout.normal[g], patterns[g].worst
@@ -107,7 +107,7 @@ def _draw_beams(
 
 
 def _draw_stds(axes: "Axes", layout: Scattered, wave: dict[str, float]) -> None:
-    """Draw the Cramer-Rao bound of a bearing over the bearing, for each group."""
+    """Draw the Cramer-Rao bound of a bearing's standard deviation over the bearing, per group."""
     turn = 2.0 * np.pi * wave["frequency"] / wave["speed_of_sound"]
     for g, normal in enumerate(layout.normal):
         around, members = np.linspace(-np.pi, np.pi, 721), layout.group == g
@@ -125,7 +125,7 @@ def _draw_stds(axes: "Axes", layout: Scattered, wave: dict[str, float]) -> None:
 
 
 def draw_hearing(overview: Overview) -> "Figure":
-    """Draw a row for each emitter: output by call and delay, and bearing by delay.
+    """Draw the detected echoes of a recording: matched-filter output and bearings per emitter.
 
     >>> draw_hearing(Overview(names=("vehicle",))).get_axes()[0].get_title()
     'vehicle: matched filter'
@@ -150,7 +150,7 @@ def draw_hearing(overview: Overview) -> "Figure":
 
 
 def _end(overview: Overview) -> float:
-    """Return the delay that contains 98 % of the echoes, weighted by level, and 10 % more [ms].
+    """Return the end [ms] of the delay axis: past 98 % of the echoes, weighted by level.
 
     Weighting keeps the faint detections of noise, at any delay, from extending the axis.
     """
@@ -165,7 +165,7 @@ def _end(overview: Overview) -> float:
 
 
 def _output(axes: "Axes", overview: Overview, number: int) -> None:
-    """Draw the output of a matched filter as an image, a row per call, and the detections."""
+    """Draw an emitter's matched-filter output as an image, a row per call, and its detections."""
     axes.set(xlabel="delay after the vehicle's call [ms]", ylabel="time of the call [s]")
     if not overview.time:
         return
@@ -195,7 +195,7 @@ def _output(axes: "Axes", overview: Overview, number: int) -> None:
 
 
 def _bearings(axes: "Axes", overview: Overview, number: int) -> None:
-    """Draw bearings over delays, fainter echoes smaller."""
+    """Draw the bearings of an emitter's detections over delay, fainter detections smaller."""
     for found in overview.detections:
         own = found.caller == number
         size = 2.0 + 10.0 * np.log10(np.maximum(found.power[own], 1.0)) / 4.0
@@ -206,5 +206,5 @@ def _bearings(axes: "Axes", overview: Overview, number: int) -> None:
 
 
 def _colour(number: int) -> str:
-    """Return the colour of the vehicle's echoes or of callers' echoes."""
+    """Return the colour of echoes of the vehicle's calls (number 0) or of a caller's calls."""
     return STRATEGY_COLOURS["passive" if number else "active"]

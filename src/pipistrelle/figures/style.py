@@ -64,7 +64,7 @@ STYLE = {
 
 
 def picture(width: float, height: float) -> "Figure":
-    """Return an empty figure of a width and a height [inch] that a notebook displays."""
+    """Return an empty matplotlib figure of a size [inch] that a notebook displays."""
     from matplotlib.figure import Figure
 
     class Picture(Figure):
@@ -77,12 +77,12 @@ def picture(width: float, height: float) -> "Figure":
 
 
 def strategy_colour(strategy: str) -> str:
-    """Return the colour of a strategy, the same in every figure."""
+    """Return the colour of a sensing strategy, the same in every figure."""
     return STRATEGY_COLOURS.get(strategy, INK)
 
 
 def page_colours() -> str:
-    """Return the colours of a page as CSS variables, light unless the reader prefers dark."""
+    """Return the colours of an HTML page as CSS variables, for light and dark schemes."""
     light, dark = (
         " ".join(f"--{name}: {colours[scheme]};" for name, colours in PAGE.items())
         for scheme in (0, 1)
@@ -92,7 +92,7 @@ def page_colours() -> str:
 
 
 def save_figure(figure: "Figure", folder: Path, name: str) -> tuple[Path, Path]:
-    """Write a figure as ``name.png`` and ``name.pdf``, the same bytes for the same figure.
+    """Write a figure as ``name.png`` and ``name.pdf``; equal figures give equal bytes.
 
     `folder`: created if missing.
 

@@ -56,7 +56,7 @@ SCRIPTS = ("numbers.js", "drawing.js", "map.js", "charts.js", "player.js")
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Rows:
-    """Numbers of landmarks or scan rows in all frames, with the first row of each frame."""
+    """Numbers of landmarks or measurements in all frames, with the first row of each frame."""
 
     first: Int[np.ndarray, " n"]
     """Frame i has the rows first[i] to first[i + 1]."""
@@ -67,7 +67,7 @@ class Rows:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Estimate:
-    """Measurements and beliefs of a strategy and filter at all frames."""
+    """Measurements and beliefs of a strategy and filter at all frames, as arrays."""
 
     strategy: str
     filter: str
@@ -103,7 +103,7 @@ class Estimate:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Playback:
-    """Truth, measurements and beliefs of a mission at all frames."""
+    """Truth, measurements and beliefs of a mission at all frames, for an HTML page."""
 
     title: str
     """Title of the mission."""
@@ -134,7 +134,7 @@ class Playback:
 def playback(
     done: Mission, snapshots: Mapping[tuple[str, str], Sequence[Snapshot]], most: int = MAX_FRAMES
 ) -> Playback:
-    """Return a recorded mission as flat arrays.
+    """Convert a recorded mission to the arrays that the HTML page plays.
 
     `snapshots`: of a `MissionRecorder`. `most`: largest number of frames, evenly spaced, with the
     last. Estimates without frames, of filters that failed at once, are omitted; raises InputError
@@ -177,7 +177,7 @@ def playback(
 
 
 def _facts(done: Mission, frames: int, shown: int) -> tuple[str, ...]:
-    """Return facts about a mission."""
+    """Return short facts about a mission as text: duration, frames, beam, landmarks."""
     time = done.trials[0].track.time
     facts = [f"{time[-1] - time[0]:.1f} s", f"{frames} frames"]
     if shown < frames:
@@ -195,7 +195,7 @@ def _facts(done: Mission, frames: int, shown: int) -> tuple[str, ...]:
 def _callers(
     done: Mission, steps: Int[np.ndarray, " n"], origin: Float[np.ndarray, "2"]
 ) -> tuple[tuple[int, str, np.ndarray], ...]:
-    """Return label, name and position, or positions at the frames, of each caller."""
+    """Return label, name and position [m] of each caller; a moving caller's at every frame."""
     if done.log is not None:
         unknown = np.full(2, np.nan)
         return tuple((caller.landmark, caller.name, unknown) for caller in done.log.callers)
@@ -217,7 +217,7 @@ def _estimate(
     truth: Truth,
     origin: Float[np.ndarray, "2"],
 ) -> Estimate:
-    """Return an estimate at each time, by the latest of its frames."""
+    """Convert a trial's snapshots to arrays, with the latest snapshot at each time."""
     at = np.searchsorted([frame.scan.time for frame in frames], time, side="right") - 1
     at = np.maximum(at, 0)
     if len(time) == len(frames):  # scans may share a time
@@ -268,7 +268,7 @@ def _estimate(
 
 
 def _named(labels: Int[np.ndarray, " n"], trial: TrialResult) -> Int[np.ndarray, " n"]:
-    """Return the labels of the corresponding true landmarks, below -1 without any."""
+    """Replace a map's labels by its true landmarks' labels, or by numbers below -1 if false."""
     if trial.mapped is None:
         return labels
     pairs = zip(
@@ -279,7 +279,7 @@ def _named(labels: Int[np.ndarray, " n"], trial: TrialResult) -> Int[np.ndarray,
 
 
 def _rows(trial: TrialResult, frames: Sequence[tuple[np.ndarray, ...]]) -> Rows:
-    """Return the rows of all frames, given the labels and the columns of numbers of each."""
+    """Stack the labels and numbers of all frames, and count the first row of each frame."""
     labels = np.concatenate([np.empty(0, int), *(labels.astype(int) for labels, *_ in frames)])
     numbers = [np.column_stack(columns) for _, *columns in frames]
     return Rows(
@@ -295,7 +295,7 @@ def _revised(
     at: Int[np.ndarray, " n"],
     steps: Int[np.ndarray, " n"],
 ) -> tuple[Int[np.ndarray, " j"], list[Float[np.ndarray, "_ 2"]]]:
-    """Return the frames with a revised path, and the paths from the start to each [m]."""
+    """Return the frames with a revised path, and the revised path up to each of them [m]."""
     found = [
         (int(np.searchsorted(at, i)), frame.path)
         for i, frame in enumerate(frames)
@@ -312,7 +312,7 @@ def _revised(
 
 
 def page(playback: Playback) -> str:
-    """Return the HTML page that plays a mission."""
+    """Return an HTML page that plays a mission, with its scripts and numbers."""
     from jinja2 import Environment, StrictUndefined
 
     here = files("pipistrelle.figures.player")
@@ -336,7 +336,7 @@ def page(playback: Playback) -> str:
 
 
 def _numbers(playback: Playback) -> dict[str, Any]:
-    """Return the input of the page's script."""
+    """Return the numbers of a playback as JSON values for the page's script."""
     return _packed(replace(playback, callers=(), estimates=())) | {
         "callers": [
             {"label": label, "name": upright(name), "moves": place.ndim == 2}
@@ -357,7 +357,7 @@ def _numbers(playback: Playback) -> dict[str, Any]:
 
 @np.errstate(over="ignore", invalid="ignore")
 def _packed(value: Any) -> Any:
-    """Convert a value to JSON: records without None, arrays as little-endian int32 or float32."""
+    """Convert a value for JSON: records to dicts without None, arrays to base64 binary."""
     if is_dataclass(value):
         parts = {to_camel(field.name): getattr(value, field.name) for field in fields(value)}
         return {name: _packed(part) for name, part in parts.items() if part is not None}
