@@ -26,7 +26,7 @@ ASIDE = {"active": 0.985, "fused": 1.015, "passive": 1.0}
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Line:
-    """The line of one filter and strategy in a chart: its cases along the horizontal axis."""
+    """A line in a chart: the cases of a filter and strategy along the horizontal axis."""
 
     way: Way
     name: str
@@ -44,7 +44,7 @@ Facet = tuple[str, list[Line]]
 
 
 def axis_of(variable: Variable) -> Axis:
-    """Return the axis of a variable, with a tick at each value.
+    """Return the chart axis for a variable of a study, with a tick at each value.
 
     Returns: logarithmic for beamwidths and for geometric series.
     """
@@ -71,7 +71,7 @@ def axis_of(variable: Variable) -> Axis:
 
 
 def axis_of_words(words: Sequence[str]) -> Axis:
-    """Return an axis with words as ticks."""
+    """Return a chart axis with words as ticks; long words are slanted or shortened."""
     named = tuple((float(i), word) for i, word in enumerate(words))
     longest = MAX_LETTERS // len(named)
     slanted = longest < SHORTEST and max(map(len, words)) > longest
@@ -87,7 +87,7 @@ def axis_of_words(words: Sequence[str]) -> Axis:
 
 
 def facets_of(study: Study, variable: Variable | None, axis: Axis) -> tuple[list[Facet], bool]:
-    """Split a study's cases into panels over a variable, or over the filters.
+    """Split a study's cases into chart panels with lines over a variable, or over the filters.
 
     Returns: a panel per filter and combination of the other variables with the strategies as
     lines; if these are more than `MOST_PANELS`, a panel per filter and strategy with a line per
@@ -150,7 +150,7 @@ def beside(
     among: Sequence[str] = STRATEGIES,
     far: float = 1.0,
 ) -> Float[np.ndarray, " k"]:
-    """Shift a strategy's points along the axis, so that strategies do not overlap.
+    """Shift a strategy's points along the axis, so that the strategies do not overlap.
 
     `among`: all strategies shown. `far`: multiple of the shift of single worlds.
     """
@@ -163,7 +163,7 @@ def beside(
 
 
 def each_combination(study: Study, variable: Variable) -> str:
-    """Describe the lines of a chart: a combination of all variables except the axis's."""
+    """Describe for a caption the lines of a chart that has a line per combination of variables."""
     others = [other for other in study.variables if other is not variable]
     first = combination_name(study, 0, [variable])
     what = (
@@ -175,14 +175,14 @@ def each_combination(study: Study, variable: Variable) -> str:
 
 
 def slug(name: str) -> str:
-    """Replace characters that are not letters or digits, for the name of a file."""
+    """Replace characters that are not letters or digits by underscores, for a file's name."""
     return re.sub(r"\W+", "_", name)
 
 
 def _thinned(
     named: Sequence[tuple[float, str]], limits: tuple[float, float], *, log: bool
 ) -> tuple[tuple[float, str], ...]:
-    """Remove ticks with overlapping texts; keep the first."""
+    """Remove axis ticks with a text that would overlap the text of the tick before."""
     kept: list[tuple[float, str]] = []
     for value, word in named:
         if kept:
@@ -196,7 +196,7 @@ def _thinned(
 
 
 def _shortened(word: str, most: int) -> str:
-    """Replace the middle of a long word by an ellipsis."""
+    """Replace the middle of a word by an ellipsis if it has more than `most` letters."""
     if len(word) <= most:
         return word
     return f"{word[: most - most // 2 - 1]}…{word[len(word) - most // 2 :]}"

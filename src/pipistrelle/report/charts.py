@@ -81,7 +81,7 @@ DIFFERENCE = "active minus fused; open: not significant"
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Level:
-    """A chart of a score over a variable."""
+    """Description of a chart of a score over a variable: title, axis label, scale, caption."""
 
     name: str
     """Name of the chart and its files."""
@@ -137,12 +137,12 @@ _OWN: dict[str, dict[str, Any]] = {
 
 
 def levels() -> tuple[Level, ...]:
-    """Return the charts of the scores that `evaluation.scores` shows over a variable."""
+    """Return the descriptions of all charts that show a score over a variable."""
     return tuple(_level(name, score) for name, score in shown_in("levels").items())
 
 
 def _level(name: str, score: Score) -> Level:
-    """Return the chart of a score."""
+    """Return the description of the chart that shows a score over a variable."""
     factor, sign = UNITS[score.unit]
     stem = name.removesuffix(f"_{score.unit}")
     drawn: dict[str, Any] = {
@@ -160,7 +160,7 @@ def _level(name: str, score: Score) -> Level:
 
 
 def level_charts(selection: Selection, only: str = "") -> list[Chart]:
-    """Chart scores over each variable, or over the filters without variables.
+    """Chart every score over each variable of a study, or over the filters without variables.
 
     A panel per filter, a colour per strategy; worlds more than σ above the mean are single marks.
     `only`: part of the names of the scores. Bradley & Abaid, Secs. V-C, V-D, V-E and Appendix A.
@@ -176,7 +176,7 @@ def level_charts(selection: Selection, only: str = "") -> list[Chart]:
 
 
 def _chart(selection: Selection, what: Level, variable: Variable | None) -> Chart:
-    """Chart a level over a variable."""
+    """Return the chart of a score over a variable, or over the filters if it is None."""
     study = selection.study
     axis = axis_of(variable) if variable else axis_of_words([*filter_titles(study).values()])
     facets, many = facets_of(study, variable, axis)
@@ -211,7 +211,7 @@ def _chart(selection: Selection, what: Level, variable: Variable | None) -> Char
 
 
 def _caption(study: Study, what: Level, variable: Variable | None, *, many: bool) -> str:
-    """Return the caption of a chart with a line per combination (`many`) or per strategy."""
+    """Return a score chart's caption; `many`: its lines are combinations of the variables."""
     if many and variable:
         mean = "Geometric mean" if what.log else "Mean"
         dashed = f"; dashed: {'the bound' if what.named == 'bound' else what.named}"
@@ -226,7 +226,7 @@ def _caption(study: Study, what: Level, variable: Variable | None, *, many: bool
 def _drawn(
     selection: Selection, what: Level, lines: Sequence[Line], *, apart: bool, many: bool
 ) -> list[Series]:
-    """Return the lines of a panel, single worlds above each, and the dashed bound.
+    """Return the data series of a panel: means, single worlds above σ, and the dashed bound.
 
     `apart`: points side by side in place of lines. `many`: lines of combinations.
     """
@@ -248,14 +248,14 @@ def _drawn(
 def _samples(
     selection: Selection, line: Line, score: str, scale: float
 ) -> list[Float[np.ndarray, " m"]]:
-    """Return a score's values over the worlds at each point of a line, times a factor."""
+    """Return a score's values in all worlds at each point of a line, times `scale`."""
     return [scale * samples(selection, score, [(*line.way, int(i))])[0] for i in line.cells]
 
 
 def _mean_line(
     line: Line, per_place: Sequence[Float[np.ndarray, " m"]], style: str, *, log: bool
 ) -> Series:
-    """Return mean ± σ along the axis; shifted points if the axis has words."""
+    """Return a score's mean ± σ over the worlds at each point of a line, as a data series."""
     with np.errstate(divide="ignore", invalid="ignore"):
         values = [np.log(sample[sample > 0.0]) if log else sample for sample in per_place]
     mean, std = np.array([mean_std(sample) for sample in values]).T
@@ -277,7 +277,7 @@ def _mean_line(
 def _worlds_above(
     line: Line, mean: Series, per_place: Sequence[Float[np.ndarray, " m"]], *, flat: bool
 ) -> Series:
-    """Return the worlds above the band of a line."""
+    """Return the worlds above mean + σ at each point of a line, as a data series of marks."""
     top = np.array([np.nan]) if mean.high is None else mean.high
     above = [sample[sample > end] for sample, end in zip(per_place, top, strict=True)]
     at = line.aside
@@ -294,7 +294,7 @@ def _worlds_above(
 
 
 def _dashed(selection: Selection, line: Line, what: Level, *, apart: bool) -> Series:
-    """Return the dashed line of a level: the mean of its second score over the worlds."""
+    """Return the mean of a second score over the worlds, such as the bound, as a dashed line."""
     beneath = [mean_std(one)[0] for one in _samples(selection, line, what.beside, what.scale)]
     return Series(
         name=f"{line.name}, {what.named}",
@@ -308,7 +308,7 @@ def _dashed(selection: Selection, line: Line, what: Level, *, apart: bool) -> Se
 
 
 def effect_charts(selection: Selection) -> list[Chart]:
-    """Chart the effects of each variable with each filter, a panel per measure.
+    """Chart the effects of each variable with each filter, a panel per score.
 
     Returns: without variables, the effects of strategies and filters.
     """
@@ -346,7 +346,7 @@ def effect_charts(selection: Selection) -> list[Chart]:
 
 
 def gain_charts(selection: Selection) -> list[Chart]:
-    """Chart the RMSE of active minus fused sensing over each variable, paired over worlds."""
+    """Chart the gain of listening (RMSE of active minus fused sensing) over each variable."""
     return [_gain_chart(selection, variable) for variable in selection.study.variables]
 
 
@@ -358,7 +358,7 @@ def about(
     edges: Float[np.ndarray, "n 2"],
     filled: Sequence[bool] | np.ndarray,
 ) -> Series:
-    """Return a series of points with error bars that end at `edges`."""
+    """Return a data series of points with error bars that end at `edges`."""
     return Series(
         name=name,
         role=role,
@@ -374,7 +374,7 @@ def about(
 def _panel(
     measure: changes.Measure, family: Sequence[changes.Effect], axis: Axis, at: Mapping[str, float]
 ) -> Panel:
-    """Return the panel of the effects in a measure, a series per strategy."""
+    """Return the panel of a chart with the effects on a score, a data series per strategy."""
     ways: dict[str, list[changes.Effect]] = {}
     for effect in family:
         if effect.measure == measure:
@@ -400,7 +400,7 @@ def _changes(
     at: Mapping[str, float],
     effects: Sequence[changes.Effect],
 ) -> Series:
-    """Return the differences of a strategy, with 0 at the reference value."""
+    """Return a strategy's changes of a score as points with error bars, 0 at the reference."""
     measure, findings = effects[0].measure, [effect.finding for effect in effects]
     mean, edges = _bars(findings)
     mean, edges = np.append(0.0, mean), np.vstack(([np.nan, np.nan], edges))
@@ -422,7 +422,7 @@ def _bars(findings: Sequence[Finding]) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _gain_chart(selection: Selection, variable: Variable) -> Chart:
-    """Chart the gain of fused over active along a variable."""
+    """Chart the gain of fused over active sensing along a variable."""
     study, axis = selection.study, axis_of(variable)
     panels = []
     for what, score in GAINS:
@@ -454,7 +454,7 @@ def _gain_chart(selection: Selection, variable: Variable) -> Chart:
 
 
 def _gains(selection: Selection, name: str, score: str, variable: Variable) -> list[Series]:
-    """Return a filter's gains along a variable: mean, and a series for each combination."""
+    """Return a filter's gains over a variable as data series: their mean, and each combination."""
     rows, x = along(selection.study, variable), places(variable)
     judged = [finding for _, finding in paper.gains(selection, name, score)]
     each = [_judged(DIFFERENCE, "fused", x, [judged[i] for i in column]) for column in rows.T]
@@ -473,7 +473,7 @@ def _gains(selection: Selection, name: str, score: str, variable: Variable) -> l
 def _judged(
     name: str, role: str, x: Float[np.ndarray, " n"], findings: Sequence[Finding]
 ) -> Series:
-    """Return findings as points with their intervals, full where significant."""
+    """Return findings as points with their intervals as error bars, filled where significant."""
     mean, edges = _bars(findings)
     return about(name, role, x, mean, edges, [one.holds is not None for one in findings])
 
@@ -488,7 +488,7 @@ def anees_charts(selection: Selection) -> list[Chart]:
 
 
 def _anees_chart(selection: Selection, name: str, title: str) -> Chart:
-    """Chart a filter's ANEES over time."""
+    """Return the chart of a filter's ANEES over time, a panel per strategy."""
     study = selection.study
     ways = [(name, strategy) for strategy in STRATEGIES if (name, strategy) in study.trials]
     lines = {way: _anees_lines(selection, way) for way in ways}
@@ -526,7 +526,7 @@ def _anees_chart(selection: Selection, name: str, title: str) -> Chart:
 
 
 def _anees_caption(study: Study, runs: int, *, alike: bool) -> str:
-    """Return the caption of an ANEES chart."""
+    """Return the caption of a chart of ANEES over time."""
     clauses = []
     if [variable.name for variable in study.variables] == [BEAM]:
         clauses.append("The stronger a line, the narrower the beam")
@@ -547,7 +547,7 @@ def _anees_caption(study: Study, runs: int, *, alike: bool) -> str:
 
 
 def _drives_alike(study: Study) -> bool:
-    """Return whether all combinations have the same laps and times."""
+    """Return whether the drives of all combinations of variables have equal laps and times."""
     frames = next(iter(study.trials.values())).nees.shape[2]
     drives = {
         (
@@ -561,7 +561,7 @@ def _drives_alike(study: Study) -> bool:
 
 
 def _ideal(study: Study, way: Way, runs: int) -> Series:
-    """Return the ANEES of a consistent filter over time, and its bounds for `runs` worlds."""
+    """Return the ANEES of a consistent filter over time with its 95 % band, as a data series."""
     expected, variance = study.trials[way].consistent
     low, high = anees_bounds_about(expected, variance, runs)
     return Series(
@@ -576,7 +576,7 @@ def _ideal(study: Study, way: Way, runs: int) -> Series:
 
 
 def _anees_lines(selection: Selection, way: Way) -> list[Series]:
-    """Return ANEES over time, the widest beam first and faintest."""
+    """Return the ANEES over time of each case of a filter and strategy, as data series."""
     study = selection.study
     nees = study.trials[way].nees
     cases = own_cases(study.trials[way]).tolist() if nees.shape[2] else []
@@ -597,7 +597,7 @@ def _anees_lines(selection: Selection, way: Way) -> list[Series]:
 
 
 def table_ii_charts(selection: Selection) -> list[Chart]:
-    """Chart the landmarks of the study and of the paper's Table II."""
+    """Chart the numbers of landmarks in the study and in the paper's Table II."""
     panels = []
     for kind, score in (("fully initialised", "landmarks_full"), ("total", "landmarks_total")):
         found = {title: _counts(selection, name, score) for name, title in paper.FILTERS.items()}
@@ -638,7 +638,7 @@ PAPERS: tuple[Figure, ...] = (
 
 
 def answers(name: str) -> bool:
-    """Return whether the chart of a name shows a score that the answer names."""
+    """Return whether the chart with a name shows a score that the report's answer is about."""
     answering = {level.name for level in levels()} - {"map_rmse_aligned"} | {"gain"}
     return name.partition("_by_")[0] in answering or name.startswith("effect_")
 
@@ -655,7 +655,7 @@ def study_charts(selection: Selection, charts: Sequence[Figure] | None = None) -
 
 
 def _counts(selection: Selection, name: str, score: str) -> tuple[list[str], tuple[Series, Series]]:
-    """Return the names of Table II's rows, the paper's counts and ours."""
+    """Return for a filter the rows of Table II, the paper's landmark counts and the study's."""
     rows, printed, ours = [], [], []
     for row in paper.TABLE_II:
         cell = paper.cell_of(selection.study, row) if row.filter == name else None

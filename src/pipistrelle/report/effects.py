@@ -65,7 +65,7 @@ Pair = tuple[Cell, Cell]
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Measure:
-    """A score that is compared, or the gain in it over active sensing."""
+    """A score for the comparison of cases, or the gain in this score over active sensing."""
 
     title: str
     score: str
@@ -80,7 +80,7 @@ class Measure:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Pairing:
-    """Cases that differ only in the value of a factor."""
+    """Pairs of cases that differ in a single factor: a variable, the strategy or the filter."""
 
     factor: str
     """Name of the variable, `STRATEGY` or `FILTER`."""
@@ -101,7 +101,7 @@ class Pairing:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Effect:
-    """A pairing judged in a measure over the worlds."""
+    """The change of a score between paired cases over the worlds, with its significance."""
 
     pairing: Pairing
     measure: Measure
@@ -114,7 +114,7 @@ class Effect:
 
 
 def measures_of(study: Study) -> tuple[Measure, ...]:
-    """List the scores that are compared: position RMSE, then all that have numbers."""
+    """List the scores to compare: the position RMSE, then all others that have numbers."""
     return tuple(
         Measure(title=score.title, score=name, unit=score.unit, ratio=score.ratio)
         for name, score in shown_in("effects").items()
@@ -123,7 +123,7 @@ def measures_of(study: Study) -> tuple[Measure, ...]:
 
 
 def gains_of(study: Study) -> tuple[Measure, ...]:
-    """List the gains over active sensing in each error; they are positive if listening helps."""
+    """List the gains over active sensing in each error score, positive if listening helps."""
     return tuple(
         replace(one, title=f"gain in {one.title} over active", over="active")
         for one in measures_of(study)
@@ -132,14 +132,14 @@ def gains_of(study: Study) -> tuple[Measure, ...]:
 
 
 def is_first(measure: Measure) -> bool:
-    """Return whether a measure is the position RMSE, the subject of the answer."""
+    """Return whether a measure is the position RMSE, which the report's answer is about."""
     return measure.score == POSITION and not measure.over
 
 
 def measured(
     selection: Selection, measure: Measure, before: Cell, after: Cell
 ) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"]]:
-    """Return a measure of two cases in each world; NaN in worlds that do not count.
+    """Return a measure of two cases in each world; NaN in excluded worlds.
 
     Ratios give logarithms. Map errors are taken over the landmarks that all cases with the same
     landmarks have placed.
@@ -157,7 +157,7 @@ def measured(
 
 
 def _numbers(study: Study, score: str, cells: Sequence[Cell]) -> list[Float[np.ndarray, " n"]]:
-    """Return a score of cases; map errors over landmarks that all cases of a drawing placed."""
+    """Return a score of each case in all worlds; map errors over landmarks that all placed."""
     numbers: dict[Cell, Float[np.ndarray, " n"]] = {}
     for drawing in {study.drawing[number] for _, _, number in cells}:
         drawn = [cell for cell in cells if study.drawing[cell[2]] == drawing]
@@ -177,7 +177,7 @@ def _numbers(study: Study, score: str, cells: Sequence[Cell]) -> list[Float[np.n
 def compare(
     selection: Selection, measure: Measure, rows: Sequence[Sequence[Pair]]
 ) -> tuple[Contrast, ...]:
-    """Compare the pairs of each row, averaged in each world; the rows are a family."""
+    """Compare pairs of cases, averaged over each row of pairs; the rows are a family of tests."""
     if not any(rows):
         return ()
     frame = _frame(selection, [(0, measure, pairs) for pairs in rows])
@@ -187,7 +187,7 @@ def compare(
 def _frame(
     selection: Selection, rows: Iterable[tuple[int, Measure, Sequence[Pair]]]
 ) -> "pl.DataFrame":
-    """Return the numbers of pairs of cases in each world, for `contrasts`.
+    """Return a measure of paired cases in each world as a table, the input of `contrasts`.
 
     `rows`: family, measure and pairs.
     """
@@ -207,7 +207,7 @@ def _frame(
 
 
 def pairings_of(study: Study) -> Iterator[Pairing]:
-    """Yield the comparisons of values, and of gains over active, then of strategies and filters."""
+    """Yield the comparisons of a study: values of variables, gains, strategies and filters."""
     titles, measures, gains = filter_titles(study), measures_of(study), gains_of(study)
     strategies = {
         name: [way for way in STRATEGIES if (name, way) in study.trials] for name in titles
@@ -232,7 +232,7 @@ def pairings_of(study: Study) -> Iterator[Pairing]:
 def _of_values(
     study: Study, variable: Variable, ways: Sequence[Way], measures: tuple[Measure, ...]
 ) -> Iterator[Pairing]:
-    """Pair every value of a variable with its reference in the first way.
+    """Pair the cases of each value of a variable with the cases of its reference value.
 
     Combinations whose cases are the same in all ways count once; a variable that changes no case,
     as the beam of passive sensing, gives nothing.
@@ -260,7 +260,7 @@ def _of_values(
 
 
 def _of_ways(study: Study, one: Way, other: Way, **fields: Any) -> Pairing:
-    """Pair the cases of two ways at every combination where they differ."""
+    """Pair the cases of two (filter, strategy) pairs at each combination of the variables."""
     at = np.array([study.trials[way].at for way in (one, other)])
     numbers = np.sort(np.unique(at, axis=1, return_index=True)[1]).tolist()
     return Pairing(
@@ -272,7 +272,7 @@ def _of_ways(study: Study, one: Way, other: Way, **fields: Any) -> Pairing:
 
 
 def effects_of(selection: Selection) -> tuple[Effect, ...]:
-    """Judge every comparison of a study in every measure."""
+    """Judge every comparison of a study in every score that it concerns."""
     import polars as pl
 
     families: dict[tuple[Any, ...], list[Pairing]] = {}
@@ -307,12 +307,12 @@ def effects_of(selection: Selection) -> tuple[Effect, ...]:
 
 
 def direction(finding: Finding) -> int:
-    """Return 1 for a significant rise, -1 for a significant fall, otherwise 0."""
+    """Return the sign of a significant change: 1 for a rise, -1 for a fall, otherwise 0."""
     return {True: 1, False: -1, None: 0}[finding.holds]
 
 
 def record(by_rule: Mapping[Rule, Sequence[Effect]], headline: Rule) -> list[dict[str, Any]]:
-    """Return the rows of effects in ``summary.json``.
+    """Return the effects of a study as entries of ``summary.json``.
 
     `by_rule`: the same effects under each exclusion rule. `headline`: the rule under which effects
     at single combinations are given. Ratios replace logarithms; None replaces numbers that are not
@@ -345,7 +345,7 @@ def record(by_rule: Mapping[Rule, Sequence[Effect]], headline: Rule) -> list[dic
 
 
 def _plain_effect(effect: Effect) -> dict[str, Any]:
-    """Return an effect under an exclusion rule as JSON values."""
+    """Return an effect under a single exclusion rule as JSON values."""
     ratio, finding = effect.measure.ratio, effect.finding
     low, high = finding.family
     would = math.nan if finding.holds is not None or effect.untouched else (high - low) / 2.0
@@ -359,7 +359,7 @@ def _plain_effect(effect: Effect) -> dict[str, Any]:
 
 
 def json_finding(finding: Finding, *, effect: bool = False, ratio: bool = False) -> dict[str, Any]:
-    """Return a finding as JSON values; None replaces numbers that are not finite.
+    """Return a finding (mean, intervals, p) as JSON values; None if a number is not finite.
 
     `effect`: give Bonferroni's interval, not Holm's. `ratio`: convert logarithms to ratios.
     """
@@ -379,7 +379,7 @@ def json_finding(finding: Finding, *, effect: bool = False, ratio: bool = False)
 
 
 def headline(subject: str, title: str, unit: str, contrast: Contrast, cases: int = 1) -> str:
-    """Return a sentence for a contrast: direction, size and interval of the change.
+    """Return a sentence on a change of a score: its direction, size and interval.
 
     `subject`: the two values, as "B instead of A". `title` and `unit`: of the score. `cases`: over
     which the change is averaged.
@@ -403,7 +403,7 @@ def headline(subject: str, title: str, unit: str, contrast: Contrast, cases: int
 
 
 def question(study: Study) -> str:
-    """Return the question that a study answers."""
+    """Return the question that a study answers, from its variables, strategies and filters."""
     if study.variables:
         verb = "do" if len(study.variables) > 1 else "does"
         return f"What {verb} {listed([with_article(v) for v in study.variables])} change?"
@@ -417,7 +417,7 @@ def question(study: Study) -> str:
 
 
 def answer(selection: Selection, effects: Sequence[Effect]) -> list[str]:
-    """Return the headline: a sentence per variable or, without variables, per strategy or filter.
+    """Return the answer of a study: a sentence per variable, else per strategy and filter.
 
     `effects`: under the rule `HEADLINE`. Each sentence is the change of the position RMSE between
     two values, averaged over everything else; of several values of a variable the largest shown.
@@ -439,7 +439,7 @@ def answer(selection: Selection, effects: Sequence[Effect]) -> list[str]:
 
 
 def _of_variable(selection: Selection, variable: Variable, effects: Sequence[Effect]) -> str:
-    """Return the sentence of a variable: of its values with the largest effect shown."""
+    """Return the answer's sentence on a variable, for the value with the largest effect."""
     own = [effect for effect in effects if effect.pairing.factor == variable.name]
     if not own:
         return f"No measurement depends on {with_article(variable)}."
@@ -454,7 +454,7 @@ def _of_variable(selection: Selection, variable: Variable, effects: Sequence[Eff
 def _averaged(
     selection: Selection, effects: Sequence[Effect], variable: Variable | None = None
 ) -> list[tuple[Finding, str]]:
-    """Return finding and sentence of each two values, averaged over filters and strategies.
+    """Return a finding and a sentence for each pair of values, averaged over all other factors.
 
     The findings are a family. The sentence names the effects if they do not all agree with it.
     """
@@ -480,7 +480,7 @@ def _averaged(
 
 
 def _shown_by(study: Study, group: Sequence[Effect]) -> str:
-    """Return the sentence that lists the filters and strategies of a shown effect."""
+    """Return a sentence that lists the filters and strategies for which an effect is shown."""
     titles, parts = filter_titles(study), []
     for sign, verb in ((1, "rise"), (-1, "fall")):
         shown = [e.pairing for e in group if direction(e.finding) == sign]

@@ -17,13 +17,13 @@ from pipistrelle.report.variables import listed, width_name
 
 
 def model_charts(study: Study) -> list[Chart]:
-    """Chart the study's emitters, and an example world if it can be drawn."""
+    """Return charts of the emitter's beam patterns and, if it can be drawn, an example world."""
     maps = [] if study.example is None else [example_map(study, study.example)]
     return [piston(study), *maps]
 
 
 def piston(study: Study) -> Chart:
-    """Chart the beam patterns of the study's emitters.
+    """Chart the beam patterns of the vehicle's emitter at all beamwidths of a study.
 
     Bradley & Abaid, Eq. (1) and Appendix B.
     """
@@ -80,7 +80,7 @@ def example_map(study: Study, world: Scenario) -> Chart:
 
 
 def _beam(config: Config, width: float, strength: float) -> list[Series]:
-    """Return a beam's outline, and dots at half power labelled with its numbers."""
+    """Return a beam pattern as data series: its outline, and labelled dots at half power."""
     tone = {"frequency": config.emitter.centre, "speed_of_sound": config.medium.sound_speed}
     half = np.radians(np.array([width])) / 2.0
     radius = float(piston_radius(np.radians(width), **tone))
@@ -103,7 +103,7 @@ def _beam(config: Config, width: float, strength: float) -> list[Series]:
 
 
 def _protractor() -> list[Series]:
-    """Return the rings and spokes of a beam pattern, and their labels."""
+    """Return the rings, spokes and labels of a polar beam chart, as data series."""
     angle = np.radians(np.linspace(-90.0, 90.0, 181))
     spokes = np.radians(np.linspace(-90.0, 90.0, 7))
     rings = (0.5, math.sqrt(0.5), 1.0)
@@ -129,7 +129,7 @@ def _protractor() -> list[Series]:
 
 
 def _world(world: Scenario) -> tuple[Series, ...]:
-    """Return the series of a world: path, landmarks and callers."""
+    """Return a world's true path, start, landmarks and callers as data series of a map."""
     count = len(world.landmarks)
     look = {"role": "ink", "style": "points", "filled": np.zeros(count, bool)}
     path, start = world.path[:, :2], world.path[:1, :2]
@@ -143,7 +143,7 @@ def _world(world: Scenario) -> tuple[Series, ...]:
 
 
 def _caller(caller: Caller) -> Series:
-    """Return the path of a moving caller, or a star at the position of another."""
+    """Return a caller as a data series: the path if it moves, else a star at its position."""
     place = np.reshape(np.asarray(caller.place), (-1, 2))
     if moves(caller):
         return Series(name=caller.name, role="fused", x=place[:, 0], y=place[:, 1])
@@ -153,7 +153,7 @@ def _caller(caller: Caller) -> Series:
 def _places(
     name: str, points: Float[np.ndarray, "n 2"], labels: Sequence[str], **look: Any
 ) -> Series:
-    """Return points with their labels and coordinates to read out."""
+    """Return points as a data series, each with a label and its coordinates as text."""
     tips = tuple(
         f"{label}\nx: {x:.1f} m\ny: {y:.1f} m" for label, (x, y) in zip(labels, points, strict=True)
     )

@@ -59,7 +59,7 @@ MIN_WORLDS = 20
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Answered:
-    """A study with its question, answer, effects and judged claims."""
+    """A study together with its question, answer, effects and judged claims."""
 
     study: Study
     papers: bool
@@ -79,7 +79,7 @@ class Answered:
 
 
 def answered(study: Study, claims: Sequence[Claim] | None = None) -> Answered:
-    """Answer a study's question; `claims` as in `write_report`."""
+    """Answer a study's question, from its effects and the judged claims."""
     papers, by_rule = papers_cases(study), selections(study)
     effects = {rule: effects_of(selection) for rule, selection in by_rule.items()}
     asked = (CLAIMS if papers else ()) if claims is None else claims
@@ -100,7 +100,7 @@ def answered(study: Study, claims: Sequence[Claim] | None = None) -> Answered:
 
 
 def summary(result: Answered) -> dict[str, Any]:
-    """Return the content of ``summary.json``."""
+    """Return the content of a report's ``summary.json``."""
     study, selection, rule = result.study, result.selections[result.rule], result.rule
     effects = result.effects[rule], result.effects[OTHERWISE]
     exclusions = tables.exclusion_rows(study)
@@ -152,7 +152,7 @@ def write_report(
     charts: Sequence[Figure] | None = None,
     progress: Callable[[str], None] = lambda _: None,
 ) -> dict[str, Any]:
-    """Answer a study's question and write its page, its figures and its summary.
+    """Write the report of a study: a page with question and answer, figures and a summary.
 
     `study`: as `read_study` gives it. `folder`: is made if missing; gets ``index.html``,
     ``summary.json`` and ``figures``. `claims`: to be judged; by default the paper's if the study
@@ -190,7 +190,7 @@ def page(
     models: Sequence[Chart],
     numbers: dict[str, Any],
 ) -> str:
-    """Return the page as HTML.
+    """Return the HTML page of a report.
 
     `figures`: under each rule that has them. `numbers`: the content of ``summary.json``.
     """
@@ -233,7 +233,7 @@ def page(
 
 
 def _template() -> "Template":
-    """Return the page's template, which escapes every text."""
+    """Return the Jinja template of a report's page, which escapes every text."""
     from jinja2 import Environment, StrictUndefined
 
     environment = Environment(
@@ -245,7 +245,7 @@ def _template() -> "Template":
 
 
 def _side_by_side(figures: list[dict[str, Any]]) -> list[dict[str, Any]]:
-    """Mark figures of a single panel as pairs, and the last of an odd number as single."""
+    """Mark figures with a single panel for placing in pairs, and an odd last figure as lone."""
     single = [figure for figure in figures if figure["columns"] == 1]
     for figure in single:
         figure["place"] = "single"
@@ -255,7 +255,7 @@ def _side_by_side(figures: list[dict[str, Any]]) -> list[dict[str, Any]]:
 
 
 def _figure(views: Mapping[Any, Chart], rules: Sequence[str]) -> dict[str, Any]:
-    """Return a figure under all exclusion rules; None under rules without it."""
+    """Return a figure's data for the page under each exclusion rule; None without a chart."""
     by_rule: dict[str, dict[str, Any] | None] = dict.fromkeys(rules)
     for rule, chart in views.items():
         panels = []
@@ -277,7 +277,7 @@ def _figure(views: Mapping[Any, Chart], rules: Sequence[str]) -> dict[str, Any]:
 
 
 def _write_figure(chart: Chart, folder: Path) -> None:
-    """Write a chart as PNG and PDF."""
+    """Write a chart as a PNG and a PDF file."""
     from pipistrelle.figures.chart import draw_chart
     from pipistrelle.figures.style import save_figure
 
@@ -287,7 +287,7 @@ def _write_figure(chart: Chart, folder: Path) -> None:
 def _csv_texts(
     result: Answered, figures: Mapping[str, Mapping[Rule, Chart]], models: Sequence[Chart]
 ) -> dict[str, str]:
-    """Return the numbers of each figure under all exclusion rules, as CSV."""
+    """Return the numbers of each figure as CSV text, with rows for every exclusion rule."""
     texts = {chart.name: csv_text(csv_rows(chart)) for chart in models}
     for name, views in figures.items():
         rows: list[list[str]] = []
@@ -310,14 +310,14 @@ def _csv_texts(
 
 
 def _p(p: float, sentence: bool = False) -> str:
-    """Format a p value, within a sentence with its sign."""
+    """Format a p value; within a sentence it begins with an equals or less-than sign."""
     if p < 1e-4:
         return "< 0.0001"
     return ("= " if sentence else "") + (f"{p:.2g}" if p < 0.1 else f"{p:.2f}")
 
 
 def _shown(finding: Mapping[str, Any], unit: str) -> dict[str, str]:
-    """Format a finding of a claim in its unit, angles in degrees."""
+    """Format a claim's finding (mean, interval, margin) in its unit, angles in degrees."""
     factor, sign = UNITS[unit]
     end = f" {sign}" if sign not in ("", "°") else sign
     within, edge = finding["relation"] == "within", finding["margin"]

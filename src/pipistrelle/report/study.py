@@ -79,7 +79,7 @@ SAME = 1e-4
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Trials:
-    """One filter's trials with one strategy, in n worlds, b cases in each."""
+    """Trials of a single filter and strategy, as arrays over n worlds and b cases."""
 
     at: Int[np.ndarray, " c"]
     """Case of each combination: passive sensing has a single case for all beamwidths."""
@@ -102,7 +102,7 @@ class Trials:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Study:
-    """The finished part of a study: n worlds, c combinations of its variables."""
+    """The finished worlds of a study as arrays: n worlds, c combinations of the variables."""
 
     name: str
     """The plan's name, which may hold any text."""
@@ -133,7 +133,7 @@ class Study:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Selection:
-    """A study under an exclusion rule, as `select` makes it."""
+    """A study together with a rule that excludes diverged trials or worlds from comparisons."""
 
     study: Study
     rule: Rule
@@ -142,12 +142,12 @@ class Selection:
 
 
 def selections(study: Study) -> dict[Rule, Selection]:
-    """Return the selection of a study under each of `RULES`."""
+    """Return a study under each exclusion rule for diverged trials, by rule."""
     return {rule: select(study, rule) for rule in RULES}
 
 
 def select(study: Study, rule: Rule) -> Selection:
-    """Return a study under an exclusion rule."""
+    """Combine a study with an exclusion rule for diverged trials."""
     lost = {name: lost_worlds(study, name) for name in filter_titles(study)}
     return Selection(study=study, rule=rule, lost=lost)
 
@@ -158,7 +158,7 @@ def has_numbers(study: Study, score: str) -> bool:
 
 
 def along(study: Study, variable: Variable) -> Int[np.ndarray, "k m"]:
-    """Return the numbers of the combinations, a row for each value of a variable.
+    """Return the numbers of all combinations, in an array with a row per value of a variable.
 
     `variable`: one of the study's. Returns: columns are the combinations of the other variables.
     """
@@ -168,7 +168,7 @@ def along(study: Study, variable: Variable) -> Int[np.ndarray, "k m"]:
 
 
 def combination_name(study: Study, number: int, without: Sequence[Variable] = ()) -> str:
-    """Name a combination by the values of its variables, except some of them."""
+    """Name a combination by the values of the study's variables, except `without`."""
     at = np.unravel_index(number, [len(one.given) for one in study.variables] or [1])
     return ", ".join(
         variable.words[i] if variable.name == BEAM else f"{variable.name} = {variable.words[i]}"
@@ -178,7 +178,7 @@ def combination_name(study: Study, number: int, without: Sequence[Variable] = ()
 
 
 def case_name(study: Study, way: Way, number: int) -> str:
-    """Name a combination by the variables that change the cases of a filter and strategy.
+    """Name a combination by the variables that make a difference to a filter and strategy.
 
     Returns: empty for passive sensing if only the beam varies.
     """
@@ -188,12 +188,12 @@ def case_name(study: Study, way: Way, number: int) -> str:
 
 
 def own_cases(trials: Trials) -> Int[np.ndarray, " b"]:
-    """Return the number of the first combination of each case."""
+    """Return for each case the first combination of variables that it belongs to."""
     return np.unique(trials.at, return_index=True)[1]
 
 
 def filter_titles(study: Study) -> dict[str, str]:
-    """Return the titles of a study's filters by name, in the catalogue's order first.
+    """Return the titles of a study's filters by name, filters of the catalogue first.
 
     Other filters (``module:Class``) follow by name. Their title is the name of their class, or the
     whole name if two titles would be equal; their code is not needed to read a study.
@@ -207,13 +207,13 @@ def filter_titles(study: Study) -> dict[str, str]:
 
 
 def lost_worlds(study: Study, name: str) -> Bool[np.ndarray, " n"]:
-    """Return a mask of the worlds where any case of a filter diverged or failed."""
+    """Return a mask of worlds where any case of a filter diverged or failed."""
     of_filter = [trials for (other, _), trials in study.trials.items() if other == name]
     return np.any([np.any(t.failed | t.diverged, axis=1) for t in of_filter], axis=0)
 
 
 def kept(selection: Selection, cells: Sequence[Cell]) -> Bool[np.ndarray, " n"]:
-    """Return a mask of the worlds without failed or excluded trials in the compared cells.
+    """Return a mask of the worlds where no compared case failed or is excluded.
 
     A failed trial counts as diverged; under the rule "none" it has no number.
     """
@@ -231,7 +231,7 @@ def kept(selection: Selection, cells: Sequence[Cell]) -> Bool[np.ndarray, " n"]:
 
 
 def values(study: Study, score: str, cell: Cell) -> Float[np.ndarray, " n"]:
-    """Return a score of a cell in all worlds; NaN if there is none."""
+    """Return a score of a case in all worlds; NaN where it is missing."""
     name, strategy, number = cell
     trials = study.trials[name, strategy]
     return trials.scores[score][:, number if score == COMMON else trials.at[number]]
@@ -240,7 +240,7 @@ def values(study: Study, score: str, cell: Cell) -> Float[np.ndarray, " n"]:
 def samples(
     selection: Selection, score: str, cells: Sequence[Cell]
 ) -> list[Float[np.ndarray, " m"]]:
-    """Return a score of several cells in the worlds where all of them count and have a number.
+    """Return a score of several cases, in the worlds where all of them count and have a number.
 
     `score`: one of `READ`, or `COMMON`. Returns: an array per cell, over the same worlds.
     """
@@ -252,7 +252,7 @@ def samples(
 def rmse_of(
     off: Float[np.ndarray, "*n l"], shared: Bool[np.ndarray, "*n l"]
 ) -> Float[np.ndarray, "*n"]:
-    """Return the root mean square distance [m] over the landmarks of a mask; NaN without any."""
+    """Return the root mean square distance [m] of the landmarks in a mask; NaN if it is empty."""
     count = np.sum(shared, axis=-1)
     square = np.sum(np.where(shared, np.asarray(off, dtype=np.float64) ** 2, 0.0), axis=-1)
     mean = np.divide(square, count, out=np.full(count.shape, np.nan), where=count > 0)
@@ -260,14 +260,14 @@ def rmse_of(
 
 
 def mean_std(sample: Float[np.ndarray, " m"]) -> tuple[float, float]:
-    """Return the mean and standard deviation of a sample: NaN without worlds."""
+    """Return the mean and standard deviation of a sample; NaN if it is empty."""
     if len(sample) == 0:
         return np.nan, np.nan
     return float(np.mean(sample)), float(np.std(sample, ddof=1)) if len(sample) > 1 else 0.0
 
 
 def times_the_bound(selection: Selection, cell: Cell) -> float | None:
-    """Return the position RMSE over its bound, both as root mean squares over worlds.
+    """Return a case's position RMSE divided by its bound, both root mean squares over worlds.
 
     The bound is one of squares: the mean RMSE of an efficient estimator may be as low as 0.8 of it.
     If the filter revises its path, the path as estimated at each time counts. None if there is no
@@ -283,7 +283,7 @@ def times_the_bound(selection: Selection, cell: Cell) -> float | None:
 
 
 def read_study(folder: Path) -> Study:
-    """Read the finished worlds of a study.
+    """Read the finished worlds of a study from its folder.
 
     `folder`: as `pipistrelle study` fills it. Raises InputError: no study, no finished world, or a
     file that cannot be read.
@@ -306,7 +306,7 @@ def read_study(folder: Path) -> Study:
 
 
 def _unreadable(folder: Path, plan: Plan) -> InputError:
-    """Return the error for the first file with other columns than the study's."""
+    """Return the InputError for the first file of a study that has unexpected columns."""
     import polars as pl
 
     for world in sorted(done_worlds(folder)):
@@ -320,7 +320,7 @@ def _unreadable(folder: Path, plan: Plan) -> InputError:
 def _study(
     plan: Plan, trials: "pl.DataFrame", steps: "pl.DataFrame", landmarks: "pl.DataFrame"
 ) -> Study:
-    """Make arrays of a study's three tables."""
+    """Convert the three tables of a study to arrays."""
     variables = _variables(plan)
     fixed = {setting: values[0] for setting, values in plan.grid.items() if len(values) == 1}
     names = [variable.setting for variable in variables]
@@ -347,7 +347,7 @@ def _study(
 
 
 def _variables(plan: Plan) -> tuple[Variable, ...]:
-    """Return the variables of a plan: the radius as beamwidth if no other setting changes it."""
+    """Return the variables of a plan; emitter radii become beamwidths if these are unambiguous."""
     variables = []
     for setting, values in plan.grid.items():
         if len(values) < 2:
@@ -362,7 +362,7 @@ def _variables(plan: Plan) -> tuple[Variable, ...]:
 
 
 def _against_truth(variable: Variable, configs: Sequence[Config]) -> Variable:
-    """Make the true value the reference of an assumed setting or a bias, if it is among them."""
+    """Take the true value of an assumed setting or a bias as reference, if it is varied too."""
     truths = {_truth(variable.setting, config) for config in configs}
     truth = truths.pop() if len(truths) == 1 else None
     if truth is None or variable.numbers is None:
@@ -390,7 +390,7 @@ def _degrees(config: Config) -> float:
 def _numbers(
     plan: Plan, cases: "pl.DataFrame", variables: Sequence[Variable]
 ) -> dict[Way, Int[np.ndarray, " c"]]:
-    """Return the case of each combination, by filter and strategy."""
+    """Return the case number of each combination of variables, by filter and strategy."""
     given = [[repr(value) for value in variable.given] for variable in variables]
     values = {case.number: case.values for case in cases_of(plan)}
     numbers: dict[Way, Int[np.ndarray, ...]] = {}
@@ -406,7 +406,7 @@ def _numbers(
 
 
 def _drawn(plan: Plan, config: Config, world: int) -> Scenario | None:
-    """Draw a world; None if its folder is gone."""
+    """Draw a world of a plan again; None if that is impossible, as without its folder."""
     try:
         return world_of(config, world, plan.world(config))
     except InputError:
@@ -414,7 +414,7 @@ def _drawn(plan: Plan, config: Config, world: int) -> Scenario | None:
 
 
 def _drawings(plan: Plan, configs: Sequence[Config], world: int) -> Int[np.ndarray, " c"]:
-    """Return a number for each combination, equal where the landmarks are the same."""
+    """Number the combinations so that equal numbers mean equal landmarks in every world."""
     numbers: dict[Any, int] = {}
     by_settings: dict[str, int] = {}
     drawings = []
@@ -431,7 +431,7 @@ def _drawings(plan: Plan, configs: Sequence[Config], world: int) -> Int[np.ndarr
 def _failures(
     plan: Plan, trials: "pl.DataFrame", variables: Sequence[Variable]
 ) -> tuple[dict[str, Any], ...]:
-    """List the failed trials with the words of all variables except the beamwidth."""
+    """List the failed trials of a study with their settings and error messages."""
     import polars as pl
 
     values = {case.number: case.values for case in cases_of(plan)}
@@ -454,7 +454,7 @@ def _trials(
     steps: "pl.DataFrame",
     landmarks: "pl.DataFrame",
 ) -> dict[Way, Trials]:
-    """Return the trials of each filter and strategy, cases in the order of the combinations."""
+    """Return the trials of each filter and strategy as arrays, from a study's tables."""
     shape = len(worlds), len(cases_of(plan))
     # Labels below 0 are of map entries that a data association took for no true landmark.
     landmarks = landmarks.filter(landmarks["landmark"] >= 0)
@@ -501,7 +501,7 @@ def _array(
     at: Int[np.ndarray, " r"] | None = None,
     empty: Any = np.nan,
 ) -> np.ndarray:
-    """Return values of the rows of a table by world and case, and by a third index if given.
+    """Arrange a table's values in an array by world and case, and by a third index if given.
 
     `empty`: the value without a row.
     """
@@ -515,7 +515,7 @@ def _array(
 
 
 def _means(*columns: Float[np.ndarray, "n b k"]) -> Float[np.ndarray, "i b k"]:
-    """Average columns over the worlds that have them; NaN without any."""
+    """Average arrays over the worlds, without NaN; the average of NaN only is NaN."""
     counts = [np.sum(np.isfinite(column), axis=0) for column in columns]
     with np.errstate(invalid="ignore"):
         return np.array([np.nansum(c, axis=0) / n for c, n in zip(columns, counts, strict=True)])
@@ -526,7 +526,7 @@ def _common(
     full: Bool[np.ndarray, "n a l"],
     error: Float[np.ndarray, "n a l"],
 ) -> dict[Way, Float[np.ndarray, "n c"]]:
-    """Return the map RMSE over the landmarks that all strategies of a filter have placed."""
+    """Return each case's map RMSE over the landmarks that all strategies of its filter placed."""
     rmse = {}
     for name in {name for name, _ in numbers}:
         of_filter = {way: c for way, c in numbers.items() if way[0] == name}

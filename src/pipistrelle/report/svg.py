@@ -27,7 +27,7 @@ MAX_READINGS = 80
 
 
 def panel_svg(panel: Panel) -> Markup:
-    """Return a panel as an ``svg`` element with escaped texts.
+    """Draw a panel of a chart as an ``svg`` element with escaped texts.
 
     Examples
     --------
@@ -58,7 +58,7 @@ def panel_svg(panel: Panel) -> Markup:
 def _add(
     svg: Element, name: str, kind: str = "", text: str = "", title: str = "", **attributes: str
 ) -> None:
-    """Append an element, with a title if it can be read."""
+    """Append an element to an SVG image, with a tooltip if `title` is given."""
     given = {key.replace("_", "-"): value for key, value in attributes.items()}
     element = SubElement(svg, name, ({"class": kind} if kind else {}) | given)
     element.text = text
@@ -67,7 +67,7 @@ def _add(
 
 
 def readings(panel: Panel) -> list[tuple[float, str, list[tuple[str, str]]]]:
-    """Return the numbers of a panel at each position: position, its name, series and texts."""
+    """Return a panel's readable positions: place, its name, and each series' value as text."""
     named = [s for s in panel.series if s.listed and explained(s) and len(s.x)]
     if not named or panel.equal:
         return []
@@ -92,7 +92,7 @@ def readings(panel: Panel) -> list[tuple[float, str, list[tuple[str, str]]]]:
 
 
 def _texts_at(named: Sequence[Series], axis: Axis, place: float) -> list[tuple[str, str]]:
-    """Return the point of each series that is nearest to a named position and to no other."""
+    """Return the value of each series at a named position, if its nearest point belongs there."""
     places = np.array([value for value, _ in axis.named])
     texts = []
     for series in named:
@@ -105,7 +105,7 @@ def _texts_at(named: Sequence[Series], axis: Axis, place: float) -> list[tuple[s
 
 
 def _box(panel: Panel) -> tuple[float, float, float, float]:
-    """Return the left, right, upper and lower edges; equal axes have no margins."""
+    """Return the left, right, upper and lower edges [px] of a panel's axes."""
     if not panel.equal:
         left, right, top, bottom = BOX
         return left, right, top, bottom - SLANT * panel.x.slanted
@@ -125,7 +125,7 @@ def _down(panel: Panel, values: Float[np.ndarray, "*n"] | float) -> Float[np.nda
 
 
 def _share(axis: Axis, values: Float[np.ndarray, "*n"] | float) -> Float[np.ndarray, "*n"]:
-    """Return the positions of values as fractions of an axis; NaN stays NaN."""
+    """Convert values to fractions of an axis's length; NaN stays NaN."""
     low, high = axis.limits
     numbers = np.asarray(values, dtype=np.float64)
     if axis.log:
@@ -135,7 +135,7 @@ def _share(axis: Axis, values: Float[np.ndarray, "*n"] | float) -> Float[np.ndar
 
 
 def _draw_grid(svg: Element, panel: Panel) -> None:
-    """Draw the background: span, grid, ticks, labels, rules and posts."""
+    """Draw a panel's background: expected band, grid, ticks, labels and thin lines."""
     left, right, top, bottom = _box(panel)
     if panel.span:
         low, high, name = panel.span
@@ -164,12 +164,12 @@ def _draw_grid(svg: Element, panel: Panel) -> None:
 
 
 def _write(svg: Element, text: str, x: float, y: float, anchor: str) -> None:
-    """Write a text at a position."""
+    """Add a text to an SVG image at a position [px]."""
     _add(svg, "text", text=text, x=f"{x:.1f}", y=f"{y:.1f}", text_anchor=anchor)
 
 
 def _draw_series(svg: Element, series: Series, panel: Panel) -> None:
-    """Draw a series by its mark, without its band."""
+    """Draw a data series in its style into an SVG image, without its band."""
     mark = MARKS[series.style]
     x, y = _across(panel, series.x), _down(panel, series.y)
     known = np.flatnonzero(np.isfinite(x) & np.isfinite(y)).tolist()
@@ -209,14 +209,14 @@ def _draw_series(svg: Element, series: Series, panel: Panel) -> None:
 
 
 def _stroke(svg: Element, kind: str, series: Series, d: str) -> None:
-    """Draw a path in a series' colour, unless it is empty."""
+    """Add a path in the colour of a data series to an SVG image, unless the path is empty."""
     faint = {"style": f"opacity:{series.strength:.2f}"} if series.strength < 1.0 else {}
     if d:
         _add(svg, "path", f"{kind} c-{series.role}", **faint, d=d)
 
 
 def _draw_spread(svg: Element, series: Series, panel: Panel) -> None:
-    """Draw the band of a line or the bars of points, if any."""
+    """Draw the band or the error bars of a data series into an SVG image, if it has any."""
     if series.low is None or series.high is None:
         return
     x = _across(panel, series.x)
@@ -235,7 +235,7 @@ def _draw_spread(svg: Element, series: Series, panel: Panel) -> None:
 
 
 def _columns(panel: Panel) -> list[tuple[str, float, float]]:
-    """Return text and edges of the columns around the readable positions of a panel."""
+    """Return tooltip text, left and right edge of the column around each readable position."""
     read = readings(panel)
     if not read:
         return []
@@ -252,7 +252,7 @@ def _columns(panel: Panel) -> list[tuple[str, float, float]]:
 
 
 def _number(series: Series, i: int) -> str:
-    """Format a point with its interval."""
+    """Format a point of a data series with its interval: ± if symmetric, else both ends."""
     value = series.y[i]
     if series.low is None or series.high is None or not math.isfinite(series.low[i]):
         return three_digits(value)
@@ -265,7 +265,7 @@ def _number(series: Series, i: int) -> str:
 
 
 def legend(panels: Sequence[Panel]) -> list[tuple[str, str, str, float]]:
-    """Return name, role, swatch and strength of each entry of the panels' legend.
+    """Return name, colour role, symbol and opacity of each entry in the panels' legend.
 
     Returns: empty if there are many names, which the caption then explains.
     """

@@ -44,7 +44,7 @@ MAX_COMBINATIONS = 6
 def effect_tables(
     selection: Selection, effects: Sequence[changes.Effect], otherwise: Sequence[changes.Effect]
 ) -> list[dict[str, Any]]:
-    """Return a table of effects for each variable, then for strategies and filters.
+    """Return the effect tables of a report: by variable, then for strategies and filters.
 
     `otherwise`: the same effects without diverged cases. A table has name, title, meaning, whether
     it is of a variable (`varied`), and rows: filter, strategy and value, with a cell per measure.
@@ -91,7 +91,7 @@ def effect_tables(
 
 
 def _heading(pairing: changes.Pairing, variable: Variable | None) -> dict[str, Any]:
-    """Return name, title and meaning of the table of a pairing."""
+    """Return name, title and meaning of the effect table that a pair of values belongs to."""
     if variable is None:
         title = "Strategies" if pairing.factor == changes.STRATEGY else "Filters"
         return {"name": pairing.factor, "title": title, "meaning": "", "varied": False}
@@ -110,7 +110,7 @@ def _heading(pairing: changes.Pairing, variable: Variable | None) -> dict[str, A
 
 
 def _label(study: Study, effect: changes.Effect, variable: Variable | None) -> str:
-    """Return the name of an effect's row."""
+    """Return the label of an effect's row in its table."""
     pairing, titles = effect.pairing, filter_titles(study)
     change = f"{pairing.after} instead of {pairing.before}"
     if variable is None:
@@ -124,7 +124,7 @@ def _label(study: Study, effect: changes.Effect, variable: Variable | None) -> s
 
 
 def _apart(effects: Sequence[changes.Effect]) -> list[tuple[str, dict[str, Any], bool]]:
-    """Return rows of single combinations: all if few, otherwise opposite effects.
+    """Return table rows of effects at single combinations: all if few, else opposite effects.
 
     `effects`: of a pairing in every measure. Returns: label, cells by score, and whether the
     effect on the position RMSE is opposite.
@@ -142,7 +142,7 @@ def _apart(effects: Sequence[changes.Effect]) -> list[tuple[str, dict[str, Any],
 
 
 def _cells(effects: Sequence[changes.Effect], at: int | None = None) -> dict[str, dict[str, Any]]:
-    """Return text and interval of effects by score, on average or at a combination."""
+    """Return the table cells (text, interval) of effects by score: averaged or at a combination."""
     cells = {}
     for effect in effects:
         measure, finding = effect.measure, effect.finding if at is None else effect.apart[at]
@@ -169,7 +169,7 @@ def _cells(effects: Sequence[changes.Effect], at: int | None = None) -> dict[str
 
 
 def case_rows(selection: Selection) -> list[dict[str, Any]]:
-    """Return a row of numbers for each case, as in ``summary.json``.
+    """Return a row of scores for each case of a study, as in ``summary.json``.
 
     A row has filter, strategy, values of the variables, number of worlds, mean and standard
     deviation of each measure (of NEES geometric mean and factor), the means of further scores,
@@ -198,7 +198,7 @@ def case_rows(selection: Selection) -> list[dict[str, Any]]:
 
 
 def _moments(sample: np.ndarray, *, ratio: bool) -> list[float] | None:
-    """Return mean and standard deviation; of a ratio geometric mean and factor."""
+    """Return mean and standard deviation of a sample, or its geometric mean and factor."""
     if ratio:
         sample = np.log(sample[sample > 0.0])
     if len(sample) == 0:
@@ -208,7 +208,7 @@ def _moments(sample: np.ndarray, *, ratio: bool) -> list[float] | None:
 
 
 def exclusion_rows(study: Study) -> list[dict[str, Any]]:
-    """Return the excluded worlds and trials of each filter.
+    """Return table rows with the numbers of excluded worlds and trials of each filter.
 
     A row has finished worlds, worlds with a diverged or failed case, the paper's count, diverged
     trials per strategy, failed trials, and the NEES limit; None for unknown limits and counts.
@@ -233,7 +233,7 @@ def exclusion_rows(study: Study) -> list[dict[str, Any]]:
 
 
 def not_the_papers(study: Study) -> list[dict[str, Any]]:
-    """Return the settings, strategies and filters that differ from the plan `paper`.
+    """Return the settings, strategies and filters that differ between a study and plan `paper`.
 
     Returns: name, value here and value of the paper. Seed and number of worlds are ignored.
     """
@@ -254,13 +254,13 @@ def not_the_papers(study: Study) -> list[dict[str, Any]]:
 
 
 def not_the_papers_line(rows: list[dict[str, Any]]) -> str:
-    """Format the rows of `not_the_papers` in a line; empty without rows."""
+    """Format a study's differences from the plan `paper` in a line; empty without any."""
     parts = [f"{r['setting']} {_worded(r['here'])} (paper {_worded(r['paper'])})" for r in rows]
     return f"Not the paper's study: {', '.join(parts)}" if parts else ""
 
 
 def _asked(config: Config, grid: Mapping[str, Sequence[Any]]) -> dict[str, Any]:
-    """Return every setting except the seed by its dotted name, with all values of the grid."""
+    """Return every setting of a study except the seed, by dotted name, with all varied values."""
     asked: dict[str, Any] = {}
     table = config.model_dump(mode="json")
     for key in known_settings():
@@ -275,7 +275,7 @@ def _asked(config: Config, grid: Mapping[str, Sequence[Any]]) -> dict[str, Any]:
 
 
 def _worded(value: Any) -> str:
-    """Write a setting's value, a long list by its ends."""
+    """Format the value of a setting; a long list by its length and its ends."""
     if isinstance(value, list):
         if len(value) > 3:
             return f"{len(value)} values from {_worded(value[0])} to {_worded(value[-1])}"
@@ -285,7 +285,7 @@ def _worded(value: Any) -> str:
 
 
 def table_ii_rows(selection: Selection) -> list[dict[str, Any]]:
-    """Return the rows of Table II: the paper's means and deviations, and ours.
+    """Return the rows of Table II: landmark counts (mean, deviation) of the paper and the study.
 
     None if the study has no such case. With FastSLAM 2.0 `full` counts the particle of highest
     weight and `full_mean` is the weighted mean over the particles.
@@ -309,7 +309,7 @@ def table_ii_rows(selection: Selection) -> list[dict[str, Any]]:
 
 
 def consistency_rows(selection: Selection) -> list[dict[str, Any]]:
-    """Return the consistency of each case.
+    """Return a table row on the consistency (ANEES) of each case.
 
     A row has the case, the number of worlds, the time means of ANEES, of a consistent filter's and
     of its 95 % bounds, the shares of time inside and above them, and its `anees_departure`.
@@ -348,7 +348,7 @@ def consistency_rows(selection: Selection) -> list[dict[str, Any]]:
 
 
 def by_strategy(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
-    """Average `consistency_rows` over the combinations."""
+    """Average the rows of `consistency_rows` by filter and strategy."""
     groups: dict[tuple[str, str], list[dict[str, Any]]] = {}
     for row in rows:
         groups.setdefault((row["filter"], row["strategy"]), []).append(row)

@@ -27,7 +27,7 @@ NUMBERS = (
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Variable:
-    """A setting that a study varies."""
+    """A setting that a study varies, with its values, their texts and an axis label."""
 
     name: str
     """For readers: `BEAM`, or the setting."""
@@ -51,7 +51,7 @@ class Variable:
 
 
 def setting_variable(setting: str, values: Sequence[Any]) -> Variable:
-    """Return the variable of a setting and its values in a plan's grid."""
+    """Return the variable for a setting and the values that a plan's grid gives it."""
     field = known_settings().get(tuple(setting.split(".")))
     meaning = " ".join(((field.description if field else None) or "").split())
     numeric = all(isinstance(one, (int, float)) and not isinstance(one, bool) for one in values)
@@ -70,7 +70,7 @@ def setting_variable(setting: str, values: Sequence[Any]) -> Variable:
 
 
 def beam_variable(setting: str, radii: Sequence[float], degrees: Sequence[float]) -> Variable:
-    """Return the variable of the beamwidth, narrowest first.
+    """Return the beamwidth as a variable in place of emitter radii, narrowest first.
 
     `setting`: of the radius. `radii` [m]. `degrees` [deg]: the half-power beamwidth of each.
     """
@@ -92,7 +92,7 @@ def beam_variable(setting: str, radii: Sequence[float], degrees: Sequence[float]
 
 
 def width_name(beamwidth: float) -> str:
-    """Write a beamwidth [deg] in three digits, or as the paper does if it is one of the paper's."""
+    """Format a beamwidth [deg] with three digits, or as the paper does if it is the paper's."""
     short = f"{beamwidth:.3g}"
     if abs(float(short) - beamwidth) > 1e-6 * beamwidth and _papers_beamwidth(beamwidth):
         return beam_name(beamwidth)
@@ -100,18 +100,18 @@ def width_name(beamwidth: float) -> str:
 
 
 def beam_name(beamwidth: float) -> str:
-    """Write a beamwidth [deg] in whole degrees, rounded as in the paper if within 0.2 degrees."""
+    """Format a beamwidth [deg] in whole degrees, as in the paper if within 0.2 degrees of it."""
     return f"{_papers_beamwidth(beamwidth) or beamwidth:.0f}°"
 
 
 def _papers_beamwidth(beamwidth: float) -> float | None:
-    """Return the paper's beamwidth [deg] within 0.2 degrees, if any."""
+    """Return the paper's beamwidth [deg] within 0.2 degrees of a beamwidth; None without any."""
     near = min(BEAMWIDTHS, key=lambda printed: abs(printed - beamwidth))
     return near if abs(near - beamwidth) < 0.2 else None
 
 
 def written(values: Sequence[Any]) -> tuple[str, ...]:
-    """Write values in the shortest form that distinguishes all; callers are counted or named."""
+    """Format values in the shortest form that distinguishes all; callers by number or name."""
     for words in (_counted, _calling, _short):
         short = tuple(map(words, values))
         if len(set(short)) == len(short):
@@ -120,12 +120,12 @@ def written(values: Sequence[Any]) -> tuple[str, ...]:
 
 
 def word_of(variable: Variable, value: Any) -> str:
-    """Return the text of a value of a variable."""
+    """Return the text of a variable's value."""
     return variable.words[list(map(repr, variable.given)).index(repr(value))]
 
 
 def places(variable: Variable) -> Float[np.ndarray, " k"]:
-    """Return the positions of the values along an axis: the numbers, or 0, 1, 2 of words."""
+    """Return positions of a variable's values along an axis: the numbers, else 0, 1, 2, ...."""
     if variable.numbers is None:
         return np.arange(len(variable.given), dtype=np.float64)
     return np.array(variable.numbers)
@@ -137,7 +137,7 @@ def two_sided(variable: Variable) -> bool:
 
 
 def with_article(variable: Variable) -> str:
-    """Return a variable's name within a sentence: only the beamwidth takes an article."""
+    """Return a variable's name for a sentence; only the beamwidth has an article."""
     return f"the {variable.name}" if variable.name == BEAM else variable.name
 
 
@@ -153,14 +153,14 @@ def geometric(numbers: Sequence[float]) -> bool:
 
 
 def _callers(value: Any) -> tuple[CallerConfig, ...] | None:
-    """Return the callers of a value; None if it is not a list of callers."""
+    """Convert a setting's value to callers; None if it is not a list of callers."""
     if not isinstance(value, list) or not all(isinstance(one, dict) for one in value):
         return None
     return tuple(CallerConfig(**one) for one in value)
 
 
 def _counted(value: Any) -> str:
-    """Write a single caller by its name or course, several by their number."""
+    """Format a list of callers: the name or course of a single caller, else their number."""
     callers = _callers(value)
     if callers is None:
         return _short(value)
@@ -171,7 +171,7 @@ def _counted(value: Any) -> str:
 
 
 def _calling(value: Any) -> str:
-    """Write a list of callers by their names and courses."""
+    """Format a list of callers by their names and courses."""
     callers = _callers(value)
     if callers is None:
         return _short(value)
@@ -180,7 +180,7 @@ def _calling(value: Any) -> str:
 
 
 def _short(value: Any) -> str:
-    """Write a value in a few digits, the route of a caller by its number of rows."""
+    """Format a setting's value with few digits; a caller's route by its number of rows."""
     if isinstance(value, (list, tuple)):
         return f"[{', '.join(map(_short, value))}]"
     if isinstance(value, dict):
@@ -192,7 +192,7 @@ def _short(value: Any) -> str:
 
 
 def three_digits(value: float) -> str:
-    """Write a number in three digits."""
+    """Format a number with three significant digits."""
     if not math.isfinite(value):
         return "∞" if value > 0 else ("−∞" if value < 0 else "no number")
     digits = max(0, 2 - math.floor(math.log10(abs(value)))) if value else 0
@@ -202,19 +202,19 @@ def three_digits(value: float) -> str:
 
 
 def amount(value: float, unit: str) -> str:
-    """Write a number with its unit, angles in degrees."""
+    """Format a number with its unit; radians become degrees."""
     factor, sign = UNITS[unit]
     return three_digits(factor * value) + (f" {sign}" if sign not in ("", "°") else sign)
 
 
 def interval(ends: Sequence[float], unit: str) -> str:
-    """Write an interval without its unit."""
+    """Format an interval in brackets, converted to its unit but without the unit's sign."""
     factor, _ = UNITS[unit]
     return "[" + ", ".join(three_digits(factor * end) for end in ends) + "]"
 
 
 def number_word(count: int) -> str:
-    """Write a count up to twelve as a word."""
+    """Format a count as a word up to twelve, else in digits."""
     return NUMBERS[count] if count < len(NUMBERS) else str(count)
 
 
