@@ -100,7 +100,7 @@ BagSlamConfig = create_model("BagSlamConfig", __base__=SlamConfig, bag=(BagConfi
 
 
 def base_layer(base: Base) -> Layer:
-    """Convert the settings to start from to a layer."""
+    """Convert the argument `config` (a Config, mapping, preset or file) to a layer of settings."""
     if base is None:
         return {}
     if isinstance(base, Config):
@@ -114,14 +114,14 @@ def base_layer(base: Base) -> Layer:
 
 
 def folder_named(place: object, name: str) -> Path:
-    """Convert an argument to a path, or raise."""
+    """Convert an argument that names a folder to a path, or raise."""
     if not isinstance(place, (str, Path)):
         raise refusal(name, shown(place), "the path of a folder", "name one")
     return Path(place)
 
 
 def short_names(short: Layer, flags: Layer) -> Layer:
-    """Select the short options with a value; raise if `flags` give the same setting."""
+    """Select the short options that have a value; raise if `flags` give the same setting."""
     short = {key: given for key, given in short.items() if given.value is not None}
     for key in short.keys() & flags.keys():
         both = f"{short[key].where} and {flags[key].where}"
@@ -130,12 +130,12 @@ def short_names(short: Layer, flags: Layer) -> Layer:
 
 
 def keyword(name: str, value: str = "") -> str:
-    """Format a parameter, perhaps with a value, as a call from Python has it."""
+    """Format a parameter, with a value if any, as a Python keyword argument for messages."""
     return f"{name}={value}" if value else name
 
 
 def warn_caller(*lines: str) -> None:
-    """Issue warnings at the line that called the package."""
+    """Issue warnings that point to the user's line of code that called the package."""
     frame, level = sys._getframe(1), 2
     while (caller := frame.f_back) and caller.f_globals.get("__name__", "").startswith(PACKAGE):
         frame, level = caller, level + 1
@@ -145,7 +145,7 @@ def warn_caller(*lines: str) -> None:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Door:
-    """A call of a function, from Python or from the command line.
+    """A user's call from Python or the command line: arguments, settings, output of messages.
 
     The defaults are for Python; the command line spells options as flags and prints messages.
     """
@@ -174,34 +174,34 @@ class Door:
     """Yields the function that receives progress, given the settings and the estimators."""
 
     def given(self, name: str) -> Given:
-        """Return an argument, None by default, with its name for messages."""
+        """Return an argument by its parameter's name, with the option's name for messages."""
         return Given(self.asked.get(name), self.option(name))
 
     def short(self) -> Layer:
-        """Select the settings given by short options; raise if `flags` give the same setting."""
+        """Select the settings that short options give; raise if `flags` give the same setting."""
         given = {key: self.given(name) for name, key in SHORT.items()}
         if isinstance(path := given[WORLD_KEY].value, Path):
             given[WORLD_KEY] = Given(str(path), given[WORLD_KEY].where)
         return short_names(given, self.flags)
 
     def folder(self, name: str) -> Path | None:
-        """Return the folder that an argument names, if it is given."""
+        """Return the path of the folder that an argument names; None if it is not given."""
         value = self.asked.get(name)
         return None if value is None else folder_named(value, self.option(name))
 
     def ways_out(self, name: str) -> tuple[str, str]:
-        """Return how to name another folder, and how to allow that its files are replaced."""
+        """Return the options, for messages, that name another folder and allow overwriting."""
         return self.option(name, "DIR"), self.option("overwrite", "True")
 
     def claimed(self, name: str, kind: Kind) -> OwnFiles | None:
-        """Claim the folder that an argument names, if it is given."""
+        """Claim the folder that an argument names for writing; None if it is not given."""
         if (folder := self.folder(name)) is None:
             return None
         overwrite = self.asked["overwrite"]
         return claim(folder, kind, overwrite=overwrite, flags=self.ways_out(name))
 
     def estimators(self, usual: str | Sequence[str]) -> tuple[str, ...]:
-        """Return the chosen estimators, else the usual; raise for `particles` without FastSLAM."""
+        """Return the chosen estimators, else `usual`; raise for `particles` without FastSLAM."""
         chosen, particles = self.asked["filters"], self.asked.get("particles")
         names = named_filters(usual if chosen is None else chosen, self.option("filters"))
         if particles is not None and not any("fastslam" in entry(n).sections for n in names):
@@ -215,7 +215,7 @@ class Door:
 
 
 def mission_settings(door: Door) -> tuple[Config, "World | None", tuple[str, ...]]:
-    """Resolve the settings of a simulated mission; return them, their world and estimators.
+    """Return the resolved settings of a simulated mission, its world and its estimators.
 
     Later layers win: defaults, named settings, the world's settings, `Door.beneath`, and
     `Door.flags` with the short options. The beamwidth is the half-power width of the vehicle's
@@ -266,14 +266,14 @@ def mission_settings(door: Door) -> tuple[Config, "World | None", tuple[str, ...
 
 
 def number(given: Given) -> float:
-    """Convert a value to float; raise if it is not a number, even for text such as "60"."""
+    """Convert an argument to a float; raise if it is not a number, even for text such as "60"."""
     if not isinstance(given.value, Real):
         raise InputError(f"{given.where}: found {shown(given.value)}, expected a number")
     return float(given.value)
 
 
 def frames_named(given: Given, count: int) -> range:
-    """Parse a slice A:B of `count` frames; None is all of them.
+    """Parse a range A:B out of `count` frames; None selects all of them.
 
     >>> frames_named(Given("2:4", "--frames"), 10), frames_named(Given(None, "--frames"), 10)
     (range(2, 4), range(0, 10))
@@ -292,7 +292,7 @@ def frames_named(given: Given, count: int) -> range:
 
 
 def named_strategies(chosen: str | Sequence[str]) -> tuple[Strategy, ...]:
-    """Return the strategies of a choice, in the order of `STRATEGIES`."""
+    """Return the sensing strategies that an argument chooses, in the order of `STRATEGIES`."""
     if isinstance(chosen, str):
         chosen = STRATEGIES if chosen == "all" else (chosen,)
     chosen = tuple(chosen) if isinstance(chosen, Iterable) else (chosen,)
@@ -309,7 +309,7 @@ _EXPECTED = "expected an estimator's name or its class"
 
 
 def named_filters(chosen: Filters, where: str = "filters") -> tuple[str, ...]:
-    """Return the names of the chosen estimators; ``module:Class`` for a class.
+    """Return the names of the estimators that an argument chooses; ``module:Class`` for a class.
 
     Text may list several names, separated by commas. The groups are "both", the paper's two, and
     "all".
@@ -340,7 +340,7 @@ def named_filters(chosen: Filters, where: str = "filters") -> tuple[str, ...]:
 
 
 def _name_of(kind: str | type, where: str) -> str:
-    """Return the import name of an estimator, for workers."""
+    """Return an estimator's name, or ``module:Class`` for a class, for import by workers."""
     if isinstance(kind, str):
         return kind.strip()
     if not isinstance(kind, type):
@@ -355,18 +355,18 @@ def _name_of(kind: str | type, where: str) -> str:
 
 
 def replayed(config: Config) -> Section:
-    """Select the settings that affect the solution of a log."""
+    """Select the settings that affect the solution of a recorded log."""
     kind = SlamConfig if config.bag == BagConfig() else BagSlamConfig
     return kind(**{name: getattr(config, name) for name in kind.model_fields})
 
 
 def is_open(key: Key) -> bool:
-    """Return whether a setting may be given for a log: used, and not decided by it."""
+    """Return whether a setting may be given with a log: it is used, and not fixed by the log."""
     return key[0] in BagSlamConfig.model_fields and key not in LOGGED | OF_WORLDS
 
 
 def check_open(flags: Layer) -> None:
-    """Raise if a setting is decided by the log or unused."""
+    """Raise if a given setting is fixed by the log or has no effect on a log."""
     for key, given in flags.items():
         if not is_open(key):
             why = "the log decides this" if key in LOGGED else "means nothing to a recorded log"
@@ -374,12 +374,12 @@ def check_open(flags: Layer) -> None:
 
 
 def has_excess_paths(recorded: "Log") -> bool:
-    """Return whether any row of a log has an excess path."""
+    """Return whether any measurement of a log has an excess path."""
     return any((scan.excess_path == scan.excess_path).any() for scan in recorded.scans)
 
 
 def with_log(layer: Layer, recorded: "Log", log: Path) -> tuple[Config, list[str]]:
-    """Resolve settings with the values that a log decides; return notes on overruled ones."""
+    """Resolve settings with the values that a log fixes; return notes on overruled settings."""
     decided: Layer = {key: Given(getattr(recorded, key[1]), f"{log}: {key[1]}") for key in LOGGED}
     own = {key: Given(value, "slam") for key, value in OWN.items()}
     for name, value in recorded.association.items():

@@ -36,12 +36,12 @@ TRUTH, MEASURED = ("truth.csv", "landmarks.csv"), "measurements.csv"
 
 
 def is_heard(key: Key) -> bool:
-    """Return whether `hear` uses a setting."""
+    """Return whether the function `hear` uses a setting."""
     return key[0] in SECTIONS or key == ("assumed", "speed_of_sound")
 
 
 def heard_settings(layer: Layer) -> Config:
-    """Resolve the settings of `hear`; raise for a setting that it does not use."""
+    """Resolve the settings of the function `hear`; raise for a setting that it does not use."""
     for key, given in layer.items():
         if not is_heard(key):
             raise InputError(f"{given.where}: means nothing to a sound recording; leave it out")
@@ -50,7 +50,7 @@ def heard_settings(layer: Layer) -> Config:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Heard:
-    """Result of `hear`: the echoes of a recording, and their figure."""
+    """Result of `hear`: the echoes detected in a sound recording, and their figure."""
 
     overview: "Overview"
     """Matched-filter output of the first calls, for the figure."""
@@ -65,7 +65,7 @@ class Heard:
 
     @property
     def measurements(self) -> "pl.DataFrame":
-        """Rows of the log: time, caller, bearing, range, excess path, their stds, level."""
+        """Table of the echoes: time, caller, bearing, range, excess path, deviations, level."""
         from io import StringIO
 
         import polars as pl
@@ -135,7 +135,7 @@ def hear(
 
 
 def hear_by(door: Door) -> Heard:
-    """Detect the echoes in a recording as `hear`, called by a door."""
+    """Detect the echoes in a recording as `hear` does, with the arguments in `door`."""
     place, config = folder_named(door.asked["recording"], "hear"), heard_settings(door.flags)
     own = door.claimed("output", LOG)
     if own is None:
@@ -153,7 +153,7 @@ def hear_by(door: Door) -> Heard:
 def _heard_into(
     own: OwnFiles, folder: Path, config: Config, door: Door, progress: Progress | None
 ) -> Heard:
-    """Write the echoes of a recording, call by call, its figure and its truth into a log."""
+    """Write the echoes of a recording, its figure and its truth into the folder of a log."""
     from pipistrelle.figures.style import save_figure
 
     made = make_folder(own.folder)
@@ -179,7 +179,7 @@ def _heard(
     progress: Progress | None,
     write: Callable[[str], object],
 ) -> Heard:
-    """Detect the echoes of a recording, and pass the rows of each call to `write` as text."""
+    """Detect the echoes of a recording, and pass each call's measurements as text to `write`."""
     from pipistrelle.detection.logs.folder import RowsHeard
     from pipistrelle.detection.sounds.check import Overview
     from pipistrelle.detection.sounds.hearing import hear_recording, log_callers
@@ -204,14 +204,14 @@ def _heard(
 
 
 def faults_of(folder: Path, config: Config) -> list[str]:
-    """Return the faults of a recording, a line each."""
+    """Check a sound recording and return its faults, a line each."""
     from pipistrelle.detection.sounds.check import check_recording
 
     return check_recording(folder, described(folder), config)
 
 
 def described(folder: Path) -> "Description":
-    """Read the description of a recording; raise if it is not a folder of a recording."""
+    """Read the description of a sound recording; raise if the folder holds no recording."""
     from pipistrelle.detection.sounds.sound_file import FILE, read_description
 
     if not folder.is_dir():

@@ -88,7 +88,7 @@ R = TypeVar("R")
 
 
 class Pose(NamedTuple):
-    """Pose of the vehicle at a time."""
+    """Estimated pose of the vehicle at a time, with its covariance."""
 
     time: float
     """[s]."""
@@ -103,7 +103,7 @@ class Pose(NamedTuple):
 
 
 class Slam:
-    """Pose and map of a vehicle that drives now.
+    """Online SLAM: estimates pose and map of a vehicle step by step while it drives.
 
     The results are bit-identical to `pipistrelle slam` with the same steps and rows. A call that
     raises an error changes nothing.
@@ -173,7 +173,7 @@ class Slam:
         self._begin(log, told, own_config(resolved, names[0]), names[0], kept)
 
     def _begin(self, log: Log, told: VehicleKeys, config: Config, name: str, kept: int) -> None:
-        """Build the estimator at the start of the drive."""
+        """Build the estimator and its state at the start of the drive."""
         self._log, self._vehicle, self._config = log, told, config
         self._name, self._kept = name, kept
         drive = drive_of(log, NO_TRUTH)
@@ -202,7 +202,7 @@ class Slam:
 
     @property
     def pose(self) -> Pose:
-        """Estimated pose of the vehicle, now."""
+        """Estimated pose of the vehicle at the present time."""
         pose = self._at_vehicle(self._session.belief.pose())
         values, axes = np.linalg.eigh(pose.covariance)
         covariance = pose.covariance if values[0] >= 0.0 else (axes * values.clip(0.0)) @ axes.T
@@ -211,24 +211,24 @@ class Slam:
 
     @property
     def map(self) -> "pl.DataFrame":
-        """Landmarks, a row for each hypothesis, with the columns of ``landmarks.parquet``."""
+        """Table of the map, a row per hypothesis of each landmark, as in ``landmarks.parquet``."""
         return self._map_table(self._session.landmarks())
 
     @property
     def moving(self) -> "pl.DataFrame":
-        """Moving callers, with the columns of `map`."""
+        """Table of the moving callers, with the columns of `map`."""
         return self._map_table(completed(self._session.belief, Belief).moving())
 
     @staticmethod
     def _map_table(landmarks: Landmarks) -> "pl.DataFrame":
-        """Return the table of a map without true positions."""
+        """Convert landmarks to the table of a map without true positions."""
         return landmark_table(landmarks, None).drop(
             "true_x_m", "true_y_m", "error_m", "true_landmark"
         )
 
     @property
     def path(self) -> "pl.DataFrame":
-        """Time, pose and standard deviations at the start and after each step.
+        """Table of time, pose and standard deviations, at the start and after each step.
 
         The smoothed trajectory, if the estimator revises it; else the kept estimates.
         """
@@ -247,7 +247,7 @@ class Slam:
         *,
         time: float | Sequence[float] | None = None,
     ) -> None:
-        """Predict by one step of odometry, or by k steps.
+        """Predict the vehicle's pose by one step of odometry, or by k steps.
 
         Parameters
         ----------
@@ -286,7 +286,7 @@ class Slam:
         self._time, self._heard = float(ends[-1]), set()
 
     def hear(self, *, time: float | None = None, **columns: Any) -> Int[np.ndarray, " m"]:
-        """Update with the rows of a scan, measured at the present pose.
+        """Update pose and map with a scan that was measured at the present pose.
 
         Parameters
         ----------
@@ -345,7 +345,7 @@ class Slam:
         return labels
 
     def save(self, file: Path | str) -> Path:
-        """Write the vehicle, the settings and the estimates into a file for `load`.
+        """Write the vehicle, the settings and the estimates into a file that `load` reads.
 
         An existing file is replaced only if `save` wrote it.
         """
@@ -375,7 +375,7 @@ class Slam:
         filter: str | type | None = None,  # noqa: A002 - the name of the option
         association__method: str | None = None,
     ) -> Self:
-        """Restore a drive from a file of `save`; it continues with the same bits.
+        """Restore a drive from a file that `save` wrote; it continues with the same bits.
 
         Parameters
         ----------
@@ -403,7 +403,7 @@ class Slam:
         return slam
 
     def _go_on_from(self, name: str, association: str, state: DriveState) -> None:
-        """Restore the contents of a file of `save`."""
+        """Restore this drive from the parsed contents of a file that `save` wrote."""
         config = Config.model_validate(state.settings)
         belief, method = state.session.belief, config.association.method
         particles = isinstance(belief, FastSlamBelief) and belief.log_weight.size
@@ -425,7 +425,7 @@ class Slam:
                 raise ValueError("a pose that is no number")
 
     def copy(self) -> Self:
-        """Return an independent copy, which continues with the same bits."""
+        """Return an independent copy of the drive, which continues with the same bits."""
         other = type(self).__new__(type(self))
         other._begin(self._log, self._vehicle, self._config, self._name, self._kept)
         other._session.go_on_from(self._session.state())
@@ -433,7 +433,7 @@ class Slam:
         return other
 
     def __repr__(self) -> str:
-        """Format the estimator, the pose and the number of landmarks."""
+        """Format the estimator, the pose and the number of landmarks in a line."""
         pose, landmarks = self.pose, self._session.landmarks().landmark
         return (
             f"Slam by {self._name} at {pose.time:g} s: x {pose.x:.3f} m, y {pose.y:.3f} m, heading "
@@ -441,14 +441,14 @@ class Slam:
         )
 
     def _online(self) -> tuple[Float[np.ndarray, " k"], Gaussian]:
-        """Return the kept times, and the pose estimate of each time."""
+        """Return the times of the last steps, and the pose as estimated at each time."""
         times, poses = zip(*self._poses, strict=True)
         mean = np.array([pose.mean for pose in poses])
         covariance = np.array([pose.covariance for pose in poses])
         return np.array(times), Gaussian(mean=mean, covariance=covariance)
 
     def _change(self, act: Callable[[], R]) -> R:
-        """Call a function that changes the session; restore the session if it raises."""
+        """Call a function that changes the estimator's state; undo the change if it raises."""
         before = self._session.state()
         try:
             result = act()
@@ -461,13 +461,13 @@ class Slam:
             raise
 
     def _at_vehicle(self, pose: Gaussian) -> Gaussian:
-        """Convert a pose of the sensor to the pose of the vehicle."""
+        """Convert an estimated pose of the sensor to the pose of the vehicle."""
         sensor = self._drive.sensor
         return carried(pose, vehicle_in(sensor)) if any(sensor) else pose
 
 
 def _fault(pose: Gaussian) -> tuple[str, str] | None:
-    """Return the fault of a pose and the expected state; None for a valid pose.
+    """Return the fault of an estimated pose and the expected state; None for a valid pose.
 
     Rounding makes an eigenvalue of 0 slightly negative, by less than half of the digits.
     """
@@ -483,7 +483,7 @@ def _fault(pose: Gaussian) -> tuple[str, str] | None:
 
 
 def _log_of(vehicle: Vehicle, time: float) -> tuple[Log, Path, VehicleKeys]:
-    """Return an empty log of a vehicle, the place of its keys, and the keys."""
+    """Return an empty log of a vehicle, the path of its description, and its parsed keys."""
     if isinstance(vehicle, Mapping):
         where, former = Path("vehicle"), ()
         told = vehicle_of(OF_ITSELF | dict(vehicle), where)
@@ -500,7 +500,7 @@ def _log_of(vehicle: Vehicle, time: float) -> tuple[Log, Path, VehicleKeys]:
 
 
 def numbers(values: object, where: str) -> Float[np.ndarray, "*n"]:
-    """Convert values to an array of numbers, None and masked values to NaN; else raise."""
+    """Convert values to a float array, None and masked values to NaN; raise for other types."""
     try:
         given = np.asarray(values)
         if isinstance(values, np.ma.MaskedArray):
@@ -516,7 +516,7 @@ def numbers(values: object, where: str) -> Float[np.ndarray, "*n"]:
 
 
 def finite(value: object, where: str) -> float:
-    """Convert a value to a finite number, or raise."""
+    """Convert a value to a single finite float, or raise InputError."""
     number = numbers(value, where)
     if number.shape != () or not np.isfinite(number):
         raise refusal(where, shown(value), "a finite number", "correct it")
@@ -524,7 +524,7 @@ def finite(value: object, where: str) -> float:
 
 
 def times_of(dt: object, time: object, now: float) -> Times:
-    """Return the ends and lengths of steps, given either."""
+    """Return the end times and the lengths [s] of control steps, given either of them."""
     if (dt is None) == (time is None):
         found = "neither dt nor time" if dt is None else "both dt and time"
         fix = "say how long the step took, or when it ended"
@@ -546,7 +546,7 @@ def times_of(dt: object, time: object, now: float) -> Times:
 
 
 def check_clock(ends: Float[np.ndarray, " k"], now: float = -inf) -> None:
-    """Raise for times beyond `MAX_TIME`, or too close for floats after `now` [s]."""
+    """Raise if a time exceeds `MAX_TIME`, or a step after `now` [s] is too short for floats."""
     if (far := np.abs(ends) > MAX_TIME).any():
         found = f"the time {ends[far][0].item()} s"
         raise refusal("time", found, f"seconds, up to {MAX_TIME:g}", "take another zero or unit")
@@ -556,7 +556,7 @@ def check_clock(ends: Float[np.ndarray, " k"], now: float = -inf) -> None:
 
 
 def table_of(columns: Mapping[str, Any], callers: Sequence[LogCaller], *, labelled: bool) -> Table:
-    """Convert the columns of a scan to a table of a log; raise for missing labels if needed."""
+    """Convert the columns of a scan to a table as of a log; raise if a needed label is missing."""
     if unknown := sorted(columns.keys() - {*COLUMNS}):
         near = meant(unknown[0], COLUMNS)
         fix = f"did you mean {near!r}?" if near else "leave it out"

@@ -65,24 +65,24 @@ Question = tuple[str, str]
 
 
 def labels_of(recorded: "Log") -> set[int]:
-    """Return the labels of all rows."""
+    """Return the set of landmark labels in a log."""
     return {label for scan in recorded.scans for label in scan.landmark.tolist()}
 
 
 def distance_driven(recorded: "Log") -> float:
-    """Return the distance driven by the odometry, forwards and backwards [m]."""
+    """Return the distance [m] that a log's odometry covers, forwards and backwards."""
     if recorded.motion == "poses":
         return sum(hypot(*step) for step in recorded.controls[:, :2].tolist())
     return float(abs(recorded.controls[:, 0] * recorded.dt).sum())
 
 
 def log_warnings(recorded: "Log", truth: "Truth", log: Path) -> list[str]:
-    """Return warnings on a log before it is solved: doubtful values, ignored rows, jumps."""
+    """Return warnings about a log before it is solved: doubtful values, ignored rows, jumps."""
     return [f"{log}: {note}" for note in _doubts(recorded, truth)]
 
 
 def _doubts(recorded: "Log", truth: "Truth") -> Iterator[str]:
-    """Yield the warnings on a log before it is solved."""
+    """Yield the warnings about a log before it is solved, without the log's path."""
     from pipistrelle.text_tables import FORMER_NAMES
 
     yield from recorded.doubts
@@ -111,7 +111,7 @@ def _doubts(recorded: "Log", truth: "Truth") -> Iterator[str]:
 
 
 def _jumps(recorded: "Log") -> Iterator[str]:
-    """Question odometry poses with steps much larger than the others (a changed frame)."""
+    """Yield a warning if some odometry steps are far larger than the others (a changed frame)."""
     from pipistrelle.detection.logs.poses import jumps
 
     far_steps = jumps(recorded.controls, recorded.dt)
@@ -127,7 +127,7 @@ def _jumps(recorded: "Log") -> Iterator[str]:
 
 
 def _unheard(recorded: "Log", labels: set[int]) -> Iterator[str]:
-    """Warn of callers with excess paths but without a position or a row of their landmark."""
+    """Yield a warning for each caller that has excess paths but no known or measured position."""
     timed = {
         number
         for scan in recorded.scans
@@ -144,7 +144,7 @@ def _unheard(recorded: "Log", labels: set[int]) -> Iterator[str]:
 def fit_warnings(
     recorded: "Log", trials: "Sequence[TrialResult]", log: Path, config: Config
 ) -> list[str]:
-    """Return warnings on trials of a log with many rows that do not fit.
+    """Return warnings about the solution of a log if many measurements do not fit it.
 
     They name the mistake in its columns that explains the misfit, else ask about units and labels.
     """
@@ -173,7 +173,7 @@ def fit_warnings(
 
 
 def _units(recorded: "Log") -> str:
-    """Ask about the units and the sense of the numbers of a log."""
+    """Return a question for the user on the units and the sense of a log's angles and ranges."""
     metric = "ranges and excess paths" if has_excess_paths(recorded) else "ranges"
     angles = "bearings and headings" if recorded.motion == "poses" else "bearings"
     labels = ", and all labels right" if labels_of(recorded) != {UNLABELLED} else ""
@@ -181,7 +181,7 @@ def _units(recorded: "Log") -> str:
 
 
 def _rejected(trial: "TrialResult", recorded: "Log", config: Config) -> list[Question]:
-    """Question the rows of a trial with many gated measurements or a large NIS."""
+    """Return warnings if the gate rejects many of a trial's measurements, or the NIS is large."""
     from pipistrelle.experiments.results.scores import is_placed, judged
 
     heard = judged(trial.scans)
@@ -208,7 +208,7 @@ def _rejected(trial: "TrialResult", recorded: "Log", config: Config) -> list[Que
 
 
 def _strayed(trial: "TrialResult", who: str) -> list[Question]:
-    """Question landmarks with successive measurements far from the final map and path."""
+    """Return a warning if successive measurements of a landmark are far from the final map."""
     from pipistrelle.evaluation.consistency import strayed_landmarks
 
     strayed = strayed_landmarks(trial.track, trial.scans, GATE, MAX_GATED_SHARE + 1.0 - GATE)
@@ -224,7 +224,7 @@ def _strayed(trial: "TrialResult", who: str) -> list[Question]:
 
 
 def _unmapped(trial: "TrialResult", recorded: "Log") -> list[Question]:
-    """Question an association that assigned fewer than half of the rows to the final map."""
+    """Return a warning if an association assigned less than half of the rows to the final map."""
     labels = np.concatenate(trial.track.labels)
     mapped = np.count_nonzero(np.isin(labels, trial.track.landmarks.landmark))
     if 2 * mapped >= labels.size:
@@ -234,7 +234,7 @@ def _unmapped(trial: "TrialResult", recorded: "Log") -> list[Question]:
 
 
 def _unsure(trials: "Sequence[TrialResult]", config: Config) -> Iterator[str]:
-    """Warn if an association discards most rows as uncertain; advise a setting that keeps them."""
+    """Yield a warning if an association discards most measurements as uncertain, with a remedy."""
     for trial in trials:
         settings = own_config(config, trial.filter).association
         rows = sum(scan.landmark.size for scan in trial.heard)
@@ -259,7 +259,7 @@ def _unsure(trials: "Sequence[TrialResult]", config: Config) -> Iterator[str]:
 
 
 def nis_warning(trial: "TrialResult") -> str:
-    """Return a warning on innovations much larger than predicted; "" if there is none."""
+    """Return a warning if a trial's innovations are much larger than predicted, else ""."""
     nis = trial.scores.nis_mean
     if nis is None or not MAX_NIS < nis < inf:
         return ""
@@ -271,7 +271,7 @@ def nis_warning(trial: "TrialResult") -> str:
 
 
 def _out_of_bounds(recorded: "Log") -> dict[str, list[Question]]:
-    """Question the values of each column outside plausible bounds; an excess path is < 2 ranges."""
+    """Return warnings about each kind of measurement with many values outside plausible bounds."""
     near, far = recorded.range_bounds
     bounds = f"range_bounds ({near:g} to {far:g} m)"
     bearing = recorded.recorded_bearings()
@@ -299,7 +299,7 @@ def _out_of_bounds(recorded: "Log") -> dict[str, list[Question]]:
 
 
 class Mistake(NamedTuple):
-    """A mistake in the columns of a log, and its correction."""
+    """A possible mistake in the columns of a log, such as wrong units, and its correction."""
 
     cause: str
     undone: str
@@ -375,7 +375,7 @@ axes of the map."""
 
 
 class _Rows(NamedTuple):
-    """Recorded rows of one scan; NaN for a missing number."""
+    """Measurements of a scan as recorded, for the search for mistakes; NaN if missing."""
 
     bearing: Float[np.ndarray, " m"]
     range: Float[np.ndarray, " m"]
@@ -387,7 +387,7 @@ class _Rows(NamedTuple):
 
 
 def misreading(recorded: "Log") -> tuple[str, bool]:
-    """Return the mistake that explains the rows of a log ("" for none), and whether they fit.
+    """Return the mistake that best explains a log's rows ("" for none), and whether they fit.
 
     A mistake is named if, by a sign test over scans at the level `CHANCE`, the rows are more
     probable with it corrected than as recorded, than with any other mistake corrected, and than
@@ -419,7 +419,7 @@ def _sign_test(difference: Float[np.ndarray, " n"]) -> float:
 
 
 def _fits(recorded: "Log") -> tuple[Int[np.ndarray, " k"], Float[np.ndarray, "k h"]]:
-    """Return the scan of each compared row, and its fit: as recorded, then by each correction.
+    """Return the scan number of each compared row, and its fit: as recorded, and by correction.
 
     The fit is the sum over earlier scans of log p(z) / p_0.
     """
@@ -446,7 +446,7 @@ def _fits(recorded: "Log") -> tuple[Int[np.ndarray, " k"], Float[np.ndarray, "k 
 
 
 def _recorded_rows(recorded: "Log") -> list[_Rows]:
-    """Return the rows of each scan that are not direct calls or moving callers."""
+    """Return each scan's measurements that have a bearing and are of fixed landmarks, by echo."""
     ends = np.cumsum([scan.landmark.size for scan in recorded.scans])
     bearings = np.split(recorded.recorded_bearings(), ends[:-1])
     moving = [caller.landmark for caller in recorded.callers if caller.moves]
@@ -464,13 +464,13 @@ def _recorded_rows(recorded: "Log") -> list[_Rows]:
 
 
 def _some(rows: _Rows, chosen: np.ndarray) -> _Rows:
-    """Select rows of a scan by their indices, which are rounded."""
+    """Select measurements of a scan by their indices, which are rounded first."""
     n = np.unique(chosen.round().astype(int)) if rows.label.size else np.empty(0, int)
     return _Rows(rows.bearing[n], rows.range[n], rows.variance[:, n], rows.label[n], rows.step)
 
 
 def _path(recorded: "Log", rate: float) -> _Path:
-    """Dead-reckon the path with the angular rate or the steering angle multiplied by `rate`."""
+    """Dead-reckon a log's path, with angular rate or steering angle multiplied by `rate`."""
     controls = recorded.controls.copy()
     if recorded.motion != "poses":
         controls[:, 1] *= rate
@@ -491,7 +491,7 @@ def _path(recorded: "Log", rate: float) -> _Path:
 def _undone(
     rows: _Rows, mistake: Mistake, heading: float
 ) -> tuple[Float[np.ndarray, " m"], Float[np.ndarray, " m"]]:
-    """Return the bearings and ranges of rows after the correction of a mistake."""
+    """Correct a mistake in the measurements of a scan; return new bearings and ranges."""
     bearing, distance = rows.bearing, rows.range
     if mistake.swapped:
         bearing, distance = distance, bearing
@@ -502,7 +502,7 @@ def _undone(
 def _expected(
     earlier: _Rows, mistake: Mistake, path: _Path, step: int
 ) -> tuple[Float[np.ndarray, "5 n"], Int[np.ndarray, " n"]]:
-    """Predict the rows of a later step from the ranges of an earlier scan; return their labels.
+    """Predict the measurements at a later step from an earlier scan; return also their labels.
 
     The prediction is a bearing, a range, and the entries bb, rb and rr of their covariance.
     """
@@ -539,7 +539,7 @@ def _expected(
 def _log_ratio(
     earlier: _Rows, later: _Rows, mistake: Mistake, path: _Path, spans: Sequence[float]
 ) -> Float[np.ndarray, " m"]:
-    """Return log p(z) / p_0 of each row given an earlier scan; 0 without a possible partner."""
+    """Return a log-likelihood ratio per row: predicted by an earlier scan, or by chance."""
     (b, r, bb, rb, rr), label = _expected(earlier, mistake, path, later.step)
     bearing, distance = _undone(later, mistake, path[0][later.step, 2])
     db, dr = wrap(bearing[:, np.newaxis] - b), distance[:, np.newaxis] - r
@@ -559,7 +559,7 @@ def _log_ratio(
 
 
 def wide_sight(trial: "TrialResult", recorded: "Log", config: Config) -> list[Question]:
-    """Question a stated field of view or range of the sensor that is wider than its rows.
+    """Return warnings if the stated field of view or range of the sensor seems too wide.
 
     Landmarks expected beyond the quantile `REACH` of the rows but within the stated limit must be
     detected with the probability ``association.detection``. The limit is questioned if the
@@ -599,7 +599,7 @@ def wide_sight(trial: "TrialResult", recorded: "Log", config: Config) -> list[Qu
 def _expected_rows(
     trial: "TrialResult", recorded: "Log"
 ) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"], Bool[np.ndarray, " n"]]:
-    """Return predicted range and bearing of each landmark in some scans, and its detection."""
+    """Return expected range and bearing of landmarks in some scans, and which were detected."""
     track, landmarks = trial.track, trial.track.landmarks
     mask = placed(landmarks)
     points, label = landmarks.mean[mask], landmarks.landmark[mask]

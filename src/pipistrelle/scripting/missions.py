@@ -78,7 +78,7 @@ def simulated(
     world: World | None = None,
     **conducted: Any,
 ) -> Mission:
-    """Simulate a drive and map it by `run_mission`; add warnings to the mission."""
+    """Simulate a drive and map it with each estimator; add warnings to the mission."""
     config, world = of_estimators(config, filters), world or ALL_DRAWN
     mission = run_mission(config, strategies, filters, world=world, **conducted)
     assert mission.scenario is not None
@@ -93,7 +93,7 @@ def simulated(
 
 
 def _far_off(trials: Sequence[TrialResult]) -> Iterator[str]:
-    """Yield a warning for each estimate with a position error of many times the bound."""
+    """Yield a warning for each estimate with a position error far above its lower bound."""
     for trial in trials:
         error, bound = trial.scores.position_rmse_m, trial.scores.position_bound_m
         if error is None or bound is None:
@@ -110,7 +110,7 @@ def _far_off(trials: Sequence[TrialResult]) -> Iterator[str]:
 def prepare_slam(
     door: Door, layer: Layer, strategies: Sequence[Strategy], filters: Sequence[str]
 ) -> Conduct:
-    """Read a recorded log and resolve its settings; return the function that solves it.
+    """Read a recorded log and resolve its settings; return a function that solves the log.
 
     The door gets notes of the reader, and warnings. Its flags override `layer`; ranges outside its
     `beamwidth` [deg] about the heading are hidden.
@@ -148,7 +148,7 @@ def prepare_slam(
 
 
 def failures(mission: Mission) -> list[str]:
-    """Return a line for each estimate that failed or has a path that is not finite."""
+    """Return a message for each estimate that failed or has a path that is not finite."""
     return [
         f"{trial.strategy} {trial.filter} failed: {trial.error or 'its path is not finite'}"
         for trial in mission.trials
@@ -163,7 +163,7 @@ def strategy_names(mission: Mission) -> dict[str, str]:
 
 
 def drawn(mission: Mission) -> "Figure":
-    """Draw the maps and errors of a mission."""
+    """Draw the figure of a mission: maps and errors of all estimates."""
     from pipistrelle.figures.mission import draw_mission
 
     return draw_mission(
@@ -176,7 +176,7 @@ def drawn(mission: Mission) -> "Figure":
 
 
 def filmed(mission: Mission, watch: "MissionRecorder", path: Path) -> None:
-    """Animate the recorded snapshots of a mission in a .gif or .mp4 file."""
+    """Write a film of a mission's recorded snapshots as a .gif or .mp4 file."""
     from pipistrelle.figures.film import animate_mission
 
     animate_mission(
@@ -189,7 +189,7 @@ def filmed(mission: Mission, watch: "MissionRecorder", path: Path) -> None:
 
 
 def caller_names(mission: Mission) -> tuple[str, ...]:
-    """Return the names of the callers other than the vehicle."""
+    """Return the names of a mission's callers, without the vehicle."""
     callers = mission.callers if mission.log is None else mission.log.callers
     return tuple(caller.name for caller in callers)
 
@@ -202,7 +202,7 @@ def keep(
     film: Callable[[Path], None] = lambda _: None,
     save_bag: bool = False,
 ) -> None:
-    """Write a mission into its folder, in place of earlier results.
+    """Write the results of a mission into its folder, in place of earlier results.
 
     `command` is recorded for the reader; `film` may write into the folder that it is given.
     """
@@ -241,7 +241,7 @@ def keep(
 
 
 class Recordings:
-    """Writer of the log, the world and the sound of a simulated mission into folders.
+    """Writer of a simulated mission's log, world and sound into folders.
 
     The folders are claimed, and the size of the sound is checked, before the mission begins.
     """
@@ -276,7 +276,7 @@ class Recordings:
         )
 
     def conduct(self, mission_of: Conduct, **watched: Any) -> Mission:
-        """Conduct a mission and write its sound meanwhile."""
+        """Conduct a mission and write its sound frame by frame."""
         if (sound := self.sound) is None:
             return mission_of(**watched)
         sound.begin(checked_scenario(self._config, world=self._world or ALL_DRAWN))
@@ -284,7 +284,7 @@ class Recordings:
         return replace(mission, notes=lambda: (*mission.notes(), *sound.notes()))
 
     def write(self, mission: Mission) -> None:
-        """Write the folders of a mission that has ended."""
+        """Write the log, the world and the sound of a finished mission into their folders."""
         if self._drawn is not None:
             assert mission.scenario is not None
             self._drawn.replace(world_files(mission.scenario, self._config))
@@ -302,13 +302,13 @@ class Recordings:
             self.sound.own.replace(files)
 
     def close(self) -> None:
-        """Discard the sound that is not yet written as a whole."""
+        """Delete the sound file if the recording was not completed."""
         if self.sound is not None:
             self.sound.discard()
 
 
 def files_of_log(mission: Mission) -> dict[str, str]:
-    """Return the measurements of a simulated mission as a log, with the truth.
+    """Return the files of a log made from a simulated mission, with the truth.
 
     They are the fused ones, if that strategy was sensed. If the settings of the filters differ, a
     filter with known labels, excess paths and standard deviations per row is preferred, since
@@ -327,7 +327,7 @@ def files_of_log(mission: Mission) -> dict[str, str]:
 
 
 def _log(mission: Mission, trial: TrialResult, scans: Sequence[Scan]) -> Log:
-    """Return a simulated mission as a recorded log, by the settings of a trial's filter."""
+    """Convert a simulated mission to a recorded log, with the settings of a trial's filter."""
     config = own_config(mission.config, trial.filter)
     drive, _ = split_at(mission.drive, [scan.time for scan in scans])
     timing = config.listening.timing

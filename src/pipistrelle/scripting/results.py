@@ -74,12 +74,12 @@ class Results:
 
     @cached_property
     def mission(self) -> "Mission":
-        """The mission, conducted again if only its folder is given."""
+        """The mission with its estimates; conducted again if only its result folder is known."""
         return self._redo(None)
 
     @cached_property
     def summary(self) -> "pl.DataFrame":
-        """Scores of each strategy and filter, with the names of ``summary.json``."""
+        """Table of the scores of each strategy and filter, named as in ``summary.json``."""
         import polars as pl
 
         if self.folder is not None:
@@ -96,22 +96,22 @@ class Results:
 
     @property
     def tracks(self) -> "pl.DataFrame":
-        """A row for each control step: estimate, standard deviations, truth, errors, NEES."""
+        """Table of tracks, a row per control step: pose, deviations, truth, errors, NEES."""
         return self._tables["steps"]
 
     @property
     def landmarks(self) -> "pl.DataFrame":
-        """A row for each hypothesis of each landmark, with the true position."""
+        """Table of maps, a row per hypothesis of each landmark, with the true position."""
         return self._tables["landmarks"]
 
     @property
     def measurements(self) -> "pl.DataFrame":
-        """A row for each measurement of each strategy; null for a missing number."""
+        """Table of measurements, a row each for every strategy; null for a missing number."""
         return self._tables["measurements"]
 
     @cached_property
     def _tables(self) -> "dict[str, pl.DataFrame]":
-        """The tables by name, read from the folder if it exists."""
+        """The tables by name, read from the result folder if there is one."""
         import polars as pl
 
         if self.folder is None:
@@ -131,13 +131,13 @@ class Results:
         return tables
 
     def figure(self) -> "Figure":
-        """Draw the maps and errors, as in ``mission.png``."""
+        """Draw the maps and errors of the mission, as in ``mission.png``."""
         from pipistrelle.scripting.missions import drawn
 
         return drawn(self.mission)
 
     def animate(self, path: Path | str = "mission.gif") -> Path:
-        """Film the mission, which is conducted again for it.
+        """Write a film of the mission, which is conducted again for this.
 
         Parameters
         ----------
@@ -159,7 +159,7 @@ class Results:
         return Path(path)
 
     def save(self, folder: Path | str, *, overwrite: bool = False, save_bag: bool = False) -> Path:
-        """Write a result folder as the command line does.
+        """Write the results into a folder, as the command line does.
 
         Parameters
         ----------
@@ -186,7 +186,7 @@ class Results:
         return own.folder
 
     def to_xarray(self) -> Any:
-        """Return the tracks with the dimensions strategy, filter and time (extra ``export``).
+        """Return the tracks as an xarray dataset by strategy, filter, time (extra ``export``).
 
         Raises
         ------
@@ -204,11 +204,11 @@ class Results:
         return self.tracks.to_pandas().set_index(["strategy", "filter", "time_s"]).to_xarray()
 
     def _scores_shown(self) -> "pl.DataFrame":
-        """Select the scores that a notebook shows."""
+        """Return the table of scores that a notebook shows."""
         return self.summary.select("strategy", "filter", *shown_in("notebook"))
 
     def __repr__(self) -> str:
-        """Format the scores as a table."""
+        """Format the scores as a text table."""
         return f"Results of a mission\n{self._scores_shown()}"
 
     def _repr_html_(self) -> str:
@@ -321,7 +321,7 @@ def run(
 
 
 def run_by(door: Door) -> Results:
-    """Simulate a mission as `run`, called by a door."""
+    """Simulate a mission as `run` does, with the arguments in `door`."""
     config, world, usual = mission_settings(door)
     strategies = named_strategies(door.asked["strategies"])
     names = door.estimators(usual)
@@ -351,7 +351,7 @@ def slam(
     progress: Progress | None = None,
     **settings: Any,
 ) -> Results:
-    """Solve a recorded log, as `pipistrelle slam` does.
+    """Estimate path and map from a recorded log, as `pipistrelle slam` does.
 
     Doubtful values in the log are warnings; settings that the log decides are refused.
 
@@ -400,7 +400,7 @@ def slam(
 
 
 def slam_by(door: Door) -> Results:
-    """Solve a log as `slam`, called by a door."""
+    """Estimate path and map from a log as `slam` does, with the arguments in `door`."""
     layer, usual = over_named(door.beneath, door.flags)
     strategies = named_strategies(door.asked["strategies"])
     names = door.estimators(usual or SLAM_TAKES)
@@ -417,7 +417,7 @@ def _conducted(
     working: AbstractContextManager[Any],
     recordings: "Recordings | None" = None,
 ) -> Results:
-    """Conduct a mission, write its results, and warn; `working` yields the progress function."""
+    """Conduct a mission, write its results into a folder and issue its warnings."""
     from pipistrelle.experiments.machine import keep_freed_memory
     from pipistrelle.experiments.results.writing import result_folder
     from pipistrelle.scripting.missions import filmed, keep
@@ -467,7 +467,7 @@ def _conducted(
 def _called(
     conduct_by: Callable[[Door], Results], asked: dict[str, Any], flags: Layer, **more: str
 ) -> Results:
-    """Conduct a mission from Python: announce the compilation, warn of failed estimates."""
+    """Conduct a mission that was called from Python; warn of failed estimates."""
     from pipistrelle.kernel_clock import announce
     from pipistrelle.scripting.missions import failures
 
@@ -487,7 +487,7 @@ def _called(
 def load(
     folder: Path | str, /, *, filters: Filters = (), association: str = ""
 ) -> "Results | StudyResults":
-    """Open a folder of results or of a study; figures of a mission conduct it again.
+    """Open a result folder of a mission or study; figures of a mission conduct it again.
 
     Parameters
     ----------

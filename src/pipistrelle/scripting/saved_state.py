@@ -93,7 +93,7 @@ RECORDS: dict[str, Any] = {
 
 
 class DriveState(NamedTuple):
-    """Contents of a file."""
+    """State of a drive as a file stores it: vehicle, settings, estimator and last poses."""
 
     name: str
     """Name of the vehicle in messages."""
@@ -116,12 +116,12 @@ class DriveState(NamedTuple):
 
 
 def _modules(names: Sequence[str]) -> set[str]:
-    """Return the modules of a user's estimator and association."""
+    """Return the modules that define the user's estimator and association."""
     return {name.partition(":")[0] for name in names if names_class(name)}
 
 
 def write_state(path: Path, names: tuple[str, str], state: DriveState) -> None:
-    """Write the names of estimator and association and the state; replace only such a file."""
+    """Write a drive's state into a new file, or over a file that this function wrote."""
     modules = _modules(names)
     try:
         nodes = _Nodes(modules)
@@ -150,7 +150,7 @@ def write_state(path: Path, names: tuple[str, str], state: DriveState) -> None:
 
 @contextmanager
 def refused_if_forged(path: Path) -> Iterator[None]:
-    """Raise an `InputError` for any failure by a file with a right checksum and wrong contents."""
+    """Raise an InputError for any error in this context, which reads a forged or damaged file."""
     try:
         yield
     except InputError:
@@ -161,7 +161,7 @@ def refused_if_forged(path: Path) -> Iterator[None]:
 
 
 def read_state(path: Path, own: Mapping[str, str | None]) -> tuple[tuple[str, str], DriveState]:
-    """Read the file, which may be forged; return the names of `write_state` and the state.
+    """Read a file that may be forged; return its estimator's and association's names and state.
 
     ``own``: estimator and association that the caller trusts, by the names of the options. Call it
     within `refused_if_forged`.
@@ -183,7 +183,7 @@ def read_state(path: Path, own: Mapping[str, str | None]) -> tuple[tuple[str, st
 
 
 def _checked_names(path: Path, header: Any, own: Mapping[str, str | None]) -> tuple[str, str]:
-    """Raise for a file of another version, or of a user's class that the caller does not name."""
+    """Check a file's version and classes; return the names of estimator and association."""
     here, written = find_version(), header["version"]
     if written != here or header.get("form", 1) != FORM:
         found = f"a drive of Pipistrelle {written if isinstance(written, str) else shown(written)}"
@@ -201,16 +201,16 @@ def _checked_names(path: Path, header: Any, own: Mapping[str, str | None]) -> tu
 
 
 def _no_number(word: str) -> None:
-    """Raise for NaN and Infinity, which are not JSON."""
+    """Raise ValueError for NaN and Infinity, which JSON does not allow."""
     raise ValueError(word)
 
 
 class _UnfitError(TypeError):
-    """A value that a file cannot hold."""
+    """Error for a value of a type that a state file cannot hold."""
 
 
 class _Nodes:
-    """Writer of nodes and of the bytes of arrays."""
+    """Writer of a state: values become JSON nodes, and arrays become bytes."""
 
     def __init__(self, modules: Collection[str]) -> None:
         self.nodes: list[Any] = []
@@ -220,7 +220,7 @@ class _Nodes:
         """The value (kept alive) and the number of its node, by identity."""
 
     def add(self, value: Any) -> Any:
-        """Return a scalar itself, else a list with the number of its node, which is added."""
+        """Store a value as a node and return its number in a list; return a scalar as such."""
         if type(value) in _SCALARS:
             return value
         if type(value) is float and np.isfinite(value):
@@ -232,7 +232,7 @@ class _Nodes:
         return [self._known[id(value)][1]]
 
     def _node(self, value: Any) -> list[Any]:
-        """Return the node of a value; add the nodes of its parts."""
+        """Return the JSON node of a value; store the nodes of its parts."""
         kind = type(value)
         if kind is float:
             return ["float", repr(value)]
@@ -252,7 +252,7 @@ class _Nodes:
         return ["record", name, *(self.add(getattr(value, part)) for part in _fields_of(kind))]
 
     def _array(self, array: np.ndarray, *, scalar: bool) -> list[Any]:
-        """Return the node of an array or NumPy scalar; keep its bytes."""
+        """Return the JSON node of an array or NumPy scalar; store its bytes."""
         if array.dtype.name not in self._dtypes:
             raise _UnfitError(f"an array of {array.dtype}")
         columns = array.flags.f_contiguous and not array.flags.c_contiguous
@@ -262,7 +262,7 @@ class _Nodes:
 
 
 class _Read:
-    """Reader of nodes and of the bytes of arrays."""
+    """Reader of a state: builds values from JSON nodes and from the bytes of arrays."""
 
     def __init__(self, data: bytes, modules: Collection[str]) -> None:
         self._data, self._at, self._modules = data, 0, modules
@@ -272,7 +272,7 @@ class _Read:
         self._depth = self._walked = self._most = 0
 
     def all(self, nodes: list[Any]) -> Any:
-        """Read all nodes; return the value of the last."""
+        """Read all nodes of a file in order; return the value of the last."""
         self._most = DEEPEST * (sum(map(len, nodes)) + MOST_SHARED)
         for kind, *rest in nodes:
             self._depth, before = 0, self._walked
@@ -286,7 +286,7 @@ class _Read:
         return self._nodes[-1][0]
 
     def _value(self, kind: str, rest: list[Any]) -> Any:
-        """Return the value of a node."""
+        """Return the value that a JSON node describes."""
         if kind == "array":
             return self._array(*rest)
         if kind == "float":
@@ -299,7 +299,7 @@ class _Read:
         return _CONTAINERS[kind](parts)
 
     def _part(self, part: Any) -> Any:
-        """Return the value of a part: a scalar, or the value of an earlier node."""
+        """Return the value of a node's part: a scalar, or the value of an earlier node."""
         if type(part) is not list:
             if type(part) not in (*_SCALARS, float):
                 raise TypeError(type(part).__name__)
@@ -314,7 +314,7 @@ class _Read:
         return value
 
     def _record(self, name: str, *parts: Any) -> Any:
-        """Construct and check a record."""
+        """Construct a record from the parts of a node, and check it."""
         kind, values = _kind_named(name, self._modules), [self._part(part) for part in parts]
         if kind is None:
             raise TypeError(name)
@@ -325,7 +325,7 @@ class _Read:
         return record
 
     def _array(self, name: str, shape: list[int], order: Any, scalar: bool) -> Any:
-        """Read the next array or NumPy scalar."""
+        """Read the next array or NumPy scalar from the file's bytes."""
         dtype, begin = self._dtypes[name], self._at
         if any(type(n) is not int or not 0 <= n <= len(self._data) for n in shape):
             raise ValueError("shape")
@@ -346,7 +346,7 @@ class _Read:
 
 
 def _kind_named(name: str, modules: Collection[str]) -> Any:
-    """Return the class of a record in the closed table or in the user's modules, or None.
+    """Return the record class that a file names, if a state may contain it; else None.
 
     In a user's module it must be defined at the top, with a constructor that takes all fields.
     """
@@ -364,7 +364,7 @@ def _kind_named(name: str, modules: Collection[str]) -> Any:
 
 @cache
 def _fields_of(kind: Any) -> tuple[str, ...]:
-    """Return the names of the fields that the constructor of a record takes."""
+    """Return the names of the fields that a record's constructor takes."""
     if is_dataclass(kind):
         return tuple(field.name for field in fields(kind) if field.init)
     return kind._fields
@@ -375,7 +375,7 @@ _hints_of = cache(get_type_hints)
 
 
 def _check(record: Any, name: str) -> None:
-    """Raise if a record of the table violates its annotations or its law."""
+    """Raise if a record violates its type annotations or its consistency check in `LAWS`."""
     kind = type(record)
     hints = _hints_of(kind) if not name.startswith(OWN) else {}
     with jaxtyped("context"):
@@ -387,7 +387,7 @@ def _check(record: Any, name: str) -> None:
 
 
 def _fits(value: Any, hint: Any) -> bool:
-    """Return whether a value fits an annotation, with the shapes of the jaxtyping context."""
+    """Return whether a value fits a type annotation, including the shapes of arrays."""
     if hint is Any or isinstance(hint, TypeVar):
         return True
     origin, args = get_origin(hint), get_args(hint)
@@ -415,13 +415,13 @@ def _fits(value: Any, hint: Any) -> bool:
 
 
 def _fits_alone(value: Any, hint: Any) -> bool:
-    """Return whether a part of a container fits an annotation, with separate shapes."""
+    """Return whether an item of a container fits an annotation, with independent shapes."""
     with jaxtyped("context"):
         return _fits(value, hint)
 
 
 def check_going_on(start: SessionState, state: SessionState, *, own: bool) -> None:
-    """Raise for a state that a session with these settings cannot reach from its start.
+    """Raise if a session with these settings cannot reach a state from its start.
 
     ``own``: whether the estimator is a user's, which may have several types of beliefs.
     """
@@ -444,7 +444,7 @@ def check_going_on(start: SessionState, state: SessionState, *, own: bool) -> No
 
 
 def within(values: Any, low: Any, high: Any) -> bool:
-    """Return whether all integers are in low <= n < high."""
+    """Return whether all values are at least `low` and below `high`."""
     array = np.asarray(values)
     return bool(np.all((array >= low) & (array < high)))
 
@@ -455,7 +455,7 @@ def _finite(*arrays: Any) -> bool:
 
 
 def _sessions(state: SessionState) -> bool:
-    """Scans are consecutive, draws are states of a generator, and an open leg exists."""
+    """Return whether a session's scan numbers, random states and open motion are consistent."""
     numbers = [heard.number for heard in state.past]
     end = state.first + len(state.labels)
     if state.first < 0 or numbers != [*range(end - len(numbers), end)]:
@@ -476,12 +476,12 @@ def _sessions(state: SessionState) -> bool:
 
 
 def _is_pose(gaussian: Gaussian) -> bool:
-    """Return whether a Gaussian is a finite pose."""
+    """Return whether a Gaussian has the shape of a pose and only finite numbers."""
     return gaussian.mean.shape == (POSE,) and _finite(gaussian.mean, gaussian.covariance)
 
 
 def _ekf(belief: EkfBelief) -> bool:
-    """The state has a pose and two numbers for each member, all finite."""
+    """Return whether an EKF belief has consistent sizes and only finite numbers."""
     size, members = belief.mean.size, belief.landmark.size
     numbers = belief.mean, belief.covariance, belief.weight, belief.origin
     return (
@@ -493,7 +493,7 @@ def _ekf(belief: EkfBelief) -> bool:
 
 
 def _fastslam(belief: FastSlamBelief) -> Any:
-    """Blocks have room for all particles, particles for all members, which are numbers."""
+    """Return whether a FastSLAM belief has consistent sizes and counts, and only numbers."""
     blocks, landmarks, lanes = belief.count.shape
     room = np.diff(belief.first)
     if {room.size, belief.landmark.size, belief.best_count.size} != {landmarks}:
@@ -524,21 +524,21 @@ def _fastslam(belief: FastSlamBelief) -> Any:
 
 
 def _shapes(stack: Stack, *rest: tuple[int, ...], whole: Sequence[int] = ()) -> bool:
-    """Return whether the entries of a stack have these shapes; arrays in `whole` are integers."""
+    """Return whether the entries of a stack of arrays have given shapes and number types."""
     kinds = [np.int64 if n in whole else np.float64 for n in range(len(rest))]
     shapes = tuple(array.shape[1:] for array in stack.arrays)
     return shapes == rest and [array.dtype for array in stack.arrays] == kinds
 
 
 def _has_shapes(arrays: Sequence[Any], *shapes: tuple[int, ...]) -> bool:
-    """Return whether arrays are finite floats with these shapes."""
+    """Return whether arrays are finite float64 arrays with given shapes."""
     return tuple(array.shape for array in arrays) == shapes and all(
         array.dtype == np.float64 and _finite(array) for array in arrays
     )
 
 
 def _history(history: History) -> Any:
-    """All indices of nodes, rows, slots, landmarks and callers are in range."""
+    """Return whether all indices in a smoother's history are in range and consistent."""
     q, p = history.calibration.odometry.size, history.calibration.stds.size
     legs = _shapes(history.legs, (3,), (3, 3), (), (2,), (2,), (3, q), whole=(3, 4))
     if not (legs and _shapes(history.steps, (3,), (3, 3), (3, q)) and p >= q):
@@ -574,7 +574,7 @@ def _history(history: History) -> Any:
 
 
 def _columns(columns: Any, first: int, width: int) -> bool:
-    """Return whether landmarks have two columns of the border each, or 0."""
+    """Return whether landmarks have distinct pairs of columns in range, or column 0 for none."""
     used = columns[columns != 0]
     return (
         within(used, first, width - 1)
@@ -584,7 +584,7 @@ def _columns(columns: Any, first: int, width: int) -> bool:
 
 
 def _smoother(belief: SmootherBelief) -> Any:
-    """The solution has the sizes and the columns of the history."""
+    """Return whether a smoother's solution has sizes and columns that fit its history."""
     history, solution = belief.history, belief.solution
     points, odometry = solution.points, belief.odometry
     p, q = history.calibration.stds.size, history.calibration.odometry.size
@@ -615,7 +615,7 @@ def _smoother(belief: SmootherBelief) -> Any:
 def _stretches(
     stretches: Sequence[Stretch], nodes: int, size: tuple[int, int], border: tuple[int, int]
 ) -> bool:
-    """Return whether stretches cover all nodes, with arrays that fit the state and the border.
+    """Return whether a smoother's segments cover all poses, with arrays of fitting shapes.
 
     ``size``: of the state and of the border; ``border``: its first column of landmarks, and their
     number.

@@ -44,27 +44,27 @@ class StudyResults:
 
     @property
     def plan(self) -> "Plan":
-        """The plan of the study."""
+        """The plan that the study runs."""
         return self._stored.plan
 
     @cached_property
     def trials(self) -> "pl.DataFrame":
-        """Scores of each world and case."""
+        """Table of scores, a row per world and case."""
         return self._stored.trials.collect()
 
     @cached_property
     def steps(self) -> "pl.DataFrame":
-        """Errors and NEES of each world, case and frame."""
+        """Table of errors and NEES, a row per world, case and frame."""
         return self._stored.steps.collect()
 
     @cached_property
     def landmarks(self) -> "pl.DataFrame":
-        """Status and error of each world, case and landmark."""
+        """Table of landmarks, a row per world, case and landmark: status and error."""
         return self._stored.landmarks.collect()
 
     @cached_property
     def summary(self) -> "pl.DataFrame":
-        """Settings, number of finished worlds and mean scores of each case."""
+        """Table of cases: settings, number of finished worlds and mean scores."""
         import polars as pl
 
         case = ["case", "strategy", "filter", *self.plan.grid, "beamwidth_deg"]
@@ -78,7 +78,7 @@ class StudyResults:
 
     @property
     def answer(self) -> list[str]:
-        """Answer to the question of the study: a line, then sentences."""
+        """Answer to the question of the study: a headline, then further sentences."""
         return list(self._answered.answer)
 
     def figure(self) -> "Figure":
@@ -91,7 +91,7 @@ class StudyResults:
 
     @cached_property
     def _answered(self) -> "Answered":
-        """The study with the answer of its report."""
+        """The study together with the answer that its report gives."""
         from pipistrelle.report.page import answered
         from pipistrelle.report.study import read_study
 
@@ -123,11 +123,11 @@ class StudyResults:
         return target / "index.html"
 
     def __repr__(self) -> str:
-        """Format the mean scores as a table."""
+        """Format the mean scores of the cases as a text table."""
         return f"Study {self.plan.name}\n{self.summary}"
 
     def _repr_html_(self) -> str:
-        """Format the mean scores as HTML."""
+        """Format the mean scores of the cases as HTML."""
         return self.summary._repr_html_()
 
 
@@ -214,7 +214,7 @@ def study(
 
 
 def _listed(value: Any) -> Any:
-    """Convert arrays and tuples to lists, as in a file."""
+    """Convert arrays and tuples in nested data to lists, as a TOML file has them."""
     if isinstance(value, Mapping):
         return {name: _listed(inner) for name, inner in value.items()}
     if hasattr(value, "tolist"):
