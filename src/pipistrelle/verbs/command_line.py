@@ -64,7 +64,7 @@ app.command(config)
 
 
 def obey(words: Sequence[str], heard: Sequence[int] = ()) -> int:
-    """Run a command line and return its exit status; explain mistakes of the user in a line.
+    """Run a command line and return its exit status; print a message for a user's mistake.
 
     `heard` collects signals to end; after the first, an error is not a mistake of the user.
     """
@@ -99,7 +99,7 @@ def obey(words: Sequence[str], heard: Sequence[int] = ()) -> int:
 
 
 def _refuse_empty(words: Sequence[str]) -> None:
-    """Raise for an empty argument, which as a path would be the current folder."""
+    """Raise for an empty argument, which would be taken for the current folder."""
     for before, word in pairwise(("pipistrelle", *words)):
         flag, given, value = word.partition("=")
         if not word or (flag.startswith("-") and given and not value):
@@ -113,7 +113,7 @@ def _refuse_empty(words: Sequence[str]) -> None:
 
 
 def _refuse_sections(words: Sequence[str]) -> None:
-    """Raise for a value of a section of settings, which would set its first setting."""
+    """Raise for an option that gives a value to a whole section of settings."""
     names = [word.partition("=")[0] for word in words if word.startswith("--")]
     if not names or {"--help", "--version"} & {*names}:  # these load no settings
         return
@@ -127,7 +127,7 @@ def _refuse_sections(words: Sequence[str]) -> None:
 
 
 def _sections() -> dict[str, list[str]]:
-    """Return the settings of each section except `filter`, which is also an option."""
+    """Return the names of the settings in each section, except the section `filter`."""
     from pipistrelle.settings import known_settings
 
     sections: dict[str, list[str]] = {}
@@ -138,7 +138,7 @@ def _sections() -> dict[str, list[str]]:
 
 
 def _explained(error: Exception, words: Sequence[str]) -> str | None:
-    """Return the message for a mistake of the user; None for a bug."""
+    """Return the message for an error that is a user's mistake; None for a bug."""
     from pipistrelle.config import InputError
 
     if isinstance(error, MemoryError):
@@ -166,7 +166,7 @@ def _explained(error: Exception, words: Sequence[str]) -> str | None:
 
 
 def _unknown(error: UnknownOptionError) -> str:
-    """Return the message for an unknown option, with a similar one."""
+    """Return the message for an unknown option, with the most similar known option."""
     from pipistrelle.refusals import meant
 
     word = (error.token.keyword or error.token.value).partition("=")[0]
@@ -178,7 +178,7 @@ def _unknown(error: UnknownOptionError) -> str:
 
 
 def _too_many(error: UnusedCliTokensError, word: str, words: Sequence[str]) -> str:
-    """Return the message for an argument without an option."""
+    """Return the message for an argument that a command does not take."""
     if ("--animate", word) in pairwise(words):
         return f"--animate: found {word!r}, expected {' or '.join(FILMS)}"
     verb, kinds = " ".join(error.command_chain or ()), signature(error.target or obey).parameters

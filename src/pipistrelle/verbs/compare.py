@@ -66,7 +66,7 @@ _NOTHING: dict[str, Any] = {"text": "", "interval": "", "shown": False}
 
 
 def _effects(table: dict[str, Any]) -> str:
-    """Format the table of a variable: the change of the position RMSE, and others shown."""
+    """Format an effect table as text: changes of the position RMSE, and others that are shown."""
     first, *others = table["measures"]
     rows = []
     for row in table["rows"]:
@@ -111,7 +111,7 @@ def compare(
     ] = False,
     quiet: Annotated[bool, Parameter(negative=(), help="Print the result folder alone.")] = False,
 ) -> None:
-    """Put results side by side, the first of them held against each other one."""
+    """Compare result folders in tables and a figure, each folder with the first."""
     from pipistrelle.config import InputError
     from pipistrelle.experiments import comparing
     from pipistrelle.files import COMPARISON, claim, spelt
@@ -163,7 +163,7 @@ def compare(
 
 
 def _studies_answer(compared: "ComparedStudies") -> list[str]:
-    """Return a sentence for each other study: its position RMSE, averaged over the grid."""
+    """Return a sentence on each further study: its mean position RMSE against the first."""
     from pipistrelle.experiments.comparing import LETTERS, POSITION
     from pipistrelle.report.effects import headline
 
@@ -198,7 +198,7 @@ def _missions_answer(compared: "ComparedMissions") -> list[str]:
 
 
 def _mission_tables(compared: "ComparedMissions") -> Iterator[str]:
-    """Format the scores of each estimate and their differences."""
+    """Yield a text table per estimate with its scores in all folders and their differences."""
     from pipistrelle.estimation.catalogue import short_name
     from pipistrelle.experiments.comparing import less
 
@@ -228,7 +228,7 @@ def _mission_tables(compared: "ComparedMissions") -> Iterator[str]:
 
 
 def _study_tables(compared: "ComparedStudies") -> Iterator[str]:
-    """Format the means of each score by case, and their differences with intervals."""
+    """Yield a text table per score with its means by case and their differences."""
     from pipistrelle.experiments.comparing import SIGNIFICANCE
 
     several = len(compared.folders) > 2
@@ -257,13 +257,13 @@ def _study_tables(compared: "ComparedStudies") -> Iterator[str]:
 
 
 def _number(value: float | None, digits: int) -> str:
-    """Format a number, in few digits if it is huge; a dash if it is missing."""
+    """Format a number with `digits` decimals, or fewer digits if huge; a dash if missing."""
     if value is None or value != value:
         return "-"
     return f"{value:.{digits}f}" if abs(value) < 1e5 else f"{value:.3g}"
 
 
 def _signed(value: float | None, digits: int) -> str:
-    """Format a difference with its sign."""
+    """Format a difference with a plus or minus sign."""
     text = _number(value, digits)
     return text if text.startswith("-") else f"+{text}"

@@ -37,7 +37,7 @@ ALIGNED = {
 
 
 def command_line() -> str:
-    """Return the command line as a line of text; escape undecodable bytes."""
+    """Return the command line of this process as text, with undecodable bytes escaped."""
     return spelt(shlex.join(["pipistrelle", *sys.argv[1:]]))
 
 
@@ -55,7 +55,7 @@ def announced(message: str, after: float = 3.0) -> Iterator[None]:
 
 @contextmanager
 def bars(quiet: bool, width: int) -> "Iterator[Callable[[str, int, int, str], None] | None]":
-    """Yield a function that draws a bar, given its name, steps done, their total, and a text.
+    """Yield a function that draws progress bars on a terminal, from name, steps, total and text.
 
     None if it is `quiet`, or standard error is no terminal. `width` is of the column of names.
     """
@@ -79,7 +79,7 @@ def bars(quiet: bool, width: int) -> "Iterator[Callable[[str, int, int, str], No
 
 @contextmanager
 def progress(quiet: bool) -> "Iterator[Progress]":
-    """Yield a function that shows a line per stage: its frames done, and frames per second.
+    """Yield a function that prints the progress of a mission, a line for each stage.
 
     It takes the stage, the frames done and their total. On a terminal the line moves; elsewhere it
     is printed at the end of the stage.
@@ -100,7 +100,7 @@ def progress(quiet: bool) -> "Iterator[Progress]":
 
 
 def _stopwatch() -> Callable[[str], float]:
-    """Return a function that gives the time since a stage began [s], without compilation."""
+    """Return a function that measures the time of a stage [s], without compilation."""
     from pipistrelle.kernel_clock import wall_s
 
     began, latest = {}, wall_s()
@@ -179,7 +179,7 @@ def listening(estimates: Iterable[tuple[str, str, Mapping[str, Any]]]) -> Iterat
 def _cells(
     trial: "TrialResult", count: int | None, driven: float | None
 ) -> Iterator[tuple[str, str]]:
-    """Yield the title and the text of each score of an estimate, "" for a missing one."""
+    """Yield title and text of each score of an estimate; the text is "" if it is missing."""
     s = trial.scores
     for name, score in shown_in("mission").items():
         yield heading(score), _number(getattr(s, name), score.digits)
@@ -196,7 +196,7 @@ def _cells(
 
 
 def _without_truth(trial: "TrialResult", driven: float | None) -> Iterator[tuple[str, str]]:
-    """Yield the innovations and standard deviations of an estimate without true poses."""
+    """Yield table rows that describe an estimate without truth: NIS, gate, deviations."""
     from pipistrelle.experiments.results.scores import judged
 
     pose, measurements = trial.track.pose, judged(trial.scans)
@@ -210,14 +210,14 @@ def _without_truth(trial: "TrialResult", driven: float | None) -> Iterator[tuple
 
 
 def _number(value: float | None, digits: int) -> str:
-    """Format a number, with few digits if it is huge; "" for None."""
+    """Format a number with `digits` decimals, or fewer digits if it is huge; "" for None."""
     if value is None:
         return ""
     return f"{value:.{digits}f}" if abs(value) < 1e5 else f"{value:.3g}"
 
 
 def text_table(title: str, heads: Sequence[Sequence[str]], rows: Sequence[Sequence[str]]) -> str:
-    """Format a table: the first column to the left, all others to the right; drawn on a terminal.
+    """Format a text table, the first column left-aligned, others right-aligned.
 
     >>> print(text_table("", [["", "A", "B"]], [["NEES", "2.1", "10.0"]]))
             A     B
@@ -227,7 +227,7 @@ def text_table(title: str, heads: Sequence[Sequence[str]], rows: Sequence[Sequen
 
 
 def _plain(title: str, heads: Sequence[Sequence[str]], rows: Sequence[Sequence[str]]) -> str:
-    """Format columns with two spaces between them."""
+    """Format a table as plain text, with two spaces between columns."""
     lines = [*heads, *rows]
     widths = [max(map(len, column)) for column in zip(*lines, strict=True)]
     texts = (
@@ -241,7 +241,7 @@ def _plain(title: str, heads: Sequence[Sequence[str]], rows: Sequence[Sequence[s
 
 
 def _drawn(title: str, heads: Sequence[Sequence[str]], rows: Sequence[Sequence[str]]) -> str:
-    """Format a table for a terminal, within its width."""
+    """Format a table with lines and headings for a terminal, within its width."""
     from rich import box
     from rich.console import Console
     from rich.table import Table

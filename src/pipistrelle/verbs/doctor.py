@@ -42,7 +42,7 @@ def doctor(
 
 
 def _findings() -> Iterator[tuple[str, str]]:
-    """Yield the name and the state of each checked part of the installation."""
+    """Yield name and state of each checked part of the installation."""
     from pipistrelle.experiments.machine import cores
 
     yield "python", f"{sys.version.split()[0]} ({sys.executable})"
@@ -60,7 +60,7 @@ def _findings() -> Iterator[tuple[str, str]]:
 
 
 def _libraries() -> Iterator[tuple[str, str]]:
-    """Yield the versions of required packages, and of the packages of extras."""
+    """Yield name and version of each required or optional package, or the way to install it."""
     try:
         required = requires("pipistrelle") or []
     except PackageNotFoundError:

@@ -55,7 +55,7 @@ MISSION = ("config", "beamwidth", "landmarks", "duration", "engine", "particles"
 
 @contextmanager
 def working(quiet: bool, *kernels: Any) -> Iterator[Callable[..., None]]:
-    """Yield the function that shows progress; announce the compilation unless `quiet`.
+    """Yield a function that shows progress; announce kernel compilation unless `quiet`.
 
     `kernels`: the settings and the estimators of kernels to compile first, in two processes.
     """
@@ -70,13 +70,13 @@ def working(quiet: bool, *kernels: Any) -> Iterator[Callable[..., None]]:
 
 
 def _run(asked: dict[str, Any]) -> int:
-    """Simulate a mission; print its scores and its folder."""
+    """Simulate a mission for `pipistrelle run`; print its scores and its folder."""
     door = door_of(asked, working=partial(working, asked["quiet"]))
     return _delivered(results.run_by(door), asked["quiet"])
 
 
 def _slam(asked: dict[str, Any]) -> int:
-    """Solve a log; print its scores and its folder, or the topics of a bag."""
+    """Solve a log for `pipistrelle slam`; print scores and folder, or the topics of a bag."""
     door = door_of(asked, working=partial(working, asked["quiet"]))
     if asked["topics"]:
         return _list_topics(asked["log"], over_named(door.beneath)[0] | door.flags | door.short())
@@ -84,7 +84,7 @@ def _slam(asked: dict[str, Any]) -> int:
 
 
 def _delivered(done: results.Results, quiet: bool) -> int:
-    """Print the table and the folder of a mission; return 1 if an estimate failed, else 0."""
+    """Print a mission's scores and folder; return exit status 1 if an estimate failed, else 0."""
     from pipistrelle.scripting.log_warnings import distance_driven
     from pipistrelle.scripting.missions import failures, strategy_names
 
@@ -125,7 +125,7 @@ def _list_topics(path: Path, layer: Layer) -> int:
 
 
 def _hear(asked: dict[str, Any]) -> int:
-    """Detect the echoes of a recording; print the number of rows and the folder of the log."""
+    """Detect the echoes of a recording for `pipistrelle hear`, or check the recording."""
     recording, door = asked["recording"], door_of(asked, working=partial(working, asked["quiet"]))
     config = hearing.heard_settings(door.flags)
     if asked["check"]:

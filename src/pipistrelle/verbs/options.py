@@ -51,7 +51,7 @@ FLAGS = {
 
 
 def _whole(_: Any, tokens: Sequence[Any]) -> int:
-    """Parse a whole number; cyclopts would round 2.5."""
+    """Parse a whole number on the command line; cyclopts would round 2.5."""
     try:
         return int(tokens[0].value)
     except ValueError:
@@ -62,7 +62,7 @@ Whole = Annotated[int, Parameter(converter=_whole)]
 
 
 def _robot(_: Any, tokens: Sequence[Any]) -> int | str:
-    """Parse the number or the name of a robot."""
+    """Parse a robot on the command line: digits as a number, other text as a name."""
     text = tokens[0].value
     return int(text) if text.isdecimal() else text
 
@@ -72,16 +72,16 @@ _METAVARS = {CALLERS: "TABLES", OWN: "TABLES", ARRAY_KEY: "FILE"}
 
 
 class _Everything:
-    """A truth value: whether the help lists all settings."""
+    """A truth value that can change: whether the help lists all settings."""
 
     value = False
 
     def __bool__(self) -> bool:
-        """Return the present value."""
+        """Return whether the help lists all settings."""
         return self.value
 
     def __xor__(self, other: bool) -> bool:
-        """Compare with the wanted value, as cyclopts does to select the listed options."""
+        """Return whether the value differs from a wanted value, as cyclopts asks."""
         return self.value ^ other
 
 
@@ -119,7 +119,7 @@ def verb_of(
     extra: Sequence[Argument] = (),
     only: Sequence[str] = (),
 ) -> Callable[..., Any]:
-    """Return a verb of the command line with the parameters and the help of a Python function.
+    """Return a command-line verb with the parameters and the help of a Python function.
 
     `act` receives the arguments by name. `options` gives the placeholder of parameters in the help,
     the text of their default, and perhaps other help than Python's; `only` selects parameters.
@@ -164,7 +164,7 @@ def verb_of(
 
 
 def _rejoined(text: str) -> str:
-    """Join the lines of each indented paragraph, which the help wraps again."""
+    """Join the lines of each indented paragraph in a help text, which is wrapped again later."""
     lines: list[str] = []
     for line in text.splitlines():
         indented = line.startswith("    ")
@@ -176,13 +176,13 @@ def _rejoined(text: str) -> str:
 
 
 def switch(name: str, words: str) -> Argument:
-    """Return a switch that only the command line has, with its help."""
+    """Return a boolean option that only the command line has, with its help text."""
     kind = Annotated[bool, Parameter(help=words)]
     return Argument(name, Argument.KEYWORD_ONLY, default=False, annotation=kind)
 
 
 def spell(name: str, value: str = "") -> str:
-    """Format a parameter, perhaps with a value, as a flag.
+    """Format a parameter, with a value if any, as a command-line flag.
 
     >>> spell("save_log", "DIR"), spell("overwrite", "True")
     ('--save-log DIR', '--overwrite')
@@ -194,7 +194,7 @@ def spell(name: str, value: str = "") -> str:
 
 
 def door_of(asked: Mapping[str, Any], **more: Any) -> Door:
-    """Return a call from the command line; it prints messages unless it is quiet."""
+    """Convert command-line arguments to a `Door`, which prints messages unless `quiet` is set."""
     if asked.get("quiet"):
         more.setdefault("note", lambda _: None)
     else:
@@ -214,7 +214,7 @@ def door_of(asked: Mapping[str, Any], **more: Any) -> Door:
 def setting_flags(
     shown: Callable[[Key], bool] = lambda _: True, own: Mapping[Key, Any] = MappingProxyType({})
 ) -> Any:
-    """Return a type with a flag for each setting, as cyclopts parses it.
+    """Return a TypedDict with a flag for each setting, for parsing by cyclopts.
 
     ``--help-all`` lists the settings that are `shown`, ``--help`` only the seed; all flags work.
     `own` holds defaults of the verb that differ, for the help.
@@ -251,7 +251,7 @@ def setting_flags(
 
 
 def _unbounded(kind: Any) -> Any:
-    """Return a type without bounds and None, which `resolve` checks."""
+    """Remove bounds and None from a type annotation; `resolve` checks the values later."""
     parts = [_unbounded(part) for part in get_args(kind) if part is not NoneType]
     either: Any = Union
     if get_origin(kind) is Union and len(parts) > 1:
@@ -263,7 +263,7 @@ def _unbounded(kind: Any) -> Any:
 
 
 def layers(named: Sequence[str] | None, settings: Mapping[str, Any] | None) -> Layer:
-    """Merge presets, files, environment variables and flags to settings.
+    """Merge presets, files, environment variables and flags into a layer of settings.
 
     >>> layers(None, {"seed": 3})["seed",].value
     3

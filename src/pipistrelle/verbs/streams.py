@@ -17,7 +17,7 @@ ENDING = (signal.SIGINT, signal.SIGTERM)
 
 
 def hold_streams() -> None:
-    """Open the null device for closed standard streams; print undecodable names as bytes.
+    """Replace closed standard streams by the null device; print undecodable names as bytes.
 
     Otherwise the next opened file would get the number of a closed stream, and messages would be
     written into it.
@@ -36,7 +36,7 @@ def hold_streams() -> None:
 
 
 def _as_bytes(error: UnicodeError) -> tuple[str | bytes, int]:
-    """Encode a name as its bytes, and a character outside the encoding as its number."""
+    """Handle encoding errors: return a name's bytes, or a character's escaped number."""
     try:
         return codecs.lookup_error("surrogateescape")(error)
     except UnicodeError:
@@ -44,7 +44,7 @@ def _as_bytes(error: UnicodeError) -> tuple[str | bytes, int]:
 
 
 def say(message: str) -> None:
-    """Write a line to standard error if it is open; escape control characters."""
+    """Write a message to standard error if it is open, with control characters escaped."""
     text = "".join(c if c.isprintable() or c == "\n" else repr(c)[1:-1] for c in message)
     with suppress(OSError):
         try:
@@ -54,13 +54,13 @@ def say(message: str) -> None:
 
 
 def warn(*messages: str) -> None:
-    """Write warnings to standard error."""
+    """Write messages to standard error, each marked as a warning."""
     for message in messages:
         say(f"pipistrelle: warning: {message}")
 
 
 def flush_results() -> None:
-    """Flush standard output, unless its reader has left."""
+    """Flush standard output; do nothing if its reader has closed the pipe."""
     try:
         sys.stdout.flush()
     except OSError as error:
@@ -70,7 +70,7 @@ def flush_results() -> None:
 
 
 def put(*values: object, end: str = "\n") -> None:
-    """Write a result to standard output, unless its reader has left."""
+    """Print values to standard output; do nothing if its reader has closed the pipe."""
     try:
         print(*values, end=end)
     except BrokenPipeError:
@@ -78,14 +78,14 @@ def put(*values: object, end: str = "\n") -> None:
 
 
 def _silence(stream: TextIO) -> None:
-    """Redirect a stream to the null device, with its unwritten text."""
+    """Redirect a stream, with its unwritten text, to the null device."""
     nowhere = os.open(os.devnull, os.O_WRONLY)
     os.dup2(nowhere, stream.fileno())
     os.close(nowhere)
 
 
 class Interrupted(KeyboardInterrupt):
-    """A keyboard interrupt that is caught.
+    """Keyboard interrupt that a signal raises and this package catches.
 
     If a plain one passes through ``exec``, as in the import of some libraries, Python ends by the
     signal even if the interrupt is caught later.
@@ -94,7 +94,7 @@ class Interrupted(KeyboardInterrupt):
 
 @contextmanager
 def heard_signals(*, last: bool = False) -> Iterator[list[int]]:
-    """Raise `Interrupted` on signals to end; yield the list of received signals.
+    """Raise `Interrupted` on SIGINT or SIGTERM in this context; yield the signals received.
 
     A library may replace the interruption by its own error, so check the list. If this is the
     `last` work of the process, signals are ignored afterwards.

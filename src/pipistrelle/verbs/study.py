@@ -22,7 +22,7 @@ Show = Callable[["StudyProgress"], None]
 
 
 def _study(asked: dict[str, Any]) -> int:
-    """Run a study; print the numbers of worlds and its folder."""
+    """Run a study for `pipistrelle study`; print its numbers of worlds and trials, its folder."""
     from pipistrelle.experiments.studies.plan import MOST_WORLDS, find_plan, read_plan
 
     iterations, workers, quiet = asked["iterations"], asked["workers"], asked["quiet"]
@@ -67,7 +67,7 @@ def _study(asked: dict[str, Any]) -> int:
 
 
 def _share(text: str | None) -> tuple[int, int]:
-    """Parse the share I/N of the worlds."""
+    """Parse an option I/N, which selects every N-th world from world I on."""
     i, slash, n = (text or "0/1").partition("/")
     if slash and i.isdecimal() and n.isdecimal() and int(i) < int(n):
         return int(i), int(n)
@@ -75,7 +75,7 @@ def _share(text: str | None) -> tuple[int, int]:
 
 
 def _compiled_first(plan: "Plan", show: Show, quiet: bool) -> Show:
-    """Return a progress function that first compiles the kernels of a plan for all workers."""
+    """Return a progress function that compiles a plan's kernels when it is first called."""
     ready = False
 
     def prepare(so_far: "StudyProgress") -> None:
@@ -96,7 +96,7 @@ def _compiled_first(plan: "Plan", show: Show, quiet: bool) -> Show:
 
 @contextmanager
 def _progress(quiet: bool) -> Iterator[Show]:
-    """Yield a function that shows progress: bars on a terminal, else lines.
+    """Yield a function that shows a study's progress: bars on a terminal, else lines.
 
     A line is printed first, last and every ten seconds.
     """
@@ -124,12 +124,12 @@ def _progress(quiet: bool) -> Iterator[Show]:
 
 
 def _failures(number: int) -> str:
-    """Format the number of failed trials; "" for none."""
+    """Format the number of failed trials in brackets; "" for none."""
     return f" ({number} failed)" if number else ""
 
 
 def _pace() -> Callable[["StudyProgress"], str]:
-    """Return a function that formats the speed since its first call, and the remaining time."""
+    """Return a function that formats a study's speed and the remaining time."""
     began: tuple[float, int] | None = None
 
     def pace(so_far: "StudyProgress") -> str:
@@ -145,7 +145,7 @@ def _pace() -> Callable[["StudyProgress"], str]:
 
 
 def _span(seconds: float) -> str:
-    """Format a duration."""
+    """Format a duration in seconds, minutes or hours."""
     minutes = round(seconds / 60.0)
     if seconds < 100.0:
         return f"{seconds:.0f} s"

@@ -71,7 +71,7 @@ def view(
     overwrite: Annotated[bool, Parameter(help="Replace an existing FILE.")] = False,
     quiet: Annotated[bool, Parameter(help="Print only the path of the page.")] = False,
 ) -> None:
-    """Write a page that plays a mission, which is conducted again from its result folder."""
+    """Write an HTML page that plays a mission, which is conducted again from its folder."""
     from pipistrelle.experiments.results.reading import read_summary
 
     read_summary(folder)
@@ -89,7 +89,7 @@ def view(
 def _play_again(
     folder: Path, log: Path | None, trusted: tuple[str, ...], quiet: bool
 ) -> "Playback":
-    """Conduct the mission again, and return its frames."""
+    """Conduct a mission again from its result folder; return its frames for the page."""
     from pipistrelle.experiments.machine import keep_freed_memory
     from pipistrelle.experiments.runs.replay import rerun
     from pipistrelle.figures.player.playback import playback
@@ -108,7 +108,7 @@ def _play_again(
 
 
 def check_place(path: Path, folder: Path | None, ending: str, overwrite: bool) -> None:
-    """Raise if a file cannot be written at this path, before it is made."""
+    """Raise if a file cannot be written at a path, before its content is computed."""
     fix = f"name another with -o FILE{ending}"
     if path.suffix.lower() != ending:
         raise InputError(f"-o: found {path}, expected a name that ends in {ending}")
@@ -138,12 +138,12 @@ def check_place(path: Path, folder: Path | None, ending: str, overwrite: bool) -
 
 
 def _is_in(path: Path, folder: Path) -> bool:
-    """Return whether the path is directly in the result folder."""
+    """Return whether a path is directly in a result folder."""
     return without_links(path.parent) == without_links(folder)
 
 
 def write_file(path: Path, folder: Path | None, data: bytes, overwrite: bool) -> None:
-    """Write a file atomically; add it to the list of files if it is in the result folder."""
+    """Write a file as a whole; in a result folder, add it to the folder's list of files."""
     if folder is not None and _is_in(path, folder):
         OwnFiles(folder, RESULTS).add(path.name, data)
         return
@@ -212,7 +212,7 @@ def array(
 
 
 def _table(layout: "Scattered", patterns: "tuple[Pattern, ...]") -> str:
-    """Format the properties of each group of microphones in a column."""
+    """Format a table with the properties of each group of microphones of an array."""
     hears = [
         "all around" if math.isnan(n) else f"around {round(math.degrees(n))}°"
         for n in layout.normal.tolist()
