@@ -192,7 +192,7 @@ def distinguishing(folders: Iterable[Iterable[Estimate]]) -> tuple[bool, bool]:
 
 
 def named(estimate: Estimate, parts: tuple[bool, bool]) -> Estimate:
-    """Replace strategy or filter of an estimate by "" unless `parts` marks it as distinguishing."""
+    """Return an estimate's (strategy, filter) with "" for a part that varies in no folder."""
     strategy, name = estimate
     return strategy * parts[0], name * parts[1]
 
@@ -228,7 +228,7 @@ def differing(settings: Sequence[Mapping[str, Any]]) -> dict[str, tuple[str | No
 def _lettered(
     folders: Sequence[Path], versions: Sequence[str], settings: Sequence[Mapping[str, Any]]
 ) -> dict[str, Any]:
-    """Return the fields `folders` (by letter) and `settings` (that differ) of a comparison."""
+    """Return two fields of a comparison: its folders by letter, and the settings that differ."""
     version = [{"version of Pipistrelle": version or None} for version in versions]
     return {
         "folders": dict(zip(LETTERS, folders, strict=False)),

@@ -133,7 +133,7 @@ def at_sensor(drive: Drive) -> Drive:
 
 
 def at_vehicle(track: Track, sensor: Pose) -> Track:
-    """Convert a sensor's estimated track to its vehicle's; `sensor` is the mounting pose."""
+    """Convert the estimated track of a sensor at mounting pose `sensor` to its vehicle's track."""
     if not any(sensor):
         return track
     vehicle = vehicle_in(sensor)

@@ -116,7 +116,7 @@ def callers_among(
     rng: np.random.Generator,
     first: np.random.Generator | None = None,
 ) -> tuple[Caller, ...]:
-    """Create the callers that the settings list, and draw the positions that are not given.
+    """Create the callers that the settings list, with random positions where none are given.
 
     `first` replaces the random stream of the first caller by the state of `rng` before the beacon
     was drawn. Each caller has a position, or one for each time; the vehicle is excluded.
@@ -194,7 +194,7 @@ def place_at(
     rng: np.random.Generator,
     clear_of: Iterable[Points],
 ) -> Float[np.ndarray, "2"] | None:
-    """Draw a position at `distance` [m] from the centre, clear of points; None if that fails."""
+    """Draw a random position at `distance` [m] from the centre, clear of points; else None."""
     clear_of = [*clear_of]
     for _ in range(MAX_DRAWS):
         direction = rng.uniform(-math.pi, math.pi)
@@ -207,7 +207,7 @@ def place_at(
 def _stand(
     one: CallerConfig, around: Surroundings, taken: Sequence[Points], rng: np.random.Generator
 ) -> Float[np.ndarray, "2"] | None:
-    """Return a fixed caller's position: given, or drawn clear of vehicle, landmarks and callers."""
+    """Return a fixed caller's position: given, or random and clear of paths and landmarks."""
     if one.place is not None:
         return np.array(one.place)
     setup = around.config.scenario
@@ -283,7 +283,7 @@ def _route(
 def _mission(
     around: Surroundings, taken: Sequence[Points], rng: np.random.Generator
 ) -> tuple[Float[np.ndarray, "t 3"], Float[np.ndarray, "t-1 2"]] | None:
-    """Draw a second vehicle's poses and controls, clear of the first; None if every draw fails."""
+    """Generate random poses and controls of a second vehicle, clear of the first; else None."""
     setup, drive = around.config.scenario, around.config.motion
     motion, bias = motion_of(drive), (drive.speed_bias, drive.turn_bias)
     course = around.course or course_of(setup, motion)
@@ -333,7 +333,7 @@ def _times(
 
 
 def _check_apart(callers: Sequence[Caller], around: Surroundings, where: str) -> None:
-    """Raise if the last caller coincides with the vehicle or a caller when the vehicle calls."""
+    """Raise if the last caller is exactly at the vehicle or another caller at a vehicle's call."""
     *others, last = callers
     calls = slice(
         around.config.scenario.steps_per_frame, None, around.config.scenario.steps_per_frame
@@ -353,7 +353,7 @@ def _check_apart(callers: Sequence[Caller], around: Surroundings, where: str) ->
 
 
 def _check_speed(key: str, one: CallerConfig, config: Config) -> None:
-    """Raise if a caller's speed or random speed is too near the speed of sound, or above it."""
+    """Raise if a caller's speed or its standard deviation is too large for the speed of sound."""
     c = config.medium.sound_speed
     for name, most in (("speed", c), ("speed_std", c / 5.0)):
         speed = getattr(one, name)
@@ -367,7 +367,7 @@ def _check_speed(key: str, one: CallerConfig, config: Config) -> None:
 def _away_from_vehicle(
     drawn: Callable[[], Float[np.ndarray, "t 2"]], around: Surroundings
 ) -> Float[np.ndarray, "t 2"] | None:
-    """Repeat drawing a caller's path until it is clear of the vehicle; None if every draw fails."""
+    """Generate random paths of a caller until a path is clear of the vehicle; else None."""
     for _ in range(MAX_DRAWS):
         path = drawn()
         offset = path - around.path

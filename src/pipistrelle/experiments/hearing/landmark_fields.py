@@ -23,7 +23,7 @@ Points = Float[np.ndarray, "_ 2"]
 def landmarks_in(
     setup: ScenarioConfig, path: Points, callers: Points, rng: np.random.Generator
 ) -> Points:
-    """Draw the landmarks of a world, clear of the vehicle's path and of fixed callers.
+    """Generate a world's landmarks at random, clear of the vehicle's path and fixed callers.
 
     `path` and `callers` are positions [m]. Orchards and rooms give the landmarks nearest the
     centre, in rising distance. Returns positions [m].
@@ -60,7 +60,7 @@ def nearest(points: Points, place: Float[np.ndarray, "2"]) -> float:
 def _scattered(
     setup: ScenarioConfig, path: Points, callers: Points, rng: np.random.Generator
 ) -> Points:
-    """Draw landmarks at random over the disc or annulus, each with the required distances."""
+    """Scatter landmarks at random over the disc or annulus, with the required distances."""
     placed, inner = np.empty((setup.landmarks, 2)), setup.inner_radius / setup.radius
     for i in range(setup.landmarks):
         for _ in range(MAX_DRAWS):

@@ -306,7 +306,7 @@ class _Record(NamedTuple):
 
     @property
     def lags(self) -> dict[str, Any]:
-        """Start, interval and pulse length of the lags, as keyword arguments of a detector."""
+        """Time axis of the output (start, interval, pulse length), as a detector's arguments."""
         return {"start": self.start, "interval": self.interval, "pulse": self.pulse}
 
 

@@ -31,7 +31,7 @@ from pipistrelle.settings import Layer
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class World:
-    """Known parts of a simulated world, such as landmarks or the course; the rest is drawn."""
+    """Known parts of a simulated world, such as landmarks or the course; the rest is random."""
 
     name: str
     landmarks: Float[np.ndarray, "n 2"] | None = None
@@ -53,7 +53,7 @@ ALL_DRAWN = World(name="any")
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Scenario:
-    """A drawn world; its n landmarks have the labels 1 to n, caller j (1, 2, ...) has n + j."""
+    """A random world; its n landmarks have the labels 1 to n, caller j (1, 2, ...) has n + j."""
 
     time: Float[np.ndarray, " t"]
     path: Float[np.ndarray, "t 3"]
@@ -68,13 +68,13 @@ class Scenario:
 
 
 def world_of(config: Config, iteration: int = 0, world: World = ALL_DRAWN) -> Scenario:
-    """Draw the world that the settings' seed and a world number determine."""
+    """Generate the random world that the settings' seed and a world number determine."""
     key = stream_key(config.seed, iteration, "scenario")
     return draw_scenario(config, np.random.default_rng(key), world)
 
 
 def draw_scenario(config: Config, rng: np.random.Generator, world: World = ALL_DRAWN) -> Scenario:
-    """Draw a world: the vehicle's path, then the beacon, the landmarks and any listed callers.
+    """Generate a random world: the vehicle's path, the beacon, landmarks and listed callers.
 
     Listed callers are drawn last, so path and landmarks do not depend on them; landmarks keep clear
     of caller positions given by a world's folder. Parts known to `world` are not drawn.
@@ -183,7 +183,7 @@ def assumed_motion(config: Config) -> Motion:
 def _place_beacon(
     setup: ScenarioConfig, clear_of: Sequence[Float[np.ndarray, "_ 2"]], rng: np.random.Generator
 ) -> Float[np.ndarray, "2"]:
-    """Draw the beacon's position, clear of the vehicle's path and of bodies with a radius."""
+    """Draw a random position of the beacon, clear of the path and of bodies with a radius."""
     beacon = place_at(setup.beacon_distance, setup, rng, clear_of)
     if beacon is not None:
         return beacon

@@ -101,7 +101,7 @@ def named_world(layer: Layer) -> World | None:
 
 
 def settled(world: World, layer: Layer) -> Layer:
-    """Merge a world's settings below `layer`, and add its numbers of landmarks and steps."""
+    """Merge a world's settings under the given settings; add its numbers of landmarks and steps."""
     beneath = world.settings | _decided(world, layer) | layer
     if world.course is not None and _STEPS not in beneath:
         steps = steps_of(world.course, resolve(beneath).scenario)
@@ -110,7 +110,7 @@ def settled(world: World, layer: Layer) -> Layer:
 
 
 def laid_over(world: World, layer: Layer, values: Layer) -> Layer:
-    """Merge settings for a world from a plan's grid: `layer`, then the world's, then `values`.
+    """Merge settings of a plan, a world in its grid and other grid values, in rising priority.
 
     `values` are the settings of the rest of the grid. The drive ends with the world's course if
     that is shorter.
@@ -199,7 +199,7 @@ def kept_world(config: Config, world: World) -> tuple[Config, dict[str, bytes]]:
 
 
 def world_files(scenario: Scenario, config: Config) -> dict[str, str]:
-    """Return the text files of a drawn world, by name, to edit or to simulate again."""
+    """Return the text files of a random world, by name, to edit or to simulate again."""
     import tomli_w
 
     names = _CONTROLS[config.motion.model]
@@ -239,7 +239,7 @@ def world_files(scenario: Scenario, config: Config) -> dict[str, str]:
 
 
 def _refuse_misspelt(folder: Path, there: Sequence[str]) -> None:
-    """Raise if a file in a world's folder has nearly the name of a missing file."""
+    """Raise if a file in a world's folder seems to be a missing file with a misspelt name."""
     missing = [name for name in FILES if name not in there]
     for path in sorted(folder.iterdir()):
         near = get_close_matches(path.name.lower(), missing, n=1, cutoff=0.85)

@@ -112,7 +112,7 @@ def load(
 
 
 def _refuse_unknown(folder: Path, titles: str) -> None:
-    """Raise if a path is missing, or holds something recognised that is no log, as a study."""
+    """Raise if a path is missing, or holds something recognised that is no log, such as a study."""
     if folder.exists():
         what, _, fix = (recording_of(folder) or "").partition("; ")
         if what:
@@ -220,7 +220,7 @@ def replay(
 
 
 def drive_of(log: Log, truth: Truth) -> Drive:
-    """Return a recorded log as the input of an estimator; x, y, heading start uncorrelated."""
+    """Return a recorded log as the input of an estimator, with the truth for scoring."""
     placed = [caller for caller in log.callers if caller.place is not None]
     stds = [np.maximum(caller.place_std or KNOWN_STD, LEAST_STD) for caller in placed]
     variance = np.square(np.array(log.initial_pose_std, dtype=float))
@@ -354,7 +354,7 @@ def _sums(log: Path) -> dict[str, str]:
 
 
 def _check_simulated(folder: Path, log: Path | None) -> None:
-    """Raise if a mission without a log was not simulated, or if `log` is given for it."""
+    """Check a mission without a log: raise if it was not simulated, or if `log` is given."""
     if "scenario" not in read_toml(folder / "config.toml"):
         raise refusal(
             f"{folder / SUMMARY}: log",

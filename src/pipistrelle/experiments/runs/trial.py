@@ -228,7 +228,7 @@ def run_trial(
 def with_moving(
     scans: Sequence[Scan], drive: Drive, *, follows: bool, known: bool = True
 ) -> Sequence[Scan]:
-    """Mark moving callers in scans, or remove their measurements if no estimate follows them.
+    """Mark moving callers in scans; remove their measurements if they cannot be tracked.
 
     Without known labels callers are marked by their numbers, and nothing is removed.
     """

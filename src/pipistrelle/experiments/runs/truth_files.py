@@ -60,7 +60,7 @@ def with_mrclam_truth(read: Read, folder: Path, robot: int) -> tuple[Log, Truth]
 
 
 def with_bag_truth(read: Read, path: Path, settings: BagConfig) -> tuple[Log, Truth]:
-    """Read a ROS bag as a log, and the true path from a topic if named; it gives the first pose."""
+    """Read a ROS bag as a log; a named topic gives the true path, and with it the first pose."""
     from pipistrelle.detection.logs.bag_log import Remarks, read_poses
 
     remarks = Remarks()

@@ -113,7 +113,7 @@ def checked_scenario(
     filters: int = 1,
     workers: int = 1,
 ) -> Scenario:
-    """Draw the first world of a mission; raise if its sound cannot be simulated.
+    """Generate the first world of a mission; raise if its sound cannot be simulated.
 
     Memory is checked for the numbers of strategies and filters, and of workers on this machine (0
     for a cluster).
@@ -215,7 +215,7 @@ def _left_from_air(config: Config) -> list[str]:
 
 
 def _cost(config: Config, callers: Sequence[Caller]) -> list[str]:
-    """Return a warning about the run time if every sample must be recorded without request."""
+    """Return a warning that all samples must be simulated, slowly, if no setting asks for it."""
     why = off_raster(config, callers)
     swept = [caller.key or caller.name for caller in callers if caller.sound is not None]
     if config.receiver.engine != "auto" or not (why or swept):

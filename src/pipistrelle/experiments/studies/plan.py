@@ -93,7 +93,7 @@ class Plan:
     read."""
 
     def world(self, config: Config) -> World:
-        """Return the user's world that the settings name, or a world that is drawn as a whole."""
+        """Return the user's world that the settings name, or an entirely random world."""
         return ALL_DRAWN if config.scenario.world is None else self.worlds[config.scenario.world]
 
 
@@ -139,7 +139,7 @@ def own_config(plan: Plan, name: str, config: Config) -> Config:
 
 
 def _dotted(values: Mapping[str, Any], prefix: str) -> Layer:
-    """Convert settings by dotted name to a layer; `prefix` precedes a name in messages."""
+    """Convert a dict of settings by dotted name to a layer; names in messages get `prefix`."""
     return {
         cast(Key, tuple(name.split("."))): Given(value, prefix + name)
         for name, value in values.items()
@@ -147,7 +147,7 @@ def _dotted(values: Mapping[str, Any], prefix: str) -> Layer:
 
 
 def common(plan: Plan, values: Mapping[str, Any]) -> Config:
-    """Return a plan's settings with some values of its grid, without filter-specific overrides.
+    """Return a plan's common settings for given values of its varied settings.
 
     >>> ways = {"strategies": ("fused",), "filters": ("ekf",), "config": Config()}
     >>> plan = Plan(name="one", iterations=1, grid={"filter.gate": (0.9,)}, **ways)
@@ -386,7 +386,7 @@ def _beneath(path: Path, table: Mapping[str, Any], over: Layer) -> tuple[Layer, 
 
 
 def _laid(path: Path, table: Mapping[str, Any], over: Layer, worlds: dict[str, World]) -> Layer:
-    """Merge settings of a world, a plan and `over`, in rising priority; read files they name."""
+    """Merge the settings of a world, a plan and the caller (`over`), in rising priority."""
     layer: Layer = {
         key: Given(value, f"{path}: config.{name}")
         for key, name, value in _settings(path, "config", table)

@@ -86,7 +86,7 @@ class TrialRecord:
 
 
 def run_world(plan: Plan, iteration: int) -> tuple[TrialRecord, ...]:
-    """Draw a world, simulate its sound once for all beamwidths, and run every case of a plan.
+    """Generate a world, simulate its sound once for all beamwidths, and run all cases of a plan.
 
     A trial that raises an exception becomes a failed record, as do all trials of a world that does.
     """
@@ -99,7 +99,7 @@ def run_world(plan: Plan, iteration: int) -> tuple[TrialRecord, ...]:
 
 
 def heard_together(plan: Plan) -> tuple[tuple[PlannedCase, ...], ...]:
-    """Group the cases of a plan that can use the same drawn world and simulated sound."""
+    """Group the cases of a plan that can use the same random world and simulated sound."""
     together: dict[str, list[PlannedCase]] = {}
     for case in cases_of(plan):
         together.setdefault(heard_settings(case.config), []).append(case)
@@ -195,7 +195,7 @@ def heard_settings(config: Config) -> str:
 
 
 def _run_cases(cases: Sequence[PlannedCase], iteration: int, world: World) -> list[TrialRecord]:
-    """Draw and simulate a world once for several cases, and run each case."""
+    """Generate and simulate a world once for several cases, and run each case."""
     config = cases[0].config
     radii = sorted({case.config.emitter.radius for case in cases})
     try:
@@ -393,7 +393,7 @@ def _parquet(table: "pl.DataFrame", metadata: dict[str, str] | None = None) -> b
 
 
 def _make_way(folder: Path, iteration: int, files: dict[str, bytes]) -> None:
-    """Delete a world's file of trials if its other tables will change, so it is unfinished."""
+    """Mark a world as unfinished (delete its trials) if its other tables will change."""
     trials = world_file(folder, "trials", iteration)
     for name in TABLES[:-1]:
         with contextlib.suppress(FileNotFoundError):
