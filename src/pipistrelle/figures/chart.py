@@ -227,7 +227,7 @@ def legend_series(panels: Iterable[Panel]) -> dict[str, Series]:
 
 
 def explained(series: Series) -> bool:
-    """Return whether the legend lists a data series: no text, no marks of single worlds."""
+    """Return whether a data series belongs in the legend, unlike texts and single worlds' marks."""
     mark = MARKS[series.style]
     return not (mark.pinned or mark.written)
 

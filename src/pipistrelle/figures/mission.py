@@ -128,7 +128,7 @@ class _EndPanel(MapPanel):
         return super().symbols() | {name for name, is_drawn in drawn.items() if is_drawn}
 
     def show_end(self) -> None:
-        """Show the final estimate, the landmarks' errors and lines along unresolved bearings."""
+        """Show the final estimate with lines to the true landmarks and along partial landmarks."""
         from matplotlib.collections import LineCollection
 
         self.show(0, self.path, self.truth.path, self.tracks)

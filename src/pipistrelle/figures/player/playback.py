@@ -268,7 +268,7 @@ def _estimate(
 
 
 def _named(labels: Int[np.ndarray, " n"], trial: TrialResult) -> Int[np.ndarray, " n"]:
-    """Replace a map's labels by its true landmarks' labels, or by numbers below -1 if false."""
+    """Replace map labels by labels of true landmarks; false landmarks get numbers below -1."""
     if trial.mapped is None:
         return labels
     pairs = zip(
@@ -279,7 +279,7 @@ def _named(labels: Int[np.ndarray, " n"], trial: TrialResult) -> Int[np.ndarray,
 
 
 def _rows(trial: TrialResult, frames: Sequence[tuple[np.ndarray, ...]]) -> Rows:
-    """Stack the labels and numbers of all frames, and count the first row of each frame."""
+    """Stack the labels and numbers of all frames in a table; record each frame's first row."""
     labels = np.concatenate([np.empty(0, int), *(labels.astype(int) for labels, *_ in frames)])
     numbers = [np.column_stack(columns) for _, *columns in frames]
     return Rows(
