@@ -139,7 +139,7 @@ def is_first(measure: Measure) -> bool:
 def measured(
     selection: Selection, measure: Measure, before: Cell, after: Cell
 ) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"]]:
-    """Return a measure of two cases in each world; NaN in excluded worlds.
+    """Return a score, or the gain in it, of two cases in each world; NaN in excluded worlds.
 
     Ratios give logarithms. Map errors are taken over the landmarks that all cases with the same
     landmarks have placed.
@@ -187,7 +187,7 @@ def compare(
 def _frame(
     selection: Selection, rows: Iterable[tuple[int, Measure, Sequence[Pair]]]
 ) -> "pl.DataFrame":
-    """Return a measure of paired cases in each world as a table, the input of `contrasts`.
+    """Return the scores of paired cases in each world as a table, the input of `contrasts`.
 
     `rows`: family, measure and pairs.
     """
@@ -260,7 +260,7 @@ def _of_values(
 
 
 def _of_ways(study: Study, one: Way, other: Way, **fields: Any) -> Pairing:
-    """Pair the cases of two (filter, strategy) pairs at each combination of the variables."""
+    """Pair the cases of two filters or strategies at each combination of the variables."""
     at = np.array([study.trials[way].at for way in (one, other)])
     numbers = np.sort(np.unique(at, axis=1, return_index=True)[1]).tolist()
     return Pairing(
@@ -272,7 +272,7 @@ def _of_ways(study: Study, one: Way, other: Way, **fields: Any) -> Pairing:
 
 
 def effects_of(selection: Selection) -> tuple[Effect, ...]:
-    """Judge every comparison of a study in every score that it concerns."""
+    """Judge the significance of every comparison of a study, in every score."""
     import polars as pl
 
     families: dict[tuple[Any, ...], list[Pairing]] = {}
@@ -480,7 +480,7 @@ def _averaged(
 
 
 def _shown_by(study: Study, group: Sequence[Effect]) -> str:
-    """Return a sentence that lists the filters and strategies for which an effect is shown."""
+    """Return a sentence that lists the filters and strategies with a significant effect."""
     titles, parts = filter_titles(study), []
     for sign, verb in ((1, "rise"), (-1, "fall")):
         shown = [e.pairing for e in group if direction(e.finding) == sign]

@@ -245,7 +245,7 @@ def _template() -> "Template":
 
 
 def _side_by_side(figures: list[dict[str, Any]]) -> list[dict[str, Any]]:
-    """Mark figures with a single panel for placing in pairs, and an odd last figure as lone."""
+    """Set how figures are placed: single-panel figures in pairs, an odd last figure by itself."""
     single = [figure for figure in figures if figure["columns"] == 1]
     for figure in single:
         figure["place"] = "single"

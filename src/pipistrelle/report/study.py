@@ -142,12 +142,12 @@ class Selection:
 
 
 def selections(study: Study) -> dict[Rule, Selection]:
-    """Return a study under each exclusion rule for diverged trials, by rule."""
+    """Apply every exclusion rule for diverged trials to a study; return the results by rule."""
     return {rule: select(study, rule) for rule in RULES}
 
 
 def select(study: Study, rule: Rule) -> Selection:
-    """Combine a study with an exclusion rule for diverged trials."""
+    """Apply an exclusion rule for diverged trials to a study."""
     lost = {name: lost_worlds(study, name) for name in filter_titles(study)}
     return Selection(study=study, rule=rule, lost=lost)
 
@@ -158,7 +158,7 @@ def has_numbers(study: Study, score: str) -> bool:
 
 
 def along(study: Study, variable: Variable) -> Int[np.ndarray, "k m"]:
-    """Return the numbers of all combinations, in an array with a row per value of a variable.
+    """Return the numbers of all combinations of variables, with a row per value of `variable`.
 
     `variable`: one of the study's. Returns: columns are the combinations of the other variables.
     """
@@ -168,7 +168,7 @@ def along(study: Study, variable: Variable) -> Int[np.ndarray, "k m"]:
 
 
 def combination_name(study: Study, number: int, without: Sequence[Variable] = ()) -> str:
-    """Name a combination by the values of the study's variables, except `without`."""
+    """Return a name for a combination of variables from their values, except `without`."""
     at = np.unravel_index(number, [len(one.given) for one in study.variables] or [1])
     return ", ".join(
         variable.words[i] if variable.name == BEAM else f"{variable.name} = {variable.words[i]}"
@@ -178,7 +178,7 @@ def combination_name(study: Study, number: int, without: Sequence[Variable] = ()
 
 
 def case_name(study: Study, way: Way, number: int) -> str:
-    """Name a combination by the variables that make a difference to a filter and strategy.
+    """Return a name for a combination from the variables that affect a filter and strategy.
 
     Returns: empty for passive sensing if only the beam varies.
     """
@@ -362,7 +362,7 @@ def _variables(plan: Plan) -> tuple[Variable, ...]:
 
 
 def _against_truth(variable: Variable, configs: Sequence[Config]) -> Variable:
-    """Take the true value of an assumed setting or a bias as reference, if it is varied too."""
+    """Use the true value of a setting as its reference value, if it is among the varied values."""
     truths = {_truth(variable.setting, config) for config in configs}
     truth = truths.pop() if len(truths) == 1 else None
     if truth is None or variable.numbers is None:
@@ -406,7 +406,7 @@ def _numbers(
 
 
 def _drawn(plan: Plan, config: Config, world: int) -> Scenario | None:
-    """Draw a world of a plan again; None if that is impossible, as without its folder."""
+    """Generate a world of a plan again; None if that is impossible, as without its folder."""
     try:
         return world_of(config, world, plan.world(config))
     except InputError:

@@ -67,7 +67,7 @@ def _add(
 
 
 def readings(panel: Panel) -> list[tuple[float, str, list[tuple[str, str]]]]:
-    """Return a panel's readable positions: place, its name, and each series' value as text."""
+    """Return a panel's numbers to read out: for each position its name and all series' values."""
     named = [s for s in panel.series if s.listed and explained(s) and len(s.x)]
     if not named or panel.equal:
         return []
@@ -235,7 +235,7 @@ def _draw_spread(svg: Element, series: Series, panel: Panel) -> None:
 
 
 def _columns(panel: Panel) -> list[tuple[str, float, float]]:
-    """Return tooltip text, left and right edge of the column around each readable position."""
+    """Return the tooltip columns of a panel: text, left and right edge around each position."""
     read = readings(panel)
     if not read:
         return []

@@ -198,7 +198,7 @@ def case_rows(selection: Selection) -> list[dict[str, Any]]:
 
 
 def _moments(sample: np.ndarray, *, ratio: bool) -> list[float] | None:
-    """Return mean and standard deviation of a sample, or its geometric mean and factor."""
+    """Return mean and standard deviation of a sample, or geometric mean and deviation factor."""
     if ratio:
         sample = np.log(sample[sample > 0.0])
     if len(sample) == 0:

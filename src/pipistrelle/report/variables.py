@@ -125,7 +125,7 @@ def word_of(variable: Variable, value: Any) -> str:
 
 
 def places(variable: Variable) -> Float[np.ndarray, " k"]:
-    """Return positions of a variable's values along an axis: the numbers, else 0, 1, 2, ...."""
+    """Return a variable's positions along an axis: its numbers, or 0, 1, 2, ... for words."""
     if variable.numbers is None:
         return np.arange(len(variable.given), dtype=np.float64)
     return np.array(variable.numbers)
