@@ -93,7 +93,7 @@ def hear(
     progress: Progress | None = None,
     **settings: Any,
 ) -> Heard:
-    """Detect the echoes in a sound recording, as a log for `slam`, as `pipistrelle hear` does.
+    """Detect the echoes in a sound recording for `slam`, as `pipistrelle hear` does.
 
     Parameters
     ----------

@@ -556,7 +556,7 @@ def check_clock(ends: Float[np.ndarray, " k"], now: float = -inf) -> None:
 
 
 def table_of(columns: Mapping[str, Any], callers: Sequence[LogCaller], *, labelled: bool) -> Table:
-    """Convert the columns of a scan to a table as of a log; raise if a needed label is missing."""
+    """Check a scan's columns and convert them to a log's table; `labelled` requires labels."""
     if unknown := sorted(columns.keys() - {*COLUMNS}):
         near = meant(unknown[0], COLUMNS)
         fix = f"did you mean {near!r}?" if near else "leave it out"

@@ -419,7 +419,7 @@ def _sign_test(difference: Float[np.ndarray, " n"]) -> float:
 
 
 def _fits(recorded: "Log") -> tuple[Int[np.ndarray, " k"], Float[np.ndarray, "k h"]]:
-    """Return the scan number of each compared row, and its fit: as recorded, and by correction.
+    """Return scan number and fit to earlier scans of each row: as recorded, and as corrected.
 
     The fit is the sum over earlier scans of log p(z) / p_0.
     """
@@ -446,7 +446,7 @@ def _fits(recorded: "Log") -> tuple[Int[np.ndarray, " k"], Float[np.ndarray, "k 
 
 
 def _recorded_rows(recorded: "Log") -> list[_Rows]:
-    """Return each scan's measurements that have a bearing and are of fixed landmarks, by echo."""
+    """Return each scan's measurements with a bearing, without direct calls and moving callers."""
     ends = np.cumsum([scan.landmark.size for scan in recorded.scans])
     bearings = np.split(recorded.recorded_bearings(), ends[:-1])
     moving = [caller.landmark for caller in recorded.callers if caller.moves]

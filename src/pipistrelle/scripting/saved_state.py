@@ -161,7 +161,7 @@ def refused_if_forged(path: Path) -> Iterator[None]:
 
 
 def read_state(path: Path, own: Mapping[str, str | None]) -> tuple[tuple[str, str], DriveState]:
-    """Read a file that may be forged; return its estimator's and association's names and state.
+    """Read a drive's state from a file that may be forged; return class names and state.
 
     ``own``: estimator and association that the caller trusts, by the names of the options. Call it
     within `refused_if_forged`.
@@ -421,7 +421,7 @@ def _fits_alone(value: Any, hint: Any) -> bool:
 
 
 def check_going_on(start: SessionState, state: SessionState, *, own: bool) -> None:
-    """Raise if a session with these settings cannot reach a state from its start.
+    """Raise if a loaded state does not fit the estimator and association of a new session.
 
     ``own``: whether the estimator is a user's, which may have several types of beliefs.
     """
