@@ -25,7 +25,7 @@ def report(
     ] = None,
     quiet: Annotated[bool, Parameter(negative=(), help="Print only the path of the page.")] = False,
 ) -> None:
-    """Answer a study's question on one page, with its figures; judge the paper's claims by it."""
+    """Write a study's report: a page that answers its question and judges the paper's claims."""
     from pipistrelle.evaluation.comparison import INTERVALS
     from pipistrelle.report.page import MIN_WORLDS, write_report
     from pipistrelle.report.study import read_study
