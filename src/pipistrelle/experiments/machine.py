@@ -109,7 +109,7 @@ def _farthest(places: Any) -> float:
 
 
 def _refuse_beyond(what: str, need: float, workers: int) -> None:
-    """Raise if all workers together need more memory than there is; `need` [bytes] is for each."""
+    """Raise if workers that need `need` bytes each exceed the memory of this machine."""
     if need * workers <= (have := installed()):
         return
     each = f" in each of {workers} workers" if workers > 1 else ""

@@ -166,7 +166,7 @@ def _keep_plan(folder: Path, there: Plan | None, plan: Plan) -> None:
 
 
 def _refuse_strange(folder: Path, there: Plan | None, strange: Sequence[str]) -> None:
-    """Raise if a folder is not empty and no study's folder, so that nothing is overwritten."""
+    """Raise if a folder is neither empty nor a study's, so that nothing in it is overwritten."""
     if there is None and strange:
         raise InputError(
             f"{folder}: holds {min(strange)} and no plan.toml, so it is no study's folder; "

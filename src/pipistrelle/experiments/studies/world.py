@@ -309,7 +309,7 @@ def world_file(folder: Path, table: str, iteration: int) -> Path:
 
 
 def done_worlds(folder: Path) -> set[int]:
-    """Return the numbers of the finished worlds in a study's folder."""
+    """Return the set of finished worlds' numbers in a study's folder."""
     names = (
         path.stem.partition("_")[2] for path in (folder / "trials").glob("iteration_*.parquet")
     )
