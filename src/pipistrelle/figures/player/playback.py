@@ -56,7 +56,7 @@ SCRIPTS = ("numbers.js", "drawing.js", "map.js", "charts.js", "player.js")
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Rows:
-    """Numbers of landmarks or measurements in all frames, with the first row of each frame."""
+    """Table of all frames' landmarks or measurements, with the index of each frame's first row."""
 
     first: Int[np.ndarray, " n"]
     """Frame i has the rows first[i] to first[i + 1]."""
