@@ -158,7 +158,7 @@ def has_numbers(study: Study, score: str) -> bool:
 
 
 def along(study: Study, variable: Variable) -> Int[np.ndarray, "k m"]:
-    """Return the numbers of all combinations of variables, with a row per value of `variable`.
+    """Return the indices of all combinations of variables, with a row per value of `variable`.
 
     `variable`: one of the study's. Returns: columns are the combinations of the other variables.
     """
@@ -188,7 +188,7 @@ def case_name(study: Study, way: Way, number: int) -> str:
 
 
 def own_cases(trials: Trials) -> Int[np.ndarray, " b"]:
-    """Return for each case the first combination of variables that it belongs to."""
+    """Return for each case the index of the first combination of variables that it belongs to."""
     return np.unique(trials.at, return_index=True)[1]
 
 
