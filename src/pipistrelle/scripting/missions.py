@@ -276,7 +276,7 @@ class Recordings:
         )
 
     def conduct(self, mission_of: Conduct, **watched: Any) -> Mission:
-        """Conduct a mission and write its sound frame by frame."""
+        """Run a mission and write its sound frame by frame."""
         if (sound := self.sound) is None:
             return mission_of(**watched)
         sound.begin(checked_scenario(self._config, world=self._world or ALL_DRAWN))

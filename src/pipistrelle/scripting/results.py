@@ -74,7 +74,7 @@ class Results:
 
     @cached_property
     def mission(self) -> "Mission":
-        """The mission with its estimates; conducted again if only its result folder is known."""
+        """The mission with its estimates; run again if only its result folder is known."""
         return self._redo(None)
 
     @cached_property
@@ -137,7 +137,7 @@ class Results:
         return drawn(self.mission)
 
     def animate(self, path: Path | str = "mission.gif") -> Path:
-        """Write a film of the mission, which is conducted again for this.
+        """Write a film of the mission, which is run again for this.
 
         Parameters
         ----------
@@ -417,7 +417,7 @@ def _conducted(
     working: AbstractContextManager[Any],
     recordings: "Recordings | None" = None,
 ) -> Results:
-    """Conduct a mission, write its results into a folder and issue its warnings."""
+    """Run a mission, write its results into a folder and issue its warnings."""
     from pipistrelle.experiments.machine import keep_freed_memory
     from pipistrelle.experiments.results.writing import result_folder
     from pipistrelle.scripting.missions import filmed, keep
@@ -467,7 +467,7 @@ def _conducted(
 def _called(
     conduct_by: Callable[[Door], Results], asked: dict[str, Any], flags: Layer, **more: str
 ) -> Results:
-    """Conduct a mission that was called from Python; warn of failed estimates."""
+    """Run a mission that was called from Python; warn of failed estimates."""
     from pipistrelle.kernel_clock import announce
     from pipistrelle.scripting.missions import failures
 
@@ -487,7 +487,7 @@ def _called(
 def load(
     folder: Path | str, /, *, filters: Filters = (), association: str = ""
 ) -> "Results | StudyResults":
-    """Open a result folder of a mission or study; figures of a mission conduct it again.
+    """Open a result folder of a mission or study; for figures, the mission is run again.
 
     Parameters
     ----------
