@@ -22,7 +22,7 @@ Show = Callable[["StudyProgress"], None]
 
 
 def _study(asked: dict[str, Any]) -> int:
-    """Run a study for `pipistrelle study`; print its numbers of worlds and trials, its folder."""
+    """Run a study for `pipistrelle study`; print counts of worlds and trials, and the folder."""
     from pipistrelle.experiments.studies.plan import MOST_WORLDS, find_plan, read_plan
 
     iterations, workers, quiet = asked["iterations"], asked["workers"], asked["quiet"]

@@ -71,7 +71,7 @@ def view(
     overwrite: Annotated[bool, Parameter(help="Replace an existing FILE.")] = False,
     quiet: Annotated[bool, Parameter(help="Print only the path of the page.")] = False,
 ) -> None:
-    """Write an HTML page that plays a mission, which is conducted again from its folder."""
+    """Write an HTML page that plays a mission, which is run again from its result folder."""
     from pipistrelle.experiments.results.reading import read_summary
 
     read_summary(folder)
@@ -89,7 +89,7 @@ def view(
 def _play_again(
     folder: Path, log: Path | None, trusted: tuple[str, ...], quiet: bool
 ) -> "Playback":
-    """Conduct a mission again from its result folder; return its frames for the page."""
+    """Run a mission again from its result folder; return its frames for the page."""
     from pipistrelle.experiments.machine import keep_freed_memory
     from pipistrelle.experiments.runs.replay import rerun
     from pipistrelle.figures.player.playback import playback
