@@ -31,7 +31,7 @@ from pipistrelle.jit import kernel
 def edited(
     history: History, remove: Sequence[int], merge: Sequence[tuple[int, int]]
 ) -> tuple[History, Bool[np.ndarray, " l"]]:
-    """Remove and merge landmarks of a history; return it, and which separator landmarks remain.
+    """Remove and merge landmarks in a smoother's history; return it and a mask of the remaining.
 
     Their measurements are deleted or relabelled; the chain must be eliminated again.
     """
@@ -48,7 +48,7 @@ def edited(
 
 
 def _slot(history: History, label: int) -> int:
-    """Return the slot of a landmark; raise InputError if it moves or was never measured."""
+    """Return the index of a landmark in the history; raise InputError if moving or unknown."""
     if (label, False) not in history.slots:
         raise InputError(
             f"association: found landmark {label} to change, which is not on the map, or moves"
@@ -57,7 +57,7 @@ def _slot(history: History, label: int) -> int:
 
 
 def _merged(history: History, kept: int, gone: int) -> History:
-    """Assign the measurements of a slot to another slot."""
+    """Return the history with all measurements of a landmark assigned to another landmark."""
     if kept == gone:
         raise InputError("association: found a landmark to merge with itself; expected two")
     ends, index, heard = history.rows.entries(0).copy(), history.index.copy(), history.heard.copy()
@@ -72,7 +72,7 @@ def _merged(history: History, kept: int, gone: int) -> History:
 def _with_rows(
     history: History, ends: Int[np.ndarray, "r 4"], keep: Bool[np.ndarray, " r"]
 ) -> History:
-    """Return a history with changed `Rows.ends`, reduced to selected measurements."""
+    """Return the history with reassigned measurements (`Rows.ends`), and only the kept of them."""
     numbers = history.rows.entries(1)[keep]
     ends, latest = ends[keep], np.full(history.latest.size, -1)
     _link(ends, numbers, latest)
@@ -99,7 +99,7 @@ def _link(
 
 
 def _forgetting(history: History, slots: Sequence[int]) -> History:
-    """Detach slots from their labels, keeping their numbers."""
+    """Detach landmarks from their labels in a smoother's history, keeping their indices."""
     named = {slot: key for key, slot in history.slots.items()}
     named |= {slot: (-2 - slot, False) for slot in slots}
     index, heard = history.index.copy(), history.heard.copy()
@@ -109,7 +109,7 @@ def _forgetting(history: History, slots: Sequence[int]) -> History:
 
 
 def _renumbered(history: History, kept: Bool[np.ndarray, " l"]) -> History:
-    """Reduce the separator to selected landmarks and renumber them."""
+    """Return the history with only selected landmarks as unknowns, numbered without gaps."""
     number, index = np.append(0, np.cumsum(kept)), history.index.copy()
     index[index > 0] = number[index[index > 0]]
     mean, information = history.known
@@ -128,7 +128,7 @@ MapRow = tuple[int, Float[np.ndarray, "2"], Float[np.ndarray, "2 2"], float]
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SmootherBelief(Recoverable):
-    """Solution of all measurements up to the last node, and the control steps since."""
+    """The smoother's belief: the solution up to the last scan, and the control steps since."""
 
     at: Gaussian
     """Pose at the last node of the chain, (3) and (3, 3)."""
@@ -144,7 +144,7 @@ class SmootherBelief(Recoverable):
     """Cache of the optimum and its covariances."""
 
     def best(self) -> Solution:
-        """Return the optimum of all measurements so far."""
+        """Return the converged solution of all measurements so far, cached."""
         if "best" not in self.found:
             self.found["best"] = converged(self.solution, self.history, self.noise)
         return self.found["best"]
@@ -156,7 +156,7 @@ class SmootherBelief(Recoverable):
         return self.found["smoothed"]
 
     def guess(self) -> ChainState:
-        """Predict the chain's state: current pose and moving callers."""
+        """Predict the current state: the vehicle's pose, and callers at constant velocity."""
         state = self.solution.state.copy()
         state[:POSE] = self.ahead.mean
         for i in range(POSE, len(state), CALLER):
@@ -164,11 +164,11 @@ class SmootherBelief(Recoverable):
         return state
 
     def pose(self) -> Gaussian:
-        """Return the current vehicle pose, (3) and (3, 3)."""
+        """Return the current vehicle pose: mean [m, m, rad] and 3 x 3 covariance."""
         return self.ahead
 
     def placed(self, odometry: Odometry, first: int) -> Gaussian:
-        """Return the poses after the steps of odometry from index ``first``."""
+        """Return the world poses after the control steps of odometry, from step ``first`` on."""
         parameters = self.history.calibration.odometry.size
         return _placed(self.solution, self.at, odometry, first, parameters)
 
@@ -194,13 +194,13 @@ class SmootherBelief(Recoverable):
         )
 
     def landmarks(self) -> Landmarks:
-        """Return the map: a Gaussian for each initialised landmark, a ray for each other."""
+        """Return the map: a Gaussian per located landmark, else a mixture along its bearing."""
         known, placed = self.smoothed(), self.history.placed
         points = zip(placed, known.places, known.place_covariance, [1.0] * len(placed), strict=True)
         return _map_of([*points, *self._rays(moving=False)])
 
     def calibration(self) -> dict[str, tuple[float, float]]:
-        """Return estimate and standard deviation of each calibration parameter, by name."""
+        """Return each calibration parameter's estimate and standard deviation, by name."""
         known, made = self.smoothed(), self.history.calibration
         values = made.assumed + made.unit * known.parameters
         stds = made.unit * np.sqrt(known.parameter_covariance.diagonal())
@@ -243,7 +243,7 @@ class SmootherBelief(Recoverable):
         )
 
     def edited(self, remove: Sequence[int], merge: Sequence[tuple[int, int]]) -> "SmootherBelief":
-        """Return the belief with landmarks removed and merged."""
+        """Return the belief with some landmarks removed and some pairs of landmarks merged."""
         history, kept = edited(self.history, remove, merge)
         points = replace(self.solution.points, spots=self.solution.points.spots[kept])
         solution = eliminated(history, self.noise, points)
@@ -256,7 +256,7 @@ class SmootherBelief(Recoverable):
         return replace(belief, ahead=ahead)
 
     def freed(self, pose: Pose, stds: Pose) -> "SmootherBelief":
-        """Move the pose and add an error, both spread over the steps since the last node."""
+        """Move and widen the pose's Gaussian, spread over the control steps since the last scan."""
         if not len(self.odometry.mean):
             return self
         x, y, turned = pose - self.at.mean
@@ -274,7 +274,7 @@ class SmootherBelief(Recoverable):
         return replace(self, odometry=odometry, ahead=ahead)
 
     def moving(self) -> Landmarks:
-        """Estimates of moving callers: Gaussians if tracked, else rays from the last bearings."""
+        """Return the moving callers: Gaussians if tracked, else mixtures along a bearing."""
         state, C = self.solution.state, self.solution.covariance
         seconds, points = self.odometry.seconds, []
         strayed = self.noise.walk_std**2 * seconds**3 / 3.0 * np.eye(2)
@@ -285,7 +285,7 @@ class SmootherBelief(Recoverable):
         return _map_of([*points, *self._rays(moving=True)])
 
     def tracks(self) -> dict[int, Gaussian]:
-        """Return the past positions of moving callers by label, (2) and (2, 2) for each step."""
+        """Return the past positions of moving callers by label, with a covariance for each step."""
         history = self.history
         if not history.callers:
             return {}
@@ -300,11 +300,11 @@ class SmootherBelief(Recoverable):
         return found
 
     def _callers(self) -> list[tuple[int, int]]:
-        """Return label and chain index of each moving caller."""
+        """Return the label and the state index of each moving caller."""
         return [(label, POSE + CALLER * v) for v, label in enumerate(self.history.callers)]
 
     def _rays(self, *, moving: bool) -> list[MapRow]:
-        """Return ray hypotheses of landmarks or moving callers that are not yet initialised.
+        """Return map rows of unlocated landmarks or callers: hypotheses along their last bearing.
 
         The hypotheses of a ray, at least two, have equal weights.
         """
@@ -336,7 +336,7 @@ class SmootherBelief(Recoverable):
 def _placed(
     solution: Solution, at: Gaussian, odometry: Odometry, first: int, parameters: int
 ) -> Gaussian:
-    """Predict poses from a solution's last pose by odometry with the estimated parameters."""
+    """Predict poses from a solution's last pose by odometry with the estimated calibration."""
     if not parameters:
         return placed(at, odometry, first)
     estimate = solution.border[1 : 1 + parameters] + solution.beta[1 : 1 + parameters]
@@ -359,7 +359,7 @@ def _placed(
 
 
 def _map_of(rows: Sequence[MapRow]) -> Landmarks:
-    """Convert the rows of a map to arrays."""
+    """Convert map rows (label, position, covariance, weight) to a `Landmarks` record."""
     return Landmarks(
         landmark=np.array([row[0] for row in rows], dtype=np.int64),
         mean=np.array([row[1] for row in rows]).reshape(-1, 2),

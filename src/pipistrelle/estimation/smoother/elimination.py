@@ -90,7 +90,7 @@ LEAST_STD = 1e-4
 def transition(
     work: Work, k: Whole, legs: Legs, places: Places, points: PointArrays, noise: NoiseModel
 ) -> float:
-    """Linearise the motion to node k (F, u, Q, parameter Jacobian); return twice its cost."""
+    """Linearise the motion between two scans, in the workspace; return its chi-square cost."""
     F, u, Q, (at, border) = work.F, work.u, work.Q, points
     F[:], Q[:] = 0.0, 0.0
     x, y, heading = at[k - 1, 0], at[k - 1, 1], at[k - 1, 2]
@@ -133,7 +133,7 @@ def _odometry(
     u: ChainState,
     Q: Square,
 ) -> float:
-    r"""Write offset u and noise Q of a motion with residual ``off``; return twice its cost.
+    r"""Linearise odometry: write offset u and noise covariance Q, and return its chi-square cost.
 
     The residual is the logarithm of SE(2), :math:`r = V^{-1}(\theta)\,(x, y)` and :math:`\theta`;
     ``axes``: cosine and sine of the heading.
@@ -167,7 +167,7 @@ def _odometry(
 
 @no_alloc
 def _misfit(N: PoseCovariance, x: float, y: float, z: float) -> float:
-    """Return (x, y, z) N^-1 (x, y, z), or 0 for a step without noise."""
+    """Return the squared Mahalanobis length of a motion's residual, or 0 if it has no noise."""
     if N[2, 2] == 0.0:
         return 0.0
     z /= math.sqrt(N[2, 2])
@@ -189,7 +189,7 @@ def _transition_of_caller(
     at: Float[np.ndarray, "k d"],
     noise: NoiseModel,
 ) -> float:
-    """Write F, u and Q of moving caller v; return twice the cost of its step."""
+    """Linearise a moving caller's motion between two scans; return its chi-square cost."""
     F, u, Q, cost, i = work.F, work.u, work.Q, 0.0, POSE + CALLER * v
     for a in range(i, i + CALLER):
         u[a] = 0.0
@@ -217,7 +217,7 @@ def _transition_of_caller(
 
 @no_alloc
 def predicted(work: Work, M: Square, P: Square) -> None:
-    """Write the predicted covariance F M F^T + Q to P, which must not be M."""
+    """Predict a covariance M through a linearised motion, and write the result to P."""
     write(work.Q, P)
     congruent(work.F, M, work.A, P)
 
@@ -233,7 +233,7 @@ def eliminate(
     noise: NoiseModel,
     span: tuple[Whole, Whole, Whole, Whole, Whole],
 ) -> float:
-    """Eliminate the chain between two nodes, in place; return the added chi-square cost.
+    """Eliminate the poses of several scans from the equations, in place; return their chi-square.
 
     ``span``: node of the front, first node to update, end of the nodes, columns, node of link 0.
     """
@@ -260,7 +260,7 @@ def step_to(
     noise: NoiseModel,
     span: Span,
 ) -> float:
-    """Predict the frontal state to a node without its measurements; return twice the cost."""
+    """Predict the last state (pose, callers) to the next scan; return the motion's chi-square."""
     front, legs, (k, n, base) = Front(*front), Legs(*legs), span
     work = work_of(front.C.shape[0], n, legs.slopes.shape[2])
     cost = transition(work, k, legs, Places(*places), points, noise)
@@ -273,7 +273,7 @@ def begin(
     front: Arrays, legs: PlainLegs, at: Float[np.ndarray, "k d"], border: Border,
     parameters: Float[np.ndarray, " p"], damping: float
 ) -> float:  # fmt: skip
-    """Initialise the frontal state with the start and parameter priors; return twice the cost."""
+    """Begin the elimination with priors of start pose and parameters; return their chi-square."""
     front[0][:], front[1][:], front[2][:] = 0.0, 0.0, 0.0
     work, start = work_of(POSE, 1, 0), Legs(*legs)
     mean, turn = start.mean[0], wrap_angle(at[0, 2] - start.mean[0, 2])
@@ -300,7 +300,7 @@ def enter(
     border: Border,
     damping: float,
 ) -> float:
-    """Add landmarks with priors (xx, xy, yy of information); return twice their cost."""
+    """Add landmarks' Gaussian priors to an information matrix; return their chi-square cost."""
     cost = 0.0
     for number in range(column.size):
         i, mean, by = column[number], known[0][number], known[1][number]
@@ -322,7 +322,7 @@ def leave(
     column: Int[np.ndarray, " g"],
     left: tuple[Float[np.ndarray, "g 2 n"], Float[np.ndarray, "g 2 d"], Float[np.ndarray, "g 2 2"]],
 ) -> None:
-    r"""Eliminate landmarks from the separator in sequence, in place.
+    r"""Eliminate landmarks from the equations in sequence, in place, and store their conditionals.
 
     With c the columns of a landmark, :math:`V = \Lambda_{cc}^{-1}`, :math:`H = -V \Lambda_c` and
     :math:`C_c` the derivatives of the state by it,
@@ -377,7 +377,7 @@ def leave(
 
 @no_alloc
 def advance(front: Front, work: Work, n: Whole) -> None:
-    """Predict the frontal state in place; the previous C and P stay in the work's C and M."""
+    """Predict the last state through a linearised motion, in place; its prior stays in ``work``."""
     write(front.P, work.M)
     for a in range(work.u.size):
         for j in range(n):
@@ -394,7 +394,7 @@ def advance(front: Front, work: Work, n: Whole) -> None:
 
 @no_alloc
 def step(front: Front, work: Work, links: Links, k: Whole, n: Whole) -> None:
-    """Predict the frontal state by a transition; write the conditional of the previous state."""
+    """Predict the last state to the next scan, and store its conditional given the next state."""
     advance(front, work, n)
     D, G, S, d = links.D[k], links.G[k], links.S[k], front.P.shape[0]
     multiply(work.F, work.M, work.A)
@@ -417,7 +417,7 @@ def step(front: Front, work: Work, links: Links, k: Whole, n: Whole) -> None:
 
 @no_alloc
 def correct(front: Front, work: Work, n: Whole) -> None:
-    """Update the frontal state with the accumulated measurements of a node."""
+    """Update the last state with the accumulated measurements of a scan, in place."""
     if work.alone[0]:
         return
     C, T, E, M = front.C, work.T, work.E, work.M
@@ -433,7 +433,7 @@ def correct(front: Front, work: Work, n: Whole) -> None:
 
 @no_alloc
 def _inform(front: Front, work: Work, E: Slopes, n: Whole) -> None:
-    """Add C^T E, with C updated, and G^T C, with C before, to the separator information."""
+    """Add the information of a scan's update to the information on landmarks and parameters."""
     C, G, before = front.C, work.G, work.C
     for i in range(n):
         row = front.information[i]
@@ -462,7 +462,7 @@ Left = tuple[Float[np.ndarray, "g 2 n"], Float[np.ndarray, "g 2 d"], Float[np.nd
 def trace_back(
     links: Arrays, beta: Border, last: ChainState, count: Whole
 ) -> Float[np.ndarray, "k d"]:
-    """Return the last ``count`` + 1 states, in order, by a backward pass over links."""
+    """Return the last ``count`` + 1 states of the trajectory, solved by back substitution."""
     links, d = Links(*links), last.size
     states = np.empty((count + 1, d))
     for a in range(d):
@@ -478,7 +478,7 @@ def places_left(
     left: Left, column: Int[np.ndarray, " g"], beta: Border,
     state: ChainState
 ) -> None:  # fmt: skip
-    """Write solved landmarks that left the separator, relative to their points, to ``beta``."""
+    """Solve for eliminated landmarks by back substitution, and write their offsets to ``beta``."""
     place = np.empty(2)
     for g in range(column.size - 1, -1, -1):
         beta[column[g]] = beta[column[g] + 1] = 0.0
@@ -491,7 +491,7 @@ def places_left(
 def spread_back(
     links: Arrays, covariances: tuple[Square, Slopes, Factor], count: Whole
 ) -> tuple[Float[np.ndarray, "k d d"], Float[np.ndarray, "k d d"]]:
-    """Return covariances of the states before ``count`` links, and their cross-covariances.
+    """Return the covariances of the smoothed states, and of each with the next state.
 
     ``covariances``: P, X (both replaced by the first state's) and the separator's covariance.
     """
@@ -529,7 +529,7 @@ def _make_symmetric(P: Square) -> None:
 def spread_left(
     left: Left, column: Int[np.ndarray, " g"], covariances: tuple[Square, Slopes, Factor]
 ) -> Float[np.ndarray, "g 2 2"]:
-    """Add landmarks that left the separator to the covariances; return their 2 x 2 blocks."""
+    """Restore eliminated landmarks in the covariances, in place; return their 2 x 2 blocks."""
     P, X, border = covariances
     (d, n), own = X.shape, np.zeros((column.size, 2, 2))
     by_border, by_state = np.zeros((2, n)), np.zeros((2, d))
@@ -556,7 +556,7 @@ def spread_left(
 
 @no_alloc
 def _add_by_slopes(D: Float[np.ndarray, "e n"], X: Slopes, total: Float[np.ndarray, "e d"]) -> None:
-    """Add D X^T to ``total``, without the constant column."""
+    """Add the matrix product D X^T to ``total``, in place, without the first columns of D and X."""
     for e in range(total.shape[0]):
         for a in range(total.shape[1]):
             for j in range(1, D.shape[1]):
@@ -565,7 +565,7 @@ def _add_by_slopes(D: Float[np.ndarray, "e n"], X: Slopes, total: Float[np.ndarr
 
 @no_alloc
 def factor(R: Factor, n: Whole) -> None:
-    """Factor an information matrix of n columns to R^T R in place; its first column becomes R b."""
+    """Factor an n x n information matrix in place into R^T R, with R lower triangular."""
     i = n - 1
     while i >= 4:
         _factor_rows(R, i, 4)
@@ -582,7 +582,7 @@ def factor(R: Factor, n: Whole) -> None:
 
 @no_alloc
 def _factor_rows(R: Factor, i: Whole, count: Whole) -> None:
-    """Factor ``count`` rows from row i upwards, and subtract each from the others above it."""
+    """Factor ``count`` rows of a matrix, from row i upwards, updating only these rows."""
     for p in range(i, i - count, -1):
         row, inverse = R[p], 1.0 / math.sqrt(R[p, p])
         for j in range(p + 1):
@@ -595,7 +595,7 @@ def _factor_rows(R: Factor, i: Whole, count: Whole) -> None:
 
 @no_alloc
 def minimise(R: Factor, n: Whole, beta: Border) -> None:
-    """Write the minimiser (1, b) of the cost, from the factor R."""
+    """Solve R (1, b) = 0 for b, with R a triangular factor, and write (1, b) to ``beta``."""
     beta[0] = 1.0
     for i in range(1, n):
         total = 0.0
@@ -606,7 +606,7 @@ def minimise(R: Factor, n: Whole, beta: Border) -> None:
 
 @no_alloc
 def rooted(R: Factor, w: Border, n: Whole) -> None:
-    """Replace a separator derivative w by R^-T w; its squared norm is the variance of w b."""
+    """Replace a vector w by the solution z of R^T z = w, for a lower triangular matrix R."""
     w[0] = 0.0
     for i in range(n - 1, 0, -1):
         if w[i] != 0.0:
@@ -618,7 +618,7 @@ def rooted(R: Factor, w: Border, n: Whole) -> None:
 
 @optimised_once
 def solve(front: Arrays, n: Whole, R: Factor, beta: Border) -> tuple[ChainState, Square]:
-    """Solve for the separator; return the last state relative to its point, and its covariance."""
+    """Solve for landmarks, parameters and last state; return this state's offset and covariance."""
     C, P, information = front
     d = P.shape[0]
     state, covariance, Z = np.zeros(d), np.empty((d, d)), np.empty((d, n))
@@ -632,7 +632,7 @@ def solve(front: Arrays, n: Whole, R: Factor, beta: Border) -> tuple[ChainState,
 
 @no_alloc
 def write_lower(information: Float[np.ndarray, "w w"], n: Whole, R: Factor) -> None:
-    """Copy the lower triangle of an information matrix to R, with pivot 1 for unused columns."""
+    """Copy the lower triangle of an information matrix to R, with diagonal 1 for unused columns."""
     for i in range(n):
         for j in range(i + 1):
             R[i, j] = information[i, j]
@@ -644,7 +644,7 @@ def write_lower(information: Float[np.ndarray, "w w"], n: Whole, R: Factor) -> N
 def spread(
     C: Float[np.ndarray, "d w"], P: Square, R: Factor, n: Whole, Z: Slopes, covariance: Square
 ) -> None:
-    """Write the covariance of a state: P given the separator, with derivatives C by it."""
+    """Write a state's total covariance: given the landmarks, plus the part due to their errors."""
     for a in range(P.shape[0]):
         for j in range(n):
             Z[a, j] = C[a, j]
@@ -664,7 +664,7 @@ def joint(
     by_chain: Float[np.ndarray, "q d"],
     by_border: Float[np.ndarray, "q n"],
 ) -> Float[np.ndarray, "q q"]:
-    """Return the covariance of linear functions of the last state and the separator."""
+    """Return the covariance of linear functions of the last state, the landmarks and parameters."""
     C, P, _ = front
     q, d = by_chain.shape
     Z, covariance, last = by_border.copy(), np.empty((q, q)), np.zeros(q, np.int64)
@@ -691,7 +691,7 @@ def joint(
 
 @optimised_once
 def border_covariance(R: Factor) -> Factor:
-    """Return the covariance of the separator from its factor, with 0 for the constant."""
+    """Return the covariance of landmarks and parameters from the factor of their information."""
     n = R.shape[0]
     Z, covariance = np.zeros((n, n)), np.zeros((n, n))
     for i in range(1, n):

@@ -128,7 +128,7 @@ def excess_path_range(
     front: Front,
     R: Factor,
 ) -> float:
-    """Return the range of a landmark or caller from its most precise excess path, or NaN."""
+    """Return the range [m] of a landmark or caller from its most precise excess path, or NaN."""
     m, first, last = heard
     slot, scale = rows.ends[m, 0], view.scale
     angle, across = direction_of(view, rows.numbers[m]), rows.numbers[m, BEARING_STD]
@@ -175,7 +175,7 @@ def excess_path_range(
 def unscented_range(
     way: Float[np.ndarray, "4"], spread: Float[np.ndarray, "4 4"], caller: bool
 ) -> tuple[float, float]:
-    """Return a range from an excess path, and its relative std (infinite if unknown).
+    """Compute a range [m] from an excess path, and its relative std by an unscented transform.
 
     ``way`` (4) is the offset to the other point (2), the direction of the unknown point, and the
     excess path; ``spread`` (4, 4) is their covariance. ``caller`` selects the range of the caller.
@@ -207,7 +207,7 @@ def unscented_range(
 
 @no_alloc
 def _range(way: Float[np.ndarray, "4"], caller: bool) -> float:
-    """Return the range of a landmark or of a caller from an excess path."""
+    """Return the range [m] of a landmark or caller from an excess path and a direction."""
     c, s = math.cos(way[2]), math.sin(way[2])
     return range_by_excess_path(way[3], way[0], way[1], c, s, caller)
 
@@ -228,7 +228,7 @@ def entering_places(
     front: Arrays,
     R: Factor,
 ) -> Float[np.ndarray, "m 2"]:
-    """Return initial positions for a frame's landmarks and callers, NaN if still uncertain."""
+    """Return initial positions for new landmarks and callers in a scan; NaN if too uncertain."""
     rows, places, front = Rows(*rows), Places(*places), Front(*front)
     (k, first, last), found = span, np.full((span[2] - span[1], 2), np.nan)
     view = view_of(estimate[0][k], estimate[1], places, k)
@@ -250,7 +250,7 @@ def entering_places(
 
 @no_alloc
 def range_by_crossing(rows: Rows, m: Whole, estimate: PointArrays, places: Places) -> float:
-    """Return the range where a bearing clearly crosses an earlier bearing, or NaN."""
+    """Return the range [m] to the clear crossing of a bearing with an earlier bearing, or NaN."""
     numbers, (poses, border) = rows.numbers[m], estimate
     k = rows.ends[m, 2]
     view = view_of(poses[k], border, places, k)
@@ -284,7 +284,7 @@ def drop_outside(
     R: Factor,
     bounds: tuple[float, float],
 ) -> tuple[Whole, float, float]:
-    """Replace gated bearings and ranges by NaN, and gated excess paths by no caller, in place.
+    """Discard bearings, ranges and excess paths of a scan that are outside the gate, in place.
 
     Returns their number, and the passed directions' sum of squared normalised innovations and
     degrees.
@@ -338,7 +338,7 @@ def drop_outside(
 def _part(
     work: Work, written: tuple[Whole, Whole], by_chain: ChainState, by_border: Border
 ) -> None:
-    """Split a Jacobian row into derivatives by the chain and by the separator."""
+    """Split a Jacobian row into derivatives by the state, and by landmarks and parameters."""
     chain, size = written
     for e in range(chain):
         by_chain[work.at[e]] += work.slope[e]
@@ -358,7 +358,7 @@ ENTERING_PASSES = 5
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Smoother:
-    """Incremental smoothing and mapping by elimination along the chain of poses.
+    """Incremental smoother for SLAM: each scan updates all poses and the map by elimination.
 
     >>> from pipistrelle.detection.scans import make_scan
     >>> motion = Motion(model="bicycle", control_std=(0.1, 0.03), wheelbase=0.2)
@@ -381,17 +381,17 @@ class Smoother:
     """Time without measurements after which a landmark leaves the separator [s]."""
 
     def __post_init__(self) -> None:
-        """Check that the gate is a probability."""
+        """Raise InputError unless the gate is a probability in (0, 1]."""
         check_gate(self.gate)
 
     @property
     def noise(self) -> NoiseModel:
-        """Noise of measurements and moving callers."""
+        """Noise parameters of measurements and moving callers, from the settings."""
         believed = HUBER_K if self.robust else math.inf
         return NoiseModel(believed, PRIOR_STD, float(self.speed_std), float(self.walk_std))
 
     def init(self, pose: Gaussian) -> SmootherBelief:
-        """Return the initial belief at a pose, (3) and (3, 3), without landmarks."""
+        """Return the initial belief at a start pose with its covariance, without landmarks."""
         pose = usable_pose(pose)
         history, parameters = begun(pose, self.calibration), np.zeros(self.calibration.stds.size)
         at = Stack((pose.mean[None].copy(),), 1, [1])
@@ -407,7 +407,7 @@ class Smoother:
         )
 
     def knowing(self, belief: SmootherBelief, known: Landmarks) -> SmootherBelief:
-        """Return the initial belief with known landmarks; ``belief`` is the result of `init`."""
+        """Return the initial belief ``belief`` with the landmarks of a known map added."""
         check_belief(belief, SmootherBelief)
         known = usable_known(known)
         C = known.covariance + SMALLEST_STD**2 * np.eye(2)
@@ -438,7 +438,7 @@ class Smoother:
     def update(
         self, belief: SmootherBelief, scan: Scan, rng: np.random.Generator | None = None
     ) -> SmootherBelief:
-        """Update the belief with a frame's measurements, initialising landmarks."""
+        """Update the belief with a scan, initialising new landmarks that it locates."""
         check_belief(belief, SmootherBelief)
         scan = usable_scan(scan)
         if scan.landmark.size == 0:
@@ -446,7 +446,7 @@ class Smoother:
         return recovering(self._corrected, belief, scan, self.gate, self.rays.range_bounds[1])
 
     def _corrected(self, belief: SmootherBelief, scan: Scan) -> SmootherBelief:
-        """Update the belief with the measurements that pass the gate."""
+        """Extend the belief by a scan: gate it, initialise new landmarks, solve and relinearise."""
         history, solution = self._awake(
             heard_more(belief.history, belief.odometry, scan), belief.history, belief.solution
         )
@@ -473,7 +473,7 @@ class Smoother:
     def _awake(
         self, history: History, before: History, solution: Solution
     ) -> tuple[History, Solution]:
-        """Reactivate landmarks that had left the separator and are measured again."""
+        """Restore eliminated landmarks that the last scan measured; return history and solution."""
         if math.isinf(self.window):
             return history, solution
         number = history.index[slots_heard(history)] - 1
@@ -488,7 +488,7 @@ class Smoother:
         return history, eliminated(before, self.noise, solution.points, kept, first)
 
     def _forgetting(self, history: History, solution: Solution) -> History:
-        """Schedule landmarks without measurements within the window to leave the separator."""
+        """Schedule landmarks unmeasured within the window for elimination; return the history."""
         k = history.nodes - 1
         if k % STRETCH or math.isinf(self.window):
             return history
@@ -498,7 +498,7 @@ class Smoother:
         return with_leaving(history, leaving, k // STRETCH - 1) if leaving.any() else history
 
     def _heard(self, before: History, here: Sweep, estimate: Solution) -> tuple[History, Solution]:
-        """Add the last frame's measurements and new landmarks; return history and solution."""
+        """Solve with the last scan and its new landmarks; return new history and solution."""
         history = before
         if (here.places[0][slots_heard(before)] == 0).any():
             history = _placed(before, here, estimate)
@@ -523,7 +523,7 @@ class Smoother:
 def _frame(
     history: History, here: Sweep, estimate: Solution
 ) -> tuple[Arrays, tuple[int, int, int], Arrays, tuple[np.ndarray, np.ndarray], Arrays, np.ndarray]:
-    """Return the arguments common to `drop_outside` and `entering_places` for the last node."""
+    """Return the last scan and the current estimate as arguments for compiled functions."""
     border = here.border.copy()
     border[1 : estimate.beta.size] += estimate.beta[1:]
     points = here.points.at.arrays[0], border
@@ -531,7 +531,7 @@ def _frame(
 
 
 def _placed(history: History, here: Sweep, estimate: Solution) -> History:
-    """Initialise landmarks and callers from the last node's measurements."""
+    """Initialise landmarks and callers that the last scan locates; return the extended history."""
     rows, span, places, points, front, factor = _frame(history, here, estimate)
     found = entering_places(rows, span, history.moves, places, points, front, factor)
     ends = rows[0][span[1] : span[2], 0]

@@ -36,7 +36,7 @@ Slot = tuple[int, bool]
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class History:
-    """Motion, measurements and index of unknowns of a mission."""
+    """The smoother's record of a mission: motion, measurements, and index of the unknowns."""
 
     legs: Stack
     """Columns of `records.Legs` (mean, noise, seconds, measurements), range of control steps,
@@ -70,17 +70,17 @@ class History:
 
     @property
     def nodes(self) -> int:
-        """Number of nodes in the chain."""
+        """Number of poses to estimate: the start, and a pose for each scan."""
         return self.legs.size
 
     @property
     def dimension(self) -> int:
-        """Size of a state of the chain."""
+        """Size of the state at a scan: 3 for the pose, 4 for each moving caller."""
         return POSE + CALLER * len(self.callers)
 
     @property
     def motion(self) -> PlainLegs:
-        """Motion to each node, as `records.Legs`.
+        """Motion from each scan to the next, with its covariance, as `records.Legs`.
 
         If the speed scale is the only source of absolute size, the motion residual is taken at the
         odometry's scale, as it would fall with a shrinking world.
@@ -91,34 +91,34 @@ class History:
 
     @property
     def span(self) -> tuple[int, int, int]:
-        """The last node, its first measurement and the end of its range."""
+        """Index of the last scan, and the first and end index of its measurements."""
         k = self.nodes - 1
         first, last = self.legs.arrays[3][k].tolist()
         return k, first, last
 
     @property
     def met(self) -> Int[np.ndarray, " l"]:
-        """First node with a measurement of each separator landmark, or NEVER."""
+        """Index of the first scan that measured each estimated landmark, or NEVER."""
         return self._of_placed(self.heard[:, 0])
 
     @property
     def entering(self) -> Int[np.ndarray, " l"]:
-        """Segment of the first measurement of each separator landmark."""
+        """Trajectory segment with the first measurement of each estimated landmark."""
         return self.met // STRETCH
 
     @property
     def silent(self) -> Int[np.ndarray, " l"]:
-        """Last node with a measurement of each separator landmark, or -1."""
+        """Index of the last scan that measured each estimated landmark, or -1."""
         return self._of_placed(self.heard[:, 1])
 
     def _of_placed(self, values: Int[np.ndarray, " s"]) -> Int[np.ndarray, " l"]:
-        """Reorder per-slot values by the landmarks' index in the separator."""
+        """Select the estimated landmarks' values from values of all landmarks and callers."""
         found, border = np.empty(len(self.placed), np.int64), self.index > 0
         found[self.index[border] - 1] = values[border]
         return found
 
     def places(self, columns: Int[np.ndarray, " l"]) -> Arrays:
-        """Return the variable of each slot, as `records.Places`, given the landmarks' columns."""
+        """Return which unknown each landmark and caller is, as `records.Places`."""
         index = self.index
         if columns.size:
             index = np.where(index > 0, columns[np.maximum(index - 1, 0)], index)
@@ -127,7 +127,7 @@ class History:
 
 
 def begun(pose: Gaussian, calibration: Calibration) -> History:
-    """Return the initial history at a start pose."""
+    """Return a smoother's history that contains only the start pose."""
     q = calibration.odometry.size
     legs = Stack(
         (
@@ -147,7 +147,7 @@ def begun(pose: Gaussian, calibration: Calibration) -> History:
 
 
 def heard_more(history: History, odometry: Odometry, scan: Scan) -> History:
-    """Append a node: motion by odometry, and a scan measured there."""
+    """Return the history extended by a scan, and by the odometry since the previous scan."""
     landmarks, callers, history = _slots_of(history, scan)
     legs, rows = history.legs.extended(1), history.rows.extended(landmarks.size)
     steps = history.steps.extended(len(odometry.mean))
@@ -172,7 +172,7 @@ def heard_more(history: History, odometry: Odometry, scan: Scan) -> History:
 
 @optimised_once
 def _write_leg(legs: Arrays, steps: Arrays, led: Led, span: tuple[Whole, Whole, float]) -> None:
-    """Write the motion to a chain node; ``span``: node, number of steps, duration [s]."""
+    """Store the motion to a scan in the arrays; ``span``: node, number of steps, duration [s]."""
     (mean, noise, seconds, _, ends, slopes), (k, last, took) = legs, span
     count = led[0].shape[0]
     first, moved = last - count, False
@@ -198,7 +198,7 @@ def _write_rows(
     seen: tuple[Int[np.ndarray, " s"], Int[np.ndarray, "s 2"]],
     span: tuple[Whole, Whole],
 ) -> bool:
-    """Write a node's measurements, linked to previous bearings; return whether any has a range."""
+    """Store a scan's measurements in the arrays; return whether any has a range or excess path."""
     (spans, ends, values), (landmarks, callers, numbers) = rows, scan
     (latest, heard), (k, first) = seen, span
     spans[k, 0], spans[k, 1], ranged = first, first + landmarks.size, False
@@ -219,7 +219,7 @@ def _write_rows(
 def _slots_of(
     history: History, scan: Scan
 ) -> tuple[Int[np.ndarray, " m"], Int[np.ndarray, " m"], History]:
-    """Return the slots of a scan's landmarks and callers (-1: none), and a history with them."""
+    """Return the indices of a scan's landmarks and callers, and the history with new indices."""
     labels, callers = scan.landmark.tolist(), caller_labels(scan).tolist()
     moving = {*scan.moving.tolist(), *history.callers}
     named = [(label, label in moving) for label in labels]
@@ -233,7 +233,7 @@ def _slots_of(
 
 
 def _with_slots(history: History, slots: Mapping[Slot, int]) -> History:
-    """Append slots that have no variable yet."""
+    """Return the history with indices for new landmarks and callers, which are not located yet."""
     count = len(slots) - len(history.slots)
     more = np.array([moves for _, moves in slots], np.int64)[-count:]
     return replace(
@@ -252,7 +252,7 @@ def with_places(
     mean: Float[np.ndarray, "l 2"],
     information: Float[np.ndarray, "l 3"],
 ) -> History:
-    """Add landmarks with priors to the separator, from the start if never measured."""
+    """Return the history with further landmarks as unknowns, given their Gaussian priors."""
     slots = dict(history.slots)
     for label in labels:
         slots.setdefault((label, False), len(slots))
@@ -271,7 +271,7 @@ def with_places(
 
 
 def with_caller(history: History, label: int, place: Float[np.ndarray, "2"]) -> History:
-    """Add a moving caller to the chain, from the last node on."""
+    """Return the history with a moving caller as part of the state from the last scan on."""
     index = history.index.copy()
     index[history.slots[label, True]] = -history.dimension
     return replace(
@@ -284,18 +284,18 @@ def with_caller(history: History, label: int, place: Float[np.ndarray, "2"]) -> 
 
 
 def with_leaving(history: History, numbers: Bool[np.ndarray, " l"], stretch: int) -> History:
-    """Schedule landmarks to leave the separator after a segment."""
+    """Return the history with landmarks scheduled for elimination after a trajectory segment."""
     return replace(history, leaves=np.where(numbers, stretch, history.leaves))
 
 
 def in_hindsight(history: History) -> History:
-    """Schedule each landmark to leave the separator after its last measurement."""
+    """Return the history with landmarks scheduled for elimination after their last measurement."""
     last = history.silent // STRETCH
     return replace(history, leaves=np.where(last < (history.nodes - 1) // STRETCH, last, NEVER))
 
 
 def slots_heard(history: History) -> Int[np.ndarray, " u"]:
-    """Return the slots measured at the last node, as landmarks or as callers."""
+    """Return the indices of the landmarks and callers that the last scan measured."""
     _, first, last = history.span
     ends = history.rows.arrays[0][first:last, :2].ravel()
     return ends[ends >= 0]

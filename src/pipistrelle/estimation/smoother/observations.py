@@ -60,7 +60,7 @@ Seen = tuple[float, float, float, float, float]
 
 
 class View(NamedTuple):
-    """Sensor pose at a node, with its unknown parameters."""
+    """Sensor pose at a scan, with the calibration parameters that affect its measurements."""
 
     x: float
     y: float
@@ -78,7 +78,7 @@ class View(NamedTuple):
 
 @no_alloc
 def view_of(pose: ChainState, border: Border, places: Places, k: Whole) -> View:
-    """Return the sensor's view from node k at a vehicle pose."""
+    """Return the sensor's pose and calibration at scan k, given the vehicle's pose."""
     sensor = places.sensor
     sound, turned, place, clock = sensor[0], sensor[1], sensor[2], sensor[3]
     heading, x, y = pose[2], 0.0, 0.0
@@ -118,7 +118,7 @@ def _steps_back(
 
 @no_alloc
 def point_of(slot: Whole, k: Whole, places: Places, points: PointArrays) -> Point:
-    """Return state index and position of a landmark or caller at node k; zeros if uninitialised."""
+    """Return the unknown's index and position of a landmark or caller at scan k, zeros if none."""
     i, (at, border) = places.index[slot], points
     if i > 0:
         return i, border[i], border[i + 1]
@@ -129,13 +129,13 @@ def point_of(slot: Whole, k: Whole, places: Places, points: PointArrays) -> Poin
 
 @no_alloc
 def bearing_of(view: View, seen: Seen, slope: float) -> float:
-    """Return the predicted bearing of a point; ``slope``: sensitivity to the speed of sound."""
+    """Return the predicted bearing [rad] of a point, corrected for the speed of sound."""
     return seen[1] if math.isnan(slope) else seen[1] - slope * view.lean
 
 
 @no_alloc
 def direction_of(view: View, numbers: Float[np.ndarray, " 8"]) -> float:
-    """Return the world direction of a measured bearing."""
+    """Return a measured bearing as a world direction [rad], corrected for the speed of sound."""
     angle = view.heading + numbers[BEARING]
     return angle if math.isnan(numbers[SLOPE]) else angle + numbers[SLOPE] * view.lean
 
@@ -144,7 +144,7 @@ def direction_of(view: View, numbers: Float[np.ndarray, " 8"]) -> float:
 def write_bearing(
     work: Work, view: View, seen: Seen, slope: float, i: Whole
 ) -> tuple[Whole, Whole]:
-    """Write the Jacobian row of a bearing to a point with state index i.
+    """Write the derivatives of a bearing by pose, parameters and position of a point as a row.
 
     This and the following functions return the number of chain entries and of all entries.
     """
@@ -156,7 +156,7 @@ def write_bearing(
 
 @no_alloc
 def write_range(work: Work, view: View, seen: Seen, i: Whole) -> tuple[Whole, Whole]:
-    """Write the Jacobian row of a range to a point with state index i."""
+    """Write the derivatives of a range by pose, parameters and position of a point as a row."""
     distance, _, c, s, _ = seen
     k = 1.0 / view.scale
     size = _write_view(work, view, (-k * c, -k * s, 0.0), -distance * k * k, 0.0)
@@ -167,7 +167,7 @@ def write_range(work: Work, view: View, seen: Seen, i: Whole) -> tuple[Whole, Wh
 def write_excess_path(
     work: Work, view: View, ends: tuple[Point, Point]
 ) -> tuple[float, Whole, Whole]:
-    """Write the Jacobian row of an excess path; return its predicted value and the entry counts."""
+    """Write the derivatives of an excess path as a Jacobian row; return its predicted value too."""
     (i, px, py), (j, bx, by) = ends
     path, lx, ly, cx, cy = excess_path_slopes(view.x, view.y, px, py, bx, by)
     k = 1.0 / view.scale
@@ -212,7 +212,7 @@ def _write_view(
 def _write_point(
     work: Work, chain: Whole, size: Whole, i: Whole, by_x: float, by_y: float
 ) -> tuple[Whole, Whole]:
-    """Insert derivatives by a position into a Jacobian row with ``chain`` leading entries."""
+    """Insert derivatives by a position into a Jacobian row; return its numbers of entries."""
     if i > 0:
         work.at[size], work.at[size + 1] = i, i + 1
         work.slope[size], work.slope[size + 1] = by_x, by_y
@@ -230,7 +230,7 @@ Off = tuple[ChainState, Border]
 
 @optimised_once
 def nonlinearity(rows: Arrays, span: Span, places: Arrays, points: PointArrays, off: Off) -> float:
-    """Return the largest linearisation error of a node's measurements at the estimate [std]."""
+    """Return the largest linearisation error of a scan's measurements, in standard deviations."""
     rows, places, (k, first, last), most = Rows(*rows), Places(*places), span, 0.0
     work, border = work_of(off[0].size, 1, 0), points[1].copy()
     for i in range(1, off[1].size):
@@ -266,7 +266,7 @@ def nonlinearity(rows: Arrays, span: Span, places: Arrays, points: PointArrays, 
 
 @no_alloc
 def _moved(point: Point, off: Off) -> Point:
-    """Return a position at the current estimate."""
+    """Move a landmark or caller from its linearisation point to its current estimate."""
     i, x, y = point
     if i > 0:
         return i, x + off[1][i], y + off[1][i + 1]
@@ -275,7 +275,7 @@ def _moved(point: Point, off: Off) -> Point:
 
 @no_alloc
 def _along(work: Work, written: tuple[Whole, Whole], off: Off) -> float:
-    """Return the linear change of a measurement from its linearisation point to the estimate."""
+    """Return a measurement's change from linearisation point to estimate, by its Jacobian row."""
     chain, size = written
     total = 0.0
     for e in range(chain):
@@ -301,7 +301,7 @@ def hear(
     points: PointArrays,
     noise: NoiseModel,
 ) -> float:
-    """Accumulate a node's measurements in T, G and information; return twice their cost."""
+    """Add a scan's measurements to the normal equations; return twice their robust loss."""
     (k, begin, end), believed, cost = span, noise.believed, 0.0
     work.T[:], work.G[:] = 0.0, 0.0
     work.alone[0] = _is_sure(front, span, rows, places, points, noise.damping)
@@ -337,7 +337,7 @@ def _hear_direction(
     point: Point,
     believed: float,
 ) -> float:
-    """Add a bearing, and its range if measured; return twice their cost."""
+    """Add a bearing, and any range with it, to the normal equations; return twice their loss."""
     i, px, py = point
     seen = observe(view.x, view.y, view.heading, px, py)
     across = 1.0 / max(numbers[BEARING_STD], SMALLEST_STD)
@@ -367,7 +367,7 @@ def _add_direction(
     slopes: tuple[float, float, float],
     off: tuple[float, float],
 ) -> None:
-    """Add a bearing and a range to a landmark in separator column i, faster than by `_add`."""
+    """Add a bearing and a range to the normal equations; faster than `_add`, if uncalibrated."""
     (c, s), (q, p, h), (b, r), T, G = cosines, slopes, off, work.T, work.G
     xx, yy = q * q * s * s + p * p * c * c, q * q * c * c + p * p * s * s
     xy = (p * p - q * q) * c * s
@@ -401,7 +401,7 @@ def _add_direction(
 
 @no_alloc
 def _huber(squared: float, believed: float) -> tuple[float, float]:
-    """Return the root of the Huber weight and twice the loss of a squared normalised residual."""
+    """Return a squared residual's root of the Huber weight, and twice its Huber loss."""
     if squared <= believed * believed:
         return 1.0, squared
     size = math.sqrt(squared)
@@ -410,7 +410,7 @@ def _huber(squared: float, believed: float) -> tuple[float, float]:
 
 @no_alloc
 def _add(work: Work, front: Front, chain: Whole, size: Whole, weight: tuple[float, float]) -> None:
-    """Add a weighted Jacobian row to T, G and separator information, or apply it as an update."""
+    """Weight a Jacobian row and add it to the normal equations, or apply it as a Kalman update."""
     at, slope, T, G, information = work.at, work.slope, work.T, work.G, front.information
     for e in range(size):
         slope[e] *= weight[0]
@@ -432,7 +432,7 @@ def _add(work: Work, front: Front, chain: Whole, size: Whole, weight: tuple[floa
 
 @no_alloc
 def _correct_by_row(work: Work, front: Front, chain: Whole, size: Whole) -> None:
-    """Update the frontal state with a single Jacobian row, as a Kalman filter.
+    """Update the last state with a measurement's Jacobian row, as a Kalman filter does.
 
     With w its derivatives by the separator and S its variance, the information gains w w^T / S.
     """
@@ -461,7 +461,7 @@ def _correct_by_row(work: Work, front: Front, chain: Whole, size: Whole) -> None
 def _is_sure(
     front: Front, span: Span, rows: Rows, places: Places, points: PointArrays, damping: float
 ) -> bool:
-    """Return whether a node's measurements are far more precise than its prior (`ALONE_ABOVE`)."""
+    """Return whether a scan's measurements are far more precise than its predicted pose."""
     (k, begin, end), x, y = span, points[0][span[0], 0], points[0][span[0], 1]
     turns, moves = damping, damping
     for m in range(begin, end):

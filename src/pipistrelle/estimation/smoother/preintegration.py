@@ -74,7 +74,7 @@ OF_SENSOR = ("speed_of_sound", "sensor_heading", "sensor_place", "time_offset")
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Calibration:
-    """Estimated calibration parameters."""
+    """The calibration parameters that a smoother estimates, with assumed values and priors."""
 
     names: tuple[str, ...]
     """Names of the numbers."""
@@ -91,7 +91,7 @@ class Calibration:
 
 
 def numbers_of(parameters: Iterable[str]) -> tuple[str, ...]:
-    """Return the names of the numbers of parameters, in the order of the separator.
+    """Return the names of the numbers of calibration parameters, in the smoother's order.
 
     >>> numbers_of(["sensor_place", "wheelbase"])
     ('wheelbase', 'sensor_place_x', 'sensor_place_y')
@@ -101,7 +101,7 @@ def numbers_of(parameters: Iterable[str]) -> tuple[str, ...]:
 
 
 def calibration_of(config: Config, motion: Motion) -> Calibration:
-    """Build the calibration that ``filter.calibrate`` selects, for a motion model.
+    """Build the calibration parameters that ``filter.calibrate`` selects, for a motion model.
 
     >>> from pipistrelle.config import FilterConfig
     >>> config = Config(filter=FilterConfig(calibrate=("sensor_place", "speed_of_sound")))
@@ -146,7 +146,7 @@ Led = tuple[Float[np.ndarray, "s 3"], Float[np.ndarray, "s 3 3"], Float[np.ndarr
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Odometry:
-    """Control steps since a node of the chain."""
+    """Poses after each control step since the last scan, relative to the pose at that scan."""
 
     mean: Float[np.ndarray, "m 3"]  # after each step, relative to that node [m, m, rad]
     covariance: Float[np.ndarray, "m 3 3"]  # of x, y and heading in the node's axes
@@ -155,7 +155,7 @@ class Odometry:
 
 
 def no_odometry(parameters: int = 0) -> Odometry:
-    """Return odometry without steps, for a number of parameters."""
+    """Return odometry without control steps, for a number of calibration parameters."""
     return Odometry(
         mean=np.empty((0, 3)),
         covariance=np.empty((0, 3, 3)),
@@ -170,7 +170,7 @@ def extended(
     dt: Durations,
     parameters: Int[np.ndarray, " q"],
 ) -> Odometry:
-    """Append control steps to odometry; ``parameters``: codes of `OF_ODOMETRY`."""
+    """Append control steps to odometry; ``parameters``: codes of the calibrated of them."""
     steps = odometry.mean, odometry.covariance, odometry.slopes
     numbers = motion_numbers(motion)
     mean, covariance, slopes = _extended(steps, controls, dt, numbers, parameters)
@@ -179,7 +179,7 @@ def extended(
 
 
 def placed(start: Gaussian, odometry: Odometry, first: int = 0) -> Gaussian:
-    """Return the world poses after each step from index ``first``, (m, 3) and (m, 3, 3)."""
+    """Convert odometry from a start pose to world poses with covariances, from a step on."""
     steps = odometry.mean[first:], odometry.covariance[first:]
     poses, spreads = _placed((start.mean, start.covariance), steps)
     return Gaussian(mean=poses, covariance=spreads)
@@ -187,7 +187,7 @@ def placed(start: Gaussian, odometry: Odometry, first: int = 0) -> Gaussian:
 
 @optimised_once
 def _placed(start: tuple[Pose, PoseCovariance], steps: Steps) -> Steps:
-    """Convert relative steps to world poses with covariances."""
+    """Convert poses relative to a start pose to world poses with covariances."""
     poses, spreads = np.empty(steps[0].shape), np.empty(steps[1].shape)
     for k in range(len(poses)):
         place(start, steps[0][k], steps[1][k], poses[k], spreads[k])
@@ -202,7 +202,7 @@ def _extended(
     motion: MotionNumbers,
     parameters: Int[np.ndarray, " q"],
 ) -> Led:
-    """Append control steps to relative steps."""
+    """Append control steps to a sequence of poses relative to the last scan's pose."""
     (before, _, q), size = steps[2].shape, dt.size
     mean, covariance = np.empty((before + size, 3)), np.empty((before + size, 3, 3))
     slopes = np.empty((before + size, 3, q))
@@ -232,7 +232,7 @@ def _lead_on(
     motion: MotionNumbers,
     parameters: Int[np.ndarray, " q"],
 ) -> None:
-    """Propagate the parameter Jacobian of a pose through a control step."""
+    """Propagate a pose's derivatives by calibration parameters through a control step, in place."""
     controls, dt = control
     dx, dy, turn, sx, sy, sh, tx, ty, th = motion_increment(motion, pose[2], controls, dt)
     for e in range(parameters.size):
@@ -261,7 +261,7 @@ def place(
     pose: Pose,
     covariance: PoseCovariance,
 ) -> None:
-    """Write a world pose and its covariance F C F^T + R P R^T from a pose relative to ``start``."""
+    """Convert a pose relative to ``start`` to a world pose with covariance, written in place."""
     (x, y, heading), C = start[0], start[1]
     c, s = math.cos(heading), math.sin(heading)
     dx, dy = c * relative[0] - s * relative[1], s * relative[0] + c * relative[1]
@@ -288,7 +288,7 @@ def poses_between(
     nodes: Steps,
     cross: Float[np.ndarray, "k 3 3"],
 ) -> Steps:
-    """Return all poses of a trajectory and their covariances, from its smoothed nodes."""
+    """Return the pose and covariance after every control step, from the smoothed poses at scans."""
     legs, count = Legs(*legs), ends[-1, 1]
     mean, covariance = np.empty((1 + count, 3)), np.empty((1 + count, 3, 3))
     mean[0], covariance[0] = nodes[0][0], nodes[1][0]

@@ -19,7 +19,7 @@ ROOM = 64
 
 @dataclass(frozen=True, slots=True)
 class Stack:
-    """Append-only arrays that grow together along their first axes, shared by successive beliefs.
+    """Append-only arrays that grow along their first axis and share memory between beliefs.
 
     Copying the history of each immutable belief would cost the square of a mission's length. A
     stack is a prefix of arrays with spare capacity: extending it shares them, or copies them if
@@ -38,7 +38,7 @@ class Stack:
     """Number of entries written by any stack of these arrays, shared between them."""
 
     def extended(self, count: int) -> Self:
-        """Return a stack extended by unwritten entries."""
+        """Return the arrays with ``count`` further entries, which are still unwritten."""
         arrays, written, size = self.arrays, self.written, self.size + count
         if written[0] != self.size or size > len(arrays[0]):
             room = max(ROOM, len(arrays[0]), 2 * size if size > len(arrays[0]) else 0)
@@ -48,12 +48,12 @@ class Stack:
         return type(self)(arrays, size, written)
 
     def entries(self, number: int) -> np.ndarray:
-        """Return the valid entries of an array."""
+        """Return the used entries of the array at index ``number``, without spare capacity."""
         return self.arrays[number][: self.size]
 
 
 def _copied(array: np.ndarray, size: int, room: int) -> np.ndarray:
-    """Copy the first entries of an array into a larger array."""
+    """Copy the first entries of an array into a new, larger array of zeros."""
     copied = np.zeros((room, *array.shape[1:]), array.dtype)
     copied[:size] = array[:size]
     return copied
@@ -61,7 +61,7 @@ def _copied(array: np.ndarray, size: int, room: int) -> np.ndarray:
 
 @no_alloc
 def write(A: Float[np.ndarray, "d n"], B: Float[np.ndarray, "d n"]) -> None:
-    """Copy A to B."""
+    """Copy the entries of matrix A to matrix B."""
     for a in range(B.shape[0]):
         for j in range(B.shape[1]):
             B[a, j] = A[a, j]
@@ -69,7 +69,7 @@ def write(A: Float[np.ndarray, "d n"], B: Float[np.ndarray, "d n"]) -> None:
 
 @no_alloc
 def add(A: Float[np.ndarray, "d n"], B: Float[np.ndarray, "d n"], sign: float) -> None:
-    """Add A times a sign to B, over their common columns."""
+    """Add ``sign`` times matrix A to matrix B, in place, over their common columns."""
     for a in range(B.shape[0]):
         for j in range(min(A.shape[1], B.shape[1])):
             B[a, j] += sign * A[a, j]
@@ -77,7 +77,7 @@ def add(A: Float[np.ndarray, "d n"], B: Float[np.ndarray, "d n"], sign: float) -
 
 @no_alloc
 def transpose(A: Float[np.ndarray, "d e"], B: Float[np.ndarray, "e d"]) -> None:
-    """Write the transpose of A to B."""
+    """Write the transpose of matrix A to matrix B."""
     for a in range(A.shape[0]):
         for b in range(A.shape[1]):
             B[b, a] = A[a, b]
@@ -85,7 +85,7 @@ def transpose(A: Float[np.ndarray, "d e"], B: Float[np.ndarray, "e d"]) -> None:
 
 @no_alloc
 def write_identity(A: Float[np.ndarray, "d d"]) -> None:
-    """Write the identity matrix."""
+    """Set a square matrix to the identity matrix, in place."""
     for a in range(A.shape[0]):
         for b in range(A.shape[0]):
             A[a, b] = 1.0 if a == b else 0.0
@@ -95,7 +95,7 @@ def write_identity(A: Float[np.ndarray, "d d"]) -> None:
 def write_image(
     A: Float[np.ndarray, "d e"], x: Float[np.ndarray, " e"], image: Float[np.ndarray, " d"]
 ) -> None:
-    """Write A x to ``image``."""
+    """Write the product A x of a matrix and a vector to ``image``."""
     for a in range(image.size):
         image[a] = 0.0
     add_image(A, x, image, 1.0)
@@ -105,7 +105,7 @@ def write_image(
 def multiply(
     A: Float[np.ndarray, "d e"], B: Float[np.ndarray, "e n"], product: Float[np.ndarray, "d n"]
 ) -> None:
-    """Write A B to ``product``."""
+    """Write the matrix product A B to ``product``."""
     product[:] = 0.0
     add_product(A, B, product, 1.0)
 
@@ -117,7 +117,7 @@ def add_product(
     total: Float[np.ndarray, "d n"],
     sign: float,
 ) -> None:
-    """Add A B times a sign to ``total``, over their common columns; three rows of B at once."""
+    """Add ``sign`` times the matrix product A B to ``total`` in place, over common columns."""
     columns = min(B.shape[1], total.shape[1])
     for a in range(A.shape[0]):
         first = 0
@@ -136,7 +136,7 @@ def add_product(
 
 @no_alloc
 def add_multiple(x: Float[np.ndarray, " n"], share: float, total: Float[np.ndarray, " n"]) -> None:
-    """Add a multiple of x to ``total``, over its length."""
+    """Add ``share`` times the vector x to the vector ``total``, in place."""
     for j in range(total.size):
         total[j] += share * x[j]
 
@@ -148,7 +148,7 @@ def add_image(
     total: Float[np.ndarray, " d"],
     sign: float,
 ) -> None:
-    """Add A x times a sign to ``total``."""
+    """Add ``sign`` times the product A x of a matrix and a vector to ``total``, in place."""
     for a in range(total.size):
         for e in range(x.size):
             total[a] += sign * A[a, e] * x[e]
@@ -161,7 +161,7 @@ def congruent(
     A: Float[np.ndarray, "d d"],
     P: Float[np.ndarray, "d d"],
 ) -> None:
-    """Add F M F^T to P, and write F M to A."""
+    """Add the matrix product F M F^T to P in place, and write F M to A."""
     multiply(F, M, A)
     for a in range(P.shape[0]):
         for b in range(a + 1):
@@ -173,7 +173,7 @@ def congruent(
 
 @no_alloc
 def cholesky(A: Float[np.ndarray, "d d"], L: Float[np.ndarray, "d d"]) -> None:
-    """Write the Cholesky factor of a positive semidefinite matrix; pivots not above 0 become 0."""
+    """Write the Cholesky factor L of a positive semidefinite A; pivots not above 0 become 0."""
     for j in range(A.shape[0]):
         pivot = A[j, j]
         for e in range(j):
@@ -188,7 +188,7 @@ def cholesky(A: Float[np.ndarray, "d d"], L: Float[np.ndarray, "d d"]) -> None:
 
 @no_alloc
 def solve_with(L: Float[np.ndarray, "d d"], x: Float[np.ndarray, " d"]) -> None:
-    """Replace x by (L L^T)^-1 x; components with a pivot of 0 become 0."""
+    """Solve L L^T y = x for y and write it to x; entries with a zero pivot of L become 0."""
     d = x.size
     for a in range(d):
         for b in range(a):
@@ -211,7 +211,7 @@ def posterior(
     ],
     M: Float[np.ndarray, "d d"],
 ) -> None:
-    """Write (P^-1 + T)^-1 as L (I + L^T T L)^-1 L^T, with P = L L^T; P may be singular."""
+    """Write the posterior covariance (P^-1 + T)^-1 of prior covariance P and information T to M."""
     (L, A, B), d = work, P.shape[0]
     L[:] = 0.0
     cholesky(P, L)
@@ -256,7 +256,7 @@ CALLER = 4
 
 
 class Front(NamedTuple):
-    """Last state of the chain given the separator: mean C beta, covariance P, evidence."""
+    """Distribution of the last state given the landmarks, and the information on landmarks."""
 
     C: Float[np.ndarray, "d n"]
     P: Float[np.ndarray, "d d"]
@@ -264,7 +264,7 @@ class Front(NamedTuple):
 
 
 class Legs(NamedTuple):
-    """Preintegrated motion to each node of the chain; entry 0 is the start."""
+    """Motion from each scan to the next, with covariance and derivatives; entry 0 is the start."""
 
     mean: Float[np.ndarray, "k 3"]  # motion since the node before, in its axes
     noise: Float[np.ndarray, "k 3 3"]
@@ -277,7 +277,7 @@ class Legs(NamedTuple):
 
 
 class Rows(NamedTuple):
-    """Measurements sorted by node."""
+    """All measurements of a mission as arrays, sorted by scan."""
 
     ends: Int[np.ndarray, "m 4"]
     """Slots of landmark and caller (-1: no excess path), node, and row of the previous bearing or
@@ -286,7 +286,7 @@ class Rows(NamedTuple):
 
 
 class Places(NamedTuple):
-    """Variable of each slot (landmark or caller), and parameters of moving callers and sensor."""
+    """Index of each landmark's and caller's unknowns, and data for moving callers and sensor."""
 
     index: Int[np.ndarray, " s"]  # separator column; minus the index in the chain; 0: no variable
     first: Int[np.ndarray, " v"]  # node at which each moving caller joins the chain
@@ -298,7 +298,7 @@ class Places(NamedTuple):
 
 
 class NoiseModel(NamedTuple):
-    """Noise of measurements and moving callers."""
+    """The smoother's Huber threshold, priors and noise of moving callers, and damping."""
 
     believed: float  # Huber threshold [standard deviations], or infinity
     place_std: float  # std of a moving caller's initial position [m]
@@ -308,7 +308,7 @@ class NoiseModel(NamedTuple):
 
 
 class Links(NamedTuple):
-    """Conditional of each node's predecessor: D beta + G x with covariance S."""
+    """Gaussian of each scan's state given the next state and the landmarks."""
 
     D: Float[np.ndarray, "k d n"]
     G: Float[np.ndarray, "k d d"]
@@ -316,7 +316,7 @@ class Links(NamedTuple):
 
 
 class Work(NamedTuple):
-    """Workspace of the elimination."""
+    """Temporary matrices and vectors of the smoother's elimination."""
 
     F: Float[np.ndarray, "d d"]
     u: Float[np.ndarray, " d"]
@@ -345,7 +345,7 @@ PointArrays = tuple[Float[np.ndarray, "k d"], Float[np.ndarray, " n"]]
 
 @kernel
 def work_of(d: Whole, n: Whole, q: Whole) -> Work:
-    """Allocate a workspace: state of size d, separator of size n, q odometry parameters."""
+    """Allocate a workspace for states of size d, n shared unknowns and q odometry parameters."""
     return Work(
         np.zeros((d, d)),
         np.zeros(d),

@@ -49,7 +49,7 @@ COLUMNS = 32
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Points:
-    """Linearisation points of all unknowns."""
+    """Linearisation points of all states, landmarks and calibration parameters."""
 
     at: Stack
     """States of the chain."""
@@ -60,7 +60,7 @@ class Points:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Stretch:
-    """Segment of the chain: its initial frontal state, and conditionals left by its elimination."""
+    """Trajectory segment: the state before it, and the conditionals stored by its elimination."""
 
     first: int
     """First node."""
@@ -81,13 +81,13 @@ class Stretch:
 
     @property
     def last(self) -> int:
-        """Last node of the segment."""
+        """Index of the segment's last scan."""
         return self.first + self.links.size - 1
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Solution:
-    """Solved chain up to its last node."""
+    """The smoother's solution of all scans so far: last state, landmarks, factor and cost."""
 
     points: Points
     columns: Int[np.ndarray, " l"]
@@ -109,17 +109,17 @@ class Solution:
 
 
 class Sweep:
-    """Forward elimination: the frontal state and the separator's columns at a node of the chain."""
+    """Mutable forward elimination along a trajectory: the last state in relation to the map."""
 
     def __init__(self, history: History, noise: NoiseModel, points: Points) -> None:
-        """Start with a separator that contains only parameters."""
+        """Prepare an elimination with all calibration parameters and no landmarks."""
         self.history, self.noise, self.points = history, noise, points
         self.columns = np.zeros(len(history.placed), np.int64)
         self.stretches: list[Stretch] = []
         self.cost = 0.0
 
     def begin(self) -> None:
-        """Begin the elimination at the start of the chain."""
+        """Begin the elimination at the start pose, with the priors of the parameters."""
         w, d = _room(1 + self.points.parameters.size), self.history.dimension
         self.front: Arrays = np.zeros((d, w)), np.zeros((d, d)), np.zeros((w, w))
         self.border = _padded(np.append(0.0, self.points.parameters), (w,))
@@ -136,7 +136,7 @@ class Sweep:
         front: Arrays,
         cost: float,
     ) -> None:
-        """Resume the elimination after some segments, with the separator's columns there."""
+        """Resume the elimination after segments that are already eliminated, from their results."""
         self.stretches, self.cost = list(stretches), cost
         self.columns[: columns.size], self.front = columns, tuple(map(np.copy, front))
         self.border = np.zeros(len(self.front[2]))
@@ -145,7 +145,7 @@ class Sweep:
         self._write_spots(np.flatnonzero(self.columns))
 
     def go_to_the_end(self) -> None:
-        """Eliminate all remaining segments."""
+        """Eliminate all remaining segments of the trajectory."""
         entering = self.history.entering
         for number in range(len(self.stretches), 1 + (self.history.nodes - 1) // STRETCH):
             self._open()
@@ -158,7 +158,7 @@ class Sweep:
                 self.part()
 
     def step(self) -> None:
-        """Predict to the last node, before its measurements."""
+        """Predict the state to the last scan, before its measurements."""
         k = self.history.nodes - 1
         if k % STRETCH == 0:
             self.part()
@@ -172,12 +172,12 @@ class Sweep:
         )  # fmt: skip
 
     def hear(self) -> None:
-        """Apply the measurements of the last node."""
+        """Update the state with the measurements of the last scan."""
         k = self.history.nodes - 1
         self._eliminate(k, k, k + 1)
 
     def join(self, numbers: Int[np.ndarray, " l"]) -> None:
-        """Add landmarks with their priors to the separator."""
+        """Add landmarks with their priors to the unknowns of the elimination."""
         if not numbers.size:
             return
         taken, column = {*self.columns.tolist()}, 1 + self.points.parameters.size
@@ -192,7 +192,7 @@ class Sweep:
         self.cost += enter(self.front[2], at, known, self.border, self.noise.damping)
 
     def admit(self, history: History) -> None:
-        """Adopt a history with new landmarks, which join later, and new moving callers."""
+        """Adopt a history with new moving callers, and new landmarks that are added later."""
         before, self.history = self.history, history
         more = len(history.placed) - len(before.placed)
         self.columns = np.append(self.columns, np.zeros(more, np.int64))
@@ -209,7 +209,7 @@ class Sweep:
             )
 
     def part(self) -> None:
-        """Eliminate the landmarks scheduled to leave the separator after the last segment."""
+        """Eliminate the landmarks that are scheduled to leave after the last segment."""
         stretch = self.history.leaves == len(self.stretches) - 1
         gone = np.flatnonzero(stretch & (self.columns > 0))
         if not gone.size:
@@ -222,7 +222,7 @@ class Sweep:
         self.stretches[-1] = replace(self.stretches[-1], gone=gone, freed=freed, left=left)
 
     def solved(self) -> Solution:
-        """Return the solution at the last node."""
+        """Return the solution of all measurements up to the last scan."""
         n = self.size
         factor, beta = np.zeros((n, n)), np.empty(n)
         off, covariance = solve(self.front, n, factor, beta)
@@ -242,7 +242,7 @@ class Sweep:
         )
 
     def _open(self) -> None:
-        """Begin a new segment."""
+        """Begin a new trajectory segment at the current state."""
         d, w = self.front[0].shape
         none = np.empty(0, np.int64)
         self.stretches.append(
@@ -259,12 +259,12 @@ class Sweep:
         )
 
     def _extend(self, count: int) -> None:
-        """Extend the last segment by nodes."""
+        """Extend the last trajectory segment by a number of scans."""
         last = self.stretches[-1]
         self.stretches[-1] = replace(last, links=last.links.extended(count))
 
     def _eliminate(self, stands: int, first: int, last: int) -> None:
-        """Eliminate nodes of the last segment."""
+        """Eliminate the states of some scans of the last segment, adding to the cost."""
         stretch = self.stretches[-1]
         span = stands, first, last, self.size, stretch.first
         self.cost += eliminate(
@@ -273,24 +273,24 @@ class Sweep:
         )  # fmt: skip
 
     def _settle(self) -> None:
-        """Update the variable index of all slots and the number of columns."""
+        """Update the index of each landmark's and caller's unknowns, and the number of columns."""
         self.places = self.history.places(self.columns)
         last = int(self.columns.max()) + 2 if self.columns.size else 0
         self.size = max(1 + self.points.parameters.size, last)
 
     def _linearised(self) -> tuple[np.ndarray, np.ndarray]:
-        """Return the linearisation points of states and separator."""
+        """Return the linearisation points of the states, and of landmarks and parameters."""
         return self.points.at.arrays[0], self.border
 
     def _write_spots(self, numbers: Int[np.ndarray, " l"]) -> None:
-        """Write landmarks' linearisation points to their columns, with more room if necessary."""
+        """Write landmarks' linearisation points to their columns; enlarge arrays if necessary."""
         if self.size > len(self.border):
             self._widen(self.history.dimension, _room(self.size))
         for e in range(2):
             self.border[self.columns[numbers] + e] = self.points.spots[numbers, e]
 
     def _widen(self, d: int, w: int) -> None:
-        """Enlarge all arrays to states of size d and a separator of w columns."""
+        """Enlarge all arrays to states of size d and to w columns for landmarks and parameters."""
         if self.front[0].shape == (d, w):
             return
         if d > len(self.front[0]):
@@ -310,7 +310,7 @@ class Sweep:
 
 
 def _wider(stretch: Stretch, d: int) -> Stretch:
-    """Enlarge a segment to states of size d."""
+    """Return a trajectory segment with arrays enlarged to states of size d."""
     D, G, S = stretch.links.arrays
     by_border, by_state, own = stretch.left
     (k, _, w), size = D.shape, stretch.links.size
@@ -325,12 +325,12 @@ def _wider(stretch: Stretch, d: int) -> Stretch:
 
 
 def _room(columns: int) -> int:
-    """Round a number of columns up to a multiple of `COLUMNS`."""
+    """Round a number of matrix columns up to a multiple of `COLUMNS`, as spare capacity."""
     return -(-columns // COLUMNS) * COLUMNS
 
 
 def _padded(array: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
-    """Pad an array with zeros to a shape."""
+    """Return an array enlarged to a shape, with zeros for the new entries."""
     padded = np.zeros(shape)
     padded[tuple(map(slice, array.shape))] = array
     return padded
@@ -355,7 +355,7 @@ def eliminated(
     kept: Sequence[Stretch] = (),
     first: int = 0,
 ) -> Solution:
-    """Linearise, eliminate and solve the chain; segments before ``first`` come from ``kept``."""
+    """Linearise and solve for all states and the map; keep the segments before ``first``."""
     sweep = Sweep(history, noise, points)
     if first:
         begun = kept[first]
@@ -367,7 +367,7 @@ def eliminated(
 
 
 def stepped(solution: Solution, history: History, noise: NoiseModel, guess: ChainState) -> Sweep:
-    """Return the chain extended by a node linearised at a guess, before the node's measurements."""
+    """Extend a solution by a new scan's state, linearised at a guess; return the elimination."""
     at = solution.points.at.extended(1)
     at.arrays[0][history.nodes - 1] = guess
     sweep = Sweep(history, noise, replace(solution.points, at=at))
@@ -377,7 +377,7 @@ def stepped(solution: Solution, history: History, noise: NoiseModel, guess: Chai
 
 
 def off_line(solution: Solution, history: History) -> float:
-    """Return the linearisation error of the last node's measurements [std] (`nonlinearity`)."""
+    """Return the largest linearisation error of the last scan's measurements [std]."""
     points, k = (solution.points.at.arrays[0], solution.border), history.nodes - 1
     off = solution.state - points[0][k], solution.beta
     return nonlinearity(history.rows.arrays, history.span, solution.places, points, off)
@@ -386,7 +386,7 @@ def off_line(solution: Solution, history: History) -> float:
 def relinearised(
     solution: Solution, history: History, noise: NoiseModel, still: float = STILL
 ) -> Solution:
-    """Relinearise the chain at its solution; return it unchanged if that does not lower the cost.
+    """Linearise at a solution and solve again; return the old solution if the cost would rise.
 
     Levenberg damping is used if the cost would rise. Points that moved by less than ``still`` stay.
     """
@@ -398,13 +398,13 @@ def relinearised(
 
 
 def _at_solution(solution: Solution, history: History, noise: NoiseModel, still: float) -> Solution:
-    """Linearise, eliminate and solve the chain at its solution."""
+    """Linearise all equations at a given solution, and return the new solution."""
     points, first = solved_points(solution, history, still)
     return eliminated(history, noise, points, solution.stretches, first)
 
 
 def converged(solution: Solution, history: History, noise: NoiseModel) -> Solution:
-    """Iterate to the optimum, with landmarks leaving the separator after their last measurement.
+    """Iterate a solution to the least-squares optimum of all measurements, and return it.
 
     Huber weights converge linearly: the ratio of two steps extrapolates all further steps (Aitken).
     """
@@ -426,14 +426,14 @@ def converged(solution: Solution, history: History, noise: NoiseModel) -> Soluti
 
 
 def _between(points: Points, others: Points) -> Float[np.ndarray, " u"]:
-    """Return the differences between two sets of points as a vector."""
+    """Return the differences between two sets of linearisation points as a single vector."""
     parts = (points.at.entries(0), points.spots, points.parameters)
     there = (others.at.entries(0), others.spots, others.parameters)
     return np.concatenate([(b - a).ravel() for a, b in zip(parts, there, strict=True)])
 
 
 def _beyond(points: Points, step: Float[np.ndarray, " u"], times: float) -> Points:
-    """Return linearisation points moved by a multiple of an optimisation step."""
+    """Return linearisation points moved by ``times`` an optimisation step."""
     if times == 0.0:
         return points
     states, size = points.at.entries(0), points.spots.size
@@ -446,7 +446,7 @@ def _beyond(points: Points, step: Float[np.ndarray, " u"], times: float) -> Poin
 
 @optimised_once
 def share_of(step: Float[np.ndarray, " u"], before: Float[np.ndarray, " u"]) -> float:
-    """Return the ratio of a step to the step before, or 0 if extrapolation would not help."""
+    """Return the ratio of an optimisation step to the step before, or 0 if not to extrapolate."""
     along, size = 0.0, 0.0
     for i in range(step.size):
         along += step[i] * before[i]
@@ -456,7 +456,7 @@ def share_of(step: Float[np.ndarray, " u"], before: Float[np.ndarray, " u"]) -> 
 
 
 def solved_points(solution: Solution, history: History, still: float) -> tuple[Points, int]:
-    """Return the solution as linearisation points, and the first segment that they change."""
+    """Return a solution as linearisation points, and the first trajectory segment that changes."""
     spots, parameters = solution.points.spots.copy(), solution.points.parameters.size
     beta = np.zeros(len(solution.border))
     beta[: solution.beta.size] = solution.beta
@@ -499,20 +499,20 @@ def _earliest(
     entering: Int[np.ndarray, " l"], moved: Float[np.ndarray, "l 2"],
     among: Int[np.ndarray, " g"], still: float, first: int
 ) -> int:  # fmt: skip
-    """Return the entry segment of the earliest moved landmark, at most ``first``."""
+    """Return the first segment with a measurement of a moved landmark, at most ``first``."""
     far = among[np.any(np.abs(moved[among]) > still, axis=1)]
     return min(first, int(entering[far].min(initial=first)))
 
 
 def _links_of(stretch: Stretch) -> tuple[Arrays, int]:
-    """Return the links of a segment and their number; the start has no link."""
+    """Return a segment's conditionals of each state given the next, and their number."""
     arrays, size = stretch.links.arrays, stretch.links.size
     return (arrays, size) if stretch.first else (tuple(one[1:] for one in arrays), size - 1)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Smoothed:
-    """All states, landmarks and parameters given all measurements."""
+    """Smoothed states, landmarks and calibration parameters, with covariances."""
 
     states: Float[np.ndarray, "k d"]
     covariance: Float[np.ndarray, "k d d"]
@@ -525,7 +525,7 @@ class Smoothed:
 
 
 def smoothed(best: Solution, history: History) -> Smoothed:
-    """Return means and covariances at the optimum."""
+    """Return all states, landmarks and parameters with covariances, from the optimal solution."""
     size, n, w = history.nodes, best.beta.size, len(best.border)
     border, P = np.zeros((w, w)), best.covariance.copy()
     border[:n, :n] = border_covariance(best.factor)
