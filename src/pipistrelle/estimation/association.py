@@ -30,7 +30,7 @@ M = TypeVar("M")
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Assignment:
-    """Labels of the measurements of a scan, and changes of the map."""
+    """Result of data association: a label for each measurement of a scan, and map changes."""
 
     label: Int[np.ndarray, " m"]
     """Label of each measurement: a mapped landmark, a new number, or UNLABELLED for clutter."""
@@ -60,31 +60,31 @@ class Association(ABC, Generic[M]):
 
     @abstractmethod
     def start(self) -> M:
-        """Return the memory before the first scan."""
+        """Return the association's memory (its state between scans) before the first scan."""
 
     @abstractmethod
     def associate(self, memory: M, belief: Belief, scan: Scan) -> tuple[M, Assignment]:
-        """Return the memory after a scan, and the assignment, leaving all arguments unchanged."""
+        """Associate a scan: return the memory after it, and the assignment; change no argument."""
 
     def informed(self, memory: M, news: Any) -> M:
-        """Return an earlier memory with information from a later scan (`Assignment.again`)."""
+        """Add information from a later scan to an earlier memory, and return the memory."""
         raise InputError(
             f"association: found scans to be associated again, but a {type(self).__name__} has no "
             "informed(memory, news)"
         )
 
     def knowing(self, memory: M, known: Landmarks, callers: Int[np.ndarray, " c"]) -> M:
-        """Return the first memory with the landmarks and callers of the initial map."""
+        """Return the initial memory, given the landmarks and callers of a known initial map."""
         return memory
 
     def tentative(self, memory: M) -> Sequence[int]:
-        """Return the labels of landmarks to leave out of the reported map."""
+        """Return the labels of uncertain landmarks, to be left out of the reported map."""
         return ()
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Candidates:
-    """Comparison of n pairs of a measurement and a landmark.
+    """Comparison of n pairs of a measurement and a landmark: differences and their covariance.
 
     Each pair has three numbers: bearing [rad], range [m], excess path [m]; NaN if not measured, or
     if the caller is not on the map.
@@ -172,7 +172,7 @@ def expected(
 
 @kernel
 def is_among(label: Int[np.ndarray, " m"], labels: Int[np.ndarray, " n"]) -> Bool[np.ndarray, " m"]:
-    """Return which labels are in a set of labels; faster than `np.isin` for few labels."""
+    """Return a mask of the labels that are in a set; faster than `np.isin` for few labels."""
     among = np.zeros(label.size, np.bool_)
     for m in range(label.size):
         for other in labels:

@@ -80,7 +80,7 @@ ranges from which their mean is taken, and from which only the second counts."""
 
 
 class Found(NamedTuple):
-    """Result of a search for a caller."""
+    """Result of a search for a caller: its position, the misfit, and the margin to others."""
 
     place: CallerPlace
     misfit: float
@@ -91,12 +91,12 @@ class Found(NamedTuple):
 
     @property
     def sure(self) -> bool:
-        """Whether the position is accepted."""
+        """Whether the found position is certain enough to be accepted."""
         return self.ahead > CLEARLY and self.misfit < WELL and self.tracks >= LEAST_TRACKS
 
 
 def searched(caller: Caller, moves: bool) -> tuple[Caller, CallerPlace | None]:
-    """Search for a caller if it is due; return its record, and its position if this is new.
+    """Search for a caller's position if this is due; return its record, and a new position or None.
 
     A second result is averaged with the first, or replaces it where they differ widely.
     """
@@ -121,12 +121,12 @@ def searched(caller: Caller, moves: bool) -> tuple[Caller, CallerPlace | None]:
 
 
 def _agreed(caller: Caller, place: CallerPlace) -> Caller:
-    """Fix a caller at a position and end its search."""
+    """Fix a caller's position and end its search; return its record."""
     return replace(caller, place=place._replace(agreed=True), tracks=Tracks())
 
 
 def find_caller(tracks: Tracks) -> Found | None:
-    """Find a stationary caller's position from its tracks; None without enough data."""
+    """Find a stationary caller's position from tracked echoes; None without enough data."""
     table, poses, direct = in_window(tracks, SCANS, SIGHTINGS)
     heard = direct[~np.isnan(direct)]
     if len(table) < LEAST_TRACKS or not heard.size:
@@ -144,7 +144,7 @@ def find_caller(tracks: Tracks) -> Found | None:
 
 
 def find_moving_caller(tracks: Tracks) -> Found | None:
-    """Find a moving caller's position and motion from its tracks; None without enough data."""
+    """Find a moving caller's position and motion from tracked echoes; None without enough data."""
     table, poses, direct = in_window(tracks, SCANS, SIGHTINGS)
     heard, times = np.flatnonzero(~np.isnan(direct)), tracks.times[-len(poses) :]
     if len(table) < LEAST_TRACKS or heard.size < 2:
@@ -187,7 +187,7 @@ def _bent(
     seen: tuple[np.ndarray, ...],
     within: Callable[[np.ndarray], bool],
 ) -> tuple[Float[np.ndarray, "3 2"], float]:
-    """Fit a parabola near a straight trajectory; return begin, middle and end, and the misfit."""
+    """Fit a caller's parabolic trajectory to tracked echoes; return its three points and misfit."""
     node, least, step = begun
     line = np.stack([1.0 - share, share], axis=1)
     node, least = _downhill(node, least, step, line, seen, within)
@@ -206,24 +206,24 @@ def _at_end(node: Float[np.ndarray, "3 2"], time: float, took: float) -> CallerP
 
 
 def _another(ranges: Float[np.ndarray, " n"], distance: float) -> Bool[np.ndarray, " n"]:
-    """Return whether each range differs clearly from a distance."""
+    """Return whether each range differs from a distance by more than a fixed ratio."""
     return np.abs(np.log(ranges / distance)) > ANOTHER
 
 
 def seen_from(pose: Float[np.ndarray, "3"], far: float, angle: float) -> Float[np.ndarray, "2"]:
-    """Return the point at a range [m] and a world bearing [rad] from a pose."""
+    """Return the point at a range [m] and a world bearing [rad] from a vehicle pose."""
     return pose[:2] + far * np.array([math.cos(angle), math.sin(angle)])
 
 
 def _rows(table: Float[np.ndarray, "t k 4"]) -> int:
-    """Count the measurements of a table of tracks."""
+    """Count the measurements in a table of tracked echoes, without its NaN entries."""
     return int(np.count_nonzero(~np.isnan(table[..., 0])))
 
 
 def _misfits(
     nodes: list[np.ndarray], weights: Float[np.ndarray, "k n"], seen: tuple[np.ndarray, ...]
 ) -> Float[np.ndarray, " g"]:
-    """Return the misfit of each candidate trajectory; arguments as in `_downhill`."""
+    """Return the misfit to tracked echoes of each candidate trajectory of a caller."""
     return np.array([misfit(weights @ node, *seen) for node in nodes])
 
 
@@ -235,7 +235,7 @@ def _downhill(
     seen: tuple[np.ndarray, ...],
     within: Callable[[np.ndarray], bool] = lambda nodes: True,
 ) -> tuple[Float[np.ndarray, "n 2"], float]:
-    """Minimise the misfit over trajectory nodes by a pattern search; return nodes and misfit."""
+    """Minimise a caller trajectory's misfit by pattern search; return its points and the misfit."""
     end, size = step / 12.0, len(nodes)
     which = [np.ones((size, 1)), *(np.eye(size)[:, :, np.newaxis] if size > 1 else ())]
     angles = np.arange(8) * np.pi / 4.0
@@ -259,7 +259,7 @@ def misfit(
     table: Float[np.ndarray, "t k 4"],
     direct: Float[np.ndarray, " k"],
 ) -> float:
-    """Return the total misfit of caller positions to all measurements [squared stds]."""
+    """Return the robust misfit of a caller's trajectory to all tracked echoes [squared stds]."""
     tracks, scans = table.shape[0], table.shape[1]
     turn, off = np.zeros(scans), np.full((tracks, scans), np.nan)
     points, total = np.empty((scans, 6)), 0.0
@@ -289,7 +289,7 @@ def _write_off(
     points: Float[np.ndarray, "k 6"],
     off: Float[np.ndarray, " k"],
 ) -> tuple[float, float]:
-    """Fit the point of a track and write its bearing residuals; ``points`` is workspace."""
+    """Return the landmark position that fits a track of echoes; write its bearing residuals."""
     x, y, weight = 0.0, 0.0, 0.0
     for k in range(rows.shape[0]):
         _write_point(places[k], poses[k], rows[k], turn[k], points[k])
@@ -314,7 +314,7 @@ def _of_track(
     off: Float[np.ndarray, " k"],
     point: tuple[float, float],
 ) -> float:
-    """Return the misfit of a track to its point."""
+    """Return the robust misfit of a track's bearings and excess paths to a landmark position."""
     total, (x, y) = 0.0, point
     for k in range(rows.shape[0]):
         if math.isnan(rows[k, 0]):
@@ -333,7 +333,7 @@ def _of_track(
 
 @no_alloc
 def _weighed(points: Float[np.ndarray, "k 6"], x: float, y: float) -> tuple[float, float]:
-    """Return a weighted mean of points, less weight for points far from the previous mean."""
+    """Return a robust mean of points, with less weight for points far from the previous mean."""
     sx, sy, weight = 0.0, 0.0, 0.0
     for k in range(points.shape[0]):
         if math.isnan(points[k, 0]):
@@ -355,7 +355,7 @@ def _write_point(
     turn: float,
     point: Float[np.ndarray, "6"],
 ) -> None:
-    """Write a measurement's point, direction, and variances along and across; NaN if unsolvable."""
+    """Write the point at a measurement's bearing and excess path, with variances; NaN if none."""
     point[0], angle = math.nan, row[0] + turn
     if math.isnan(row[0]):
         return
@@ -404,12 +404,12 @@ Costs = Callable[[Float[np.ndarray, " d"]], Float[np.ndarray, "r n"]]
 
 
 def may_have_turned(fitting: int, rows: int) -> bool:
-    """Return whether too few of a caller's measurements match at its expected position."""
+    """Return whether too few of a caller's measurements match landmarks, as after a turn."""
     return rows >= LEAST_ROWS and fitting < FITTING_SHARE * rows
 
 
 def turned(joint: JointGaussian, at: int, bearing: float, costs: Costs) -> JointGaussian:
-    """Move a caller in the joint mean to where its measurements match, if it may have turned."""
+    """Move a caller to where its echoes match best in a copy of the joint mean, if it turned."""
     mean, spread = joint.mean, np.diag(joint.covariance)[at : at + 2].sum()
     least, fitting = fit(costs(mean))
     if not may_have_turned(int(fitting.sum()), fitting.size):
@@ -428,7 +428,7 @@ def turned(joint: JointGaussian, at: int, bearing: float, costs: Costs) -> Joint
 
 
 def fit(costs: Float[np.ndarray, "r n"]) -> tuple[float, Bool[np.ndarray, " r"]]:
-    """Return the total cost, clutter counting 0, and whether each measurement has a match."""
+    """Return the total least cost of measurements (0 if unmatched), and which have a match."""
     least = costs.min(axis=1, initial=0.0)
     return float(least.sum()), least < 0.0
 
@@ -446,7 +446,7 @@ RANGE_SHARE = 0.2
 
 
 def direct_row(direct: Int[np.ndarray, " c"], number: int) -> int:
-    """Return the index of a caller's direct call in a scan, or -1."""
+    """Return the measurement index of a caller's direct call in a scan, or -1 without."""
     return int(direct[number]) if number < direct.size else -1
 
 
@@ -458,7 +458,7 @@ def labelled_by_map(
     match: Match,
     chances: PlainChances,
 ) -> Scan:
-    """Label the callers' measurements in an early scan by a later map.
+    """Return an early scan with labels for the callers' measurements, matched to a later map.
 
     The early pose replaces that of ``joint``, as if uncorrelated with the map. ``callers``: index
     of each caller in the mean, UNPLACED if it was elsewhere.
@@ -492,7 +492,7 @@ def _matched(
     match: Match,
     chances: PlainChances,
 ) -> Int[np.ndarray, " r"]:
-    """Match measurements after the best map rotation; NOTHING for all if this is ambiguous."""
+    """Match measurements to the map after its best rotation; no matches if it is ambiguous."""
     (mean, _), (spread, variance, left) = gaussian, _turn(*gaussian, there)
     turns = math.sqrt(variance) * TURNS
     means = [mean + spread * (turn / variance) for turn in turns]
@@ -510,7 +510,7 @@ def _turn(
     covariance: Float[np.ndarray, "d d"],
     there: Int[np.ndarray, " n"],
 ) -> tuple[Float[np.ndarray, " d"], float, Float[np.ndarray, "d d"]]:
-    """Return P a, a^T P a, and the covariance without the rotation."""
+    """Return gain and variance of the map's rotation, and the covariance if it were known."""
     dx, dy = mean[there] - mean[0], mean[there + 1] - mean[1]
     squared = there.size * (dx * dx + dy * dy)
     slope = np.zeros(mean.size)

@@ -67,7 +67,7 @@ OFTEN = 255
 
 
 class Known(NamedTuple):
-    """State of the l tracked landmarks."""
+    """Records of all tracked landmarks: detections, log odds of existence, and echo levels."""
 
     label: Int[np.ndarray, " l"]
     born: Int[np.ndarray, " l"]
@@ -86,14 +86,14 @@ class Known(NamedTuple):
 
 
 def nobody(callers: int) -> Known:
-    """Return a state without landmarks."""
+    """Return empty records of tracked landmarks, for a number of callers."""
     whole, number = np.empty(0, np.int64), np.empty(0)
     none, together = np.empty((0, callers)), np.empty((0, 0), np.uint8)
     return Known(whole, whole, whole, whole, number, np.empty(0, np.bool_), none, number, together)
 
 
 def with_new(known: Known, labels: list[int], scan: int, callers: int) -> Known:
-    """Append new landmarks, first detected in this scan."""
+    """Return the records with new landmarks added, first detected in this scan."""
     callers = max(callers, known.source.shape[1])
     if not labels and callers == known.source.shape[1]:
         return known
@@ -104,7 +104,7 @@ def with_new(known: Known, labels: list[int], scan: int, callers: int) -> Known:
 def _with_new(
     columns: tuple[np.ndarray, ...], labels: Int[np.ndarray, " n"], scan: Whole, callers: Whole
 ) -> tuple[np.ndarray, ...]:
-    """Return the columns of tracked landmarks extended by new ones."""
+    """Return the records' arrays with entries for new landmarks appended."""
     known, none = Known(*columns), np.zeros(labels.size, np.int64)
     old, size = known.label.size, known.label.size + labels.size
     source, together = np.full((size, callers), np.nan), np.zeros((size, size), np.uint8)
@@ -124,13 +124,13 @@ def _with_new(
 
 
 def some(known: Known, kept: Bool[np.ndarray, " l"]) -> Known:
-    """Select tracked landmarks by a mask."""
+    """Return the records of the landmarks that a mask selects."""
     left = Known(*(column[kept] for column in known))
     return left._replace(together=left.together[:, kept])
 
 
 def merged(known: Known, pairs: Sequence[tuple[int, int]]) -> Known:
-    """Merge pairs of landmarks: the second label of each pair into the first."""
+    """Return the records with duplicates merged: of each pair, the first label remains."""
     if not pairs:
         return known
     after = Known(*(column.copy() for column in known))
@@ -171,7 +171,7 @@ def judged(
     scan: int,
     sight: Sight = (0.0, 0.0),
 ) -> Known:
-    """Update log odds, counts and levels of landmarks after a scan; ``near``: maybe hidden."""
+    """Update landmarks' log odds of existence, counts and levels by a scan; return new records."""
     after = _copied(tuple(known))
     _judge(after, rows, place, near, scan, sight)
     return Known(*after)
@@ -179,7 +179,7 @@ def judged(
 
 @kernel
 def _copied(columns: tuple[np.ndarray, ...]) -> tuple[np.ndarray, ...]:
-    """Return the columns of `Known`, with copies of the columns that a scan changes."""
+    """Copy the arrays of landmark records that a scan changes; return them with the others."""
     label, born, heard, count, odds, confirmed, source, aim, together = columns
     counts = heard.copy(), count.copy(), odds.copy(), confirmed.copy()
     return (label, born, *counts, source.copy(), aim.copy(), together.copy())
@@ -194,7 +194,7 @@ def _judge(
     scan: Whole,
     sight: Sight,
 ) -> None:
-    """Update log odds, counts and levels in place after a scan."""
+    """Update landmarks' log odds of existence, detection counts and levels by a scan, in place."""
     known, (mean, at, callers, _) = Known(*columns), there
     label, caller, _, level, _, surety = rows
     place = np.full(label.size, -1)
@@ -232,7 +232,7 @@ def _judge(
 
 @no_alloc
 def _lower(known: Known, n: Whole, fall: float, scan: Whole) -> None:
-    """Lower the log odds of a landmark that was not detected."""
+    """Lower an undetected landmark's log odds of existence, in place, within its limits."""
     known.odds[n] -= fall
     if known.count[n] >= LASTING and not math.isnan(known.source[n, OWN]):
         if known.odds[n] < GONE:
@@ -247,7 +247,7 @@ def _count_together(
     place: Int[np.ndarray, " m"],
     caller: Int[np.ndarray, " m"],
 ) -> None:
-    """Count joint detections by the same caller; ``place``: landmark of each measurement, or -1."""
+    """Increase the number of joint detections of each pair of landmarks by the same caller."""
     for a in range(place.size):
         for b in range(place.size):
             i, j = place[a], place[b]
@@ -257,7 +257,7 @@ def _count_together(
 
 @no_alloc
 def _spreading(caller: Whole, far: float, i: Whole, place: Place) -> float:
-    """Return the spreading loss of an echo from the landmark at index i [dB].
+    """Return the loss of an echo's level by spherical spreading, via the landmark at i [dB].
 
     It is two-way for own calls, and for moving callers via the landmark, else from the landmark
     only.
@@ -283,7 +283,7 @@ def _missed(
     hidden: bool,
     sight: Sight,
 ) -> float:
-    """Weigh a missed detection of a caller's call: 1, `HIDDEN`, or 0 if none was expected."""
+    """Return the weight of an undetected echo as evidence against a landmark, from 0 to 1."""
     (_, caller, way, level, _, _), (mean, at, callers, _) = rows, place
     if math.isnan(far):
         return 0.0
@@ -318,7 +318,7 @@ def _missed(
 
 @no_alloc
 def _in_sight(far: float, bearing: float, rows: Heard, sight: Sight) -> bool:
-    """Return whether a sensor without levels should have detected an unoccluded landmark."""
+    """Return whether a sensor without echo levels (a lidar) should have detected a landmark."""
     _, caller, way, level, seen, _ = rows
     if far > WITHIN * sight[0] or abs(bearing) > 0.5 * sight[1] - BEFORE:
         return False
@@ -357,7 +357,7 @@ Pairs = list[tuple[int, int]]
 def asked_of(
     columns: tuple[np.ndarray, ...], at: Int[np.ndarray, " l"], now: Whole
 ) -> tuple[Int[np.ndarray, " o"], Bool[np.ndarray, "o o"], Int[np.ndarray, " a"]]:
-    """Return landmarks on the map, which pairs are distinct, and which are due for a test."""
+    """Return the mapped landmarks, their distinct pairs, and which to test for duplicates now."""
     known = Known(*columns)
     old = np.flatnonzero((at >= 0) & (known.born < now))
     asked, apart = np.zeros(old.size, np.bool_), np.ones((old.size, old.size), np.bool_)
@@ -377,7 +377,7 @@ def doubles(
     apart: Bool[np.ndarray, "l l"],
     asked: Int[np.ndarray, " a"],
 ) -> Pairs:
-    """Find duplicate landmarks; return pairs of positions in ``at``, the lower first.
+    """Find pairs of duplicate landmarks in a joint map; return indices in ``at``, lower first.
 
     ``apart``: pairs known to be distinct; ``asked``: landmarks from which groups may grow.
     """
@@ -396,7 +396,7 @@ def doubles(
 
 
 def _density(joint: JointGaussian, at: Int[np.ndarray, " l"]) -> float:
-    """Return the number of landmarks per square metre of the map."""
+    """Return the density of landmarks in the map's bounding box [1/m^2], limited above."""
     area = float(np.ptp(joint.mean[at]) * np.ptp(joint.mean[at + 1]))
     return at.size / max(area, at.size / DENSEST)
 
@@ -408,7 +408,7 @@ def _groups(
     number: int,
     prior: float,
 ) -> list[tuple[float, list[list[int]]]]:
-    """Grow a group of duplicates from each candidate pair of a landmark; return costs and pairs."""
+    """Grow a group of pairs from each possible duplicate of a landmark; return costs and pairs."""
     mean, covariance, pairs = joint.mean, joint.covariance, np.empty((at.size, 2), np.int64)
     groups = []
     for first in begun(mean, covariance, at, apart, number).tolist():
@@ -425,7 +425,7 @@ def begun(
     apart: Bool[np.ndarray, "l l"],
     number: Whole,
 ) -> Int[np.ndarray, "p 2"]:
-    """Return a landmark's candidate duplicates within the gate, as pairs, higher index first."""
+    """Return possible duplicates of a landmark within the gate as pairs, higher index first."""
     pairs, size = np.empty((at.size, 2), np.int64), 0
     for other in range(at.size):
         a, b = max(number, other), min(number, other)
@@ -435,7 +435,7 @@ def begun(
 
 
 def _lower_first(pairs: list[list[int]]) -> Pairs:
-    """Sort each pair, with indices replaced by their landmark after the merges before.
+    """Sort each pair of indices, replacing indices that earlier pairs have merged.
 
     >>> _lower_first([[7, 3], [7, 5]])
     [(3, 7), (3, 5)]
@@ -459,7 +459,7 @@ def grown(
     prior: float,
     pairs: Int[np.ndarray, "l 2"],
 ) -> tuple[float, Whole]:
-    """Grow a group greedily from a pair; write its pairs, and return its cost and size."""
+    """Grow a group of duplicate pairs greedily from a pair; return its cost and number of pairs."""
     a, b = pair
     cost = _cost(mean, covariance, at[a], at[b], prior)
     mean, P, apart = mean.copy(), covariance.copy(), apart.copy()
@@ -484,7 +484,7 @@ def grown(
 def _cost(
     mean: Float[np.ndarray, " d"], P: Float[np.ndarray, "d d"], a: Whole, b: Whole, prior: float
 ) -> float:
-    """Return the cost of equating the landmarks at two indices; infinite beyond the gate."""
+    """Return the cost of merging the landmarks at indices a and b; infinite beyond the gate."""
     dx, dy, least = mean[a] - mean[b], mean[a + 1] - mean[b + 1], LEAST_STD * LEAST_STD
     xx = P[a, a] + P[b, b] - 2.0 * P[a, b] + least
     yy = P[a + 1, a + 1] + P[b + 1, b + 1] - 2.0 * P[a + 1, b + 1] + least
@@ -500,7 +500,7 @@ def _cost(
 
 @kernel
 def _equate(mean: Float[np.ndarray, " d"], P: Float[np.ndarray, "d d"], i: Whole, j: Whole) -> None:
-    """Update mean and covariance by the constraint that two points coincide."""
+    """Condition mean and covariance P, in place, on the landmarks at i and j being the same."""
     u, v = P[:, i] - P[:, j], P[:, i + 1] - P[:, j + 1]
     xx, xy = u[i] - u[j] + LEAST_STD * LEAST_STD, u[i + 1] - u[j + 1]
     yy = v[i + 1] - v[j + 1] + LEAST_STD * LEAST_STD
@@ -514,7 +514,7 @@ def _equate(mean: Float[np.ndarray, " d"], P: Float[np.ndarray, "d d"], i: Whole
 
 @no_alloc
 def _take_over(apart: Bool[np.ndarray, "l l"], a: Whole, b: Whole) -> None:
-    """Combine the exclusions of a merged pair in its first landmark; exclude the second."""
+    """Combine two merged landmarks' exclusions from pairs in landmark a; exclude b from all."""
     for k in range(apart.shape[0]):
         apart[a, k] = apart[k, a] = apart[a, k] or apart[b, k]
     for k in range(apart.shape[0]):

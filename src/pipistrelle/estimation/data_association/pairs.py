@@ -71,7 +71,7 @@ FARTHEST = 1e6
 def nearest(
     costs: Float[np.ndarray, "m n"], innovate: Innovate | None = None
 ) -> Int[np.ndarray, " m"]:
-    """Return the landmark of each measurement by the assignment of least cost, or NOTHING.
+    """Assign measurements to landmarks at least total cost; NOTHING for clutter.
 
     >>> nearest(np.array([[-5.0, -4.0], [-4.5, np.inf], [3.0, np.inf]]))
     array([ 1,  0, -1])
@@ -90,7 +90,7 @@ def nearest(
 def marginal(
     costs: Float[np.ndarray, "m n"], innovate: Innovate | None = None
 ) -> Int[np.ndarray, " m"]:
-    """Return the landmark of each measurement if its marginal probability is high, or NOTHING.
+    """Assign each measurement to a landmark of high marginal probability, else NOTHING.
 
     >>> marginal(np.array([[-9.0, -9.0], [np.inf, np.inf]]))
     array([-1, -1])
@@ -102,7 +102,7 @@ def marginal(
 
 @kernel
 def _what_is_sure(costs: Float[np.ndarray, "m n"]) -> Int[np.ndarray, " m"]:
-    """Return the landmark of each measurement if its marginal probability is high, or NOTHING."""
+    """Assign each measurement to a landmark of high marginal probability, else NOTHING."""
     rows, landmarks, shares = _shares(costs)
     found, first = np.full(costs.shape[0], NOTHING), 0
     while first < rows.size:
@@ -120,7 +120,7 @@ def _what_is_sure(costs: Float[np.ndarray, "m n"]) -> Int[np.ndarray, " m"]:
 
 @kernel
 def probabilities(costs: Float[np.ndarray, "m n"]) -> Float[np.ndarray, "m n"]:
-    """Return the probability of each pair; the remainder of each row is for clutter.
+    """Return each measurement's probability to be of each landmark; the remainder is for clutter.
 
     >>> probabilities(np.array([[0.0]]))
     array([[0.5]])
@@ -135,7 +135,7 @@ def probabilities(costs: Float[np.ndarray, "m n"]) -> Float[np.ndarray, "m n"]:
 def _shares(
     costs: Float[np.ndarray, "m n"],
 ) -> tuple[Int[np.ndarray, " p"], Int[np.ndarray, " p"], Float[np.ndarray, " p"]]:
-    """Return the pairs within the gate, sorted by measurement, and their probabilities."""
+    """Return the measurement, landmark and marginal probability of each pair within the gate."""
     (m, n), (rows, landmarks) = costs.shape, np.nonzero(costs < np.inf)
     size, beyond = rows.size, np.full(n, m)
     weight, to_row, to_landmark = np.empty(size), np.ones(size), np.empty(size)
@@ -172,7 +172,7 @@ def _sum_up(
     weight: Float[np.ndarray, " p"],
     to_row: Float[np.ndarray, " p"],
 ) -> None:
-    """Write 1 plus the sum of weighted messages to each measurement."""
+    """Write, for each measurement, 1 plus the weighted sum of its messages from landmarks."""
     sums[:] = 1.0
     for p in range(rows.size):
         sums[rows[p]] += weight[p] * to_row[p]
@@ -186,7 +186,7 @@ MOST_NODES, MOST_ROWS = 3000, 100
 
 @cache
 def gates(numbers: int) -> Float[np.ndarray, " g"]:
-    """Return the gates on the squared distance for 0, 1, ... degrees of freedom.
+    """Return the gates on a squared Mahalanobis distance for 0, 1, ... degrees of freedom.
 
     >>> gates(2).round(2)
     array([ 0.  , 10.83, 13.82])
@@ -199,7 +199,7 @@ def gates(numbers: int) -> Float[np.ndarray, " g"]:
 def jointly_compatible(
     costs: Float[np.ndarray, "m n"], innovate: Innovate | None
 ) -> Int[np.ndarray, " m"]:
-    """Return each measurement's landmark by the largest compatible set of pairs, or NOTHING."""
+    """Assign measurements to landmarks by the largest jointly compatible set, else NOTHING."""
     found = np.full(len(costs), NOTHING)
     row, landmark = np.nonzero(costs < 0.0)
     if not row.size or innovate is None:
@@ -224,7 +224,7 @@ def _match_together(
     landmark: Int[np.ndarray, " p"],
     innovate: Innovate,
 ) -> None:
-    """Write the landmarks of measurements by the largest compatible set of candidate pairs."""
+    """Write the landmarks of a batch of measurements by the largest jointly compatible set."""
     options = np.append(np.flatnonzero(np.diff(row, prepend=-1)), row.size)
     pairs = _search(options, landmark, innovate((row, landmark)), gates(2 * (options.size - 1)))
     found[row[pairs]] = landmark[pairs]
@@ -237,7 +237,7 @@ def _search(
     innovations: Innovations,
     gate: Float[np.ndarray, " g"],
 ) -> Int[np.ndarray, " c"]:
-    """Return the largest compatible set of pairs; ``options``: first pair of each measurement."""
+    """Return the largest jointly compatible set of pairs, by branch and bound."""
     levels, numbers = options.size - 1, innovations[2]
     L, y = np.zeros((2 * levels, 2 * levels)), np.zeros(2 * levels)
     chosen, best = np.empty(levels, np.int64), np.empty(levels, np.int64)
@@ -276,7 +276,7 @@ def _search(
 def _is_taken(
     landmark: Int[np.ndarray, " p"], chosen: Int[np.ndarray, " c"], k: Whole, option: Whole
 ) -> bool:
-    """Return whether the landmark of a pair is taken by the first k chosen pairs."""
+    """Return whether a pair's landmark is already matched in the first k chosen pairs."""
     taken = False
     for n in range(k):
         taken |= landmark[chosen[n]] == landmark[option]
@@ -291,7 +291,7 @@ def _extended(
     k: Whole,
     innovations: Innovations,
 ) -> float:
-    """Write the rows of L and y for chosen pair k; return the growth of the squared distance."""
+    """Extend the Cholesky factor L by a chosen pair; return the growth of the squared distance."""
     nu, S, _ = innovations
     for a in (2 * k, 2 * k + 1):
         whole = 2 * chosen[k] + a - 2 * k
@@ -308,7 +308,7 @@ def _extended(
 
 
 class Rows(NamedTuple):
-    """Measurements of one caller."""
+    """Bearings and ranges or excess paths of a caller's measurements, with stds and clutter."""
 
     bearing: Float[np.ndarray, " m"]
     bearing_std: Float[np.ndarray, " m"]
@@ -351,7 +351,7 @@ def pair_costs(
     caller: Whole,
     chances: PlainChances,
 ) -> Float[np.ndarray, "m n"]:
-    """Return the cost of each pair of measurement and landmark; infinite if gated or vague."""
+    """Return the cost of matching each measurement with each landmark; infinite if gated."""
     heard, made = Rows(*rows), Chances(*chances)
     costs = np.full((heard.bearing.size, at.size), np.inf)
     H, index = np.zeros((2, 7)), np.zeros(7, np.int64)
@@ -389,7 +389,7 @@ def pair_innovations(
     caller: Whole,
     pairs: tuple[Int[np.ndarray, " p"], Int[np.ndarray, " p"]],
 ) -> tuple[Float[np.ndarray, " e"], Float[np.ndarray, "e e"], Int[np.ndarray, " p"]]:
-    """Return the joint innovation of pairs of measurement and landmark, and its covariance.
+    """Return innovations of measurement-landmark pairs, and the joint covariance of all.
 
     Each pair has two numbers, and a count of measured numbers; missing numbers are 0 of variance 1.
     """
@@ -427,7 +427,7 @@ def _expected(
     H: Float[np.ndarray, "2 7"],
     index: Int[np.ndarray, "7"],
 ) -> tuple[float, float]:
-    """Return predicted bearing and range or excess path; write Jacobian H and its state indices."""
+    """Predict a landmark's bearing, and range or excess path; write Jacobian H and its indices."""
     x, y = mean[0], mean[1]
     distance, bearing, c, s, k = observe(x, y, mean[2], mean[i], mean[i + 1])
     for e, column in enumerate((0, 1, 2, i, i + 1, max(caller, 0), max(caller, 0) + 1)):
@@ -452,7 +452,7 @@ def _spread(
     index: Int[np.ndarray, "7"],
     size: Whole,
 ) -> tuple[float, float, float]:
-    """Return the entries (bearing variance, covariance, range variance) of H P H^T."""
+    """Return the predicted variances of bearing and of range, and their covariance, H P H^T."""
     across, both, along = 0.0, 0.0, 0.0
     for a in range(size):
         for b in range(size):
@@ -466,7 +466,7 @@ def _spread(
 def with_points(
     joint: JointGaussian, labels: list[int], points: tuple[Float[np.ndarray, " n"], ...]
 ) -> JointGaussian:
-    """Append landmarks, each measured by bearing and range, to a joint Gaussian.
+    """Append landmarks, measured by bearing and range from the pose, to a joint Gaussian.
 
     ``points``: bearings [rad], ranges [m], and their standard deviations.
 
@@ -488,7 +488,7 @@ def _with_points(
     covariance: Float[np.ndarray, "d d"],
     points: tuple[Float[np.ndarray, " n"], ...],
 ) -> tuple[Float[np.ndarray, " e"], Float[np.ndarray, "e e"]]:
-    """Append points, given by bearings, ranges and their stds, to a mean and covariance."""
+    """Append landmarks, measured by bearing and range, to the mean and covariance of a map."""
     bearing, distance, bearing_std, range_std = points
     size, whole = mean.size, mean.size + 2 * bearing.size
     more, P = np.empty(whole), np.empty((whole, whole))

@@ -59,7 +59,7 @@ gate on the squared distance; std of levels [dB]."""
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Tracks:
-    """Measurements of a caller that is not on the map."""
+    """Echoes of a caller with unknown position, grouped over scans into a track per landmark."""
 
     poses: Float[np.ndarray, "k 3"] = field(default_factory=lambda: np.empty((0, 3)))
     """Predicted vehicle pose at each scan."""
@@ -76,7 +76,7 @@ class Tracks:
 def followed(
     tracks: Tracks, time: float, pose: Float[np.ndarray, "3"], direct: float, rows: Rows
 ) -> Tracks:
-    """Extend tracks by the measurements of a scan; ``direct``: direct bearing, or NaN."""
+    """Return a caller's tracks of echoes extended by a scan; ``direct``: direct bearing or NaN."""
     now, (x, y, heading) = len(tracks.poses), pose
     ones = np.ones(len(rows.bearing))
     seen = np.column_stack(
@@ -131,7 +131,7 @@ def _costs(
 def in_window(
     tracks: Tracks, scans: int, sightings: int
 ) -> tuple[Float[np.ndarray, "t k 4"], Float[np.ndarray, "k 3"], Float[np.ndarray, " k"]]:
-    """Return tracks with enough recent sightings (NaN if missed), poses and direct bearings."""
+    """Return the tracks seen often in recent scans (NaN if missed), poses and direct bearings."""
     window = tracks.rows[-scans:]
     table = np.full((len(tracks.last), len(window), 4), np.nan)
     for k, rows in enumerate(window):
@@ -153,7 +153,7 @@ RARE_SHARE, RAREST = 0.4, 0.01
 
 
 class ScanRows(NamedTuple):
-    """Measurements of a scan."""
+    """Measurements of a scan, with flags for their use in data association."""
 
     caller: Int[np.ndarray, " m"]
     bearing: Float[np.ndarray, " m"]
@@ -180,7 +180,7 @@ Joint = tuple[Int[np.ndarray, " n"], Float[np.ndarray, " d"], Float[np.ndarray, 
 def rows_of_scan(
     scan: Scan, limits: tuple[float, float, float], assumed: tuple[float, ...]
 ) -> ScanRows:
-    """Convert a scan to `ScanRows`; ``assumed``: default stds, exempt from all limits.
+    """Convert a scan for data association; ``assumed``: default stds, exempt from all limits.
 
     ``limits``: largest stds of bearing, of range or excess path, and of the latter for new
     landmarks.
@@ -196,7 +196,7 @@ def _read(
     limits: tuple[float, float, float],
     assumed: Float[np.ndarray, " a"],
 ) -> tuple[np.ndarray, ...]:
-    """Return the columns of `ScanRows`."""
+    """Return the columns of `ScanRows`: a scan's measurements, with flags by the limits on stds."""
     size, (limit, way_limit, birth_limit) = caller.size, limits
     bearing_std, way, way_std = numbers[BEARING_STD], np.empty(size), np.empty(size)
     usable, with_way, sure = np.empty((3, size), np.bool_)
@@ -235,7 +235,7 @@ def _is_assumed(std: float, assumed: Float[np.ndarray, " a"]) -> Flag:
 
 @kernel
 def place_of(label: Whole, landmark: Int[np.ndarray, " n"]) -> int:
-    """Return the index of a landmark in the joint mean, or -1."""
+    """Return the index of a labelled landmark in the joint mean, or -1 if absent."""
     for n in range(landmark.size):
         if landmark[n] == label:
             return 3 + 2 * n
@@ -246,7 +246,7 @@ def place_of(label: Whole, landmark: Int[np.ndarray, " n"]) -> int:
 def places_of(
     labels: Int[np.ndarray, " l"], landmark: Int[np.ndarray, " n"], near: Bool[np.ndarray, " k"]
 ) -> tuple[Int[np.ndarray, " l"], Bool[np.ndarray, " l"]]:
-    """Return each label's index in the joint mean (-1: absent), and whether it is near."""
+    """Return each landmark's index in the joint mean (-1: absent), and its flag from ``near``."""
     at, close = np.empty(labels.size, np.int64), np.zeros(labels.size, np.bool_)
     for n in range(labels.size):
         at[n] = place_of(labels[n], landmark)
@@ -264,7 +264,7 @@ def compared(
     chances: PlainChances,
     telling: float,
 ) -> tuple[Int[np.ndarray, " r"], Float[np.ndarray, "r n"], Bool[np.ndarray, " r"]]:
-    """Return a caller's usable measurements, their pair costs, and whether each is near a landmark.
+    """Compare a caller's measurements with all landmarks: return costs, and which are within gates.
 
     ``moving``: labels excluded from matching; ``near``: set for landmarks near a measurement with a
     bearing std up to ``telling``; ``caller``: number, index of its direct call, and of its
@@ -310,7 +310,7 @@ def bearing_fits(
 
 @kernel
 def part_of(heard: ScanRows, rows: Int[np.ndarray, " r"], spread: float) -> tuple[np.ndarray, ...]:
-    """Return columns of `pairs.Rows` for selected measurements; ``spread``: extra path std [m]."""
+    """Select measurements as columns of `pairs.Rows`; ``spread``: std added to their path [m]."""
     way_std = heard.way_std[rows]
     for k in range(rows.size):
         way_std[k] = math.hypot(way_std[k], spread)
@@ -328,7 +328,7 @@ def settled(
     caller: tuple[Whole, Whole, Whole],
     chances: PlainChances,
 ) -> tuple[Int[np.ndarray, " b"], tuple[int, int]]:
-    """Label a caller's measurements; return the precise unmatched (loudest first), and counts.
+    """Label a caller's matched measurements; return unmatched that begin landmarks, and counts.
 
     The counts are of precise measurements: matched, and all.
     """
@@ -375,7 +375,7 @@ def _is_beside(heard: ScanRows, row: Whole) -> bool:
 def _loudest_first(
     rows: Int[np.ndarray, " r"], level_db: Float[np.ndarray, " m"]
 ) -> Int[np.ndarray, " r"]:
-    """Sort measurements by level, loudest first; equal levels keep their order."""
+    """Sort measurement indices by level, loudest first; equal levels keep their order."""
     ordered = rows.copy()
     for k in range(1, ordered.size):
         row, n = ordered[k], k
@@ -386,7 +386,7 @@ def _loudest_first(
 
 
 class CallerPlace(NamedTuple):
-    """Position and motion of a caller."""
+    """Position and motion of a caller, as the search found them or a map states them."""
 
     x: float
     y: float
@@ -401,14 +401,14 @@ class CallerPlace(NamedTuple):
     """Whether the search is finished."""
 
     def at(self, time: float) -> tuple[float, float]:
-        """Return the position at a time [m]."""
+        """Return the caller's position [m] at a time [s], by constant acceleration."""
         t, (vx, vy, ax, ay) = time - self.time, self.motion
         return self.x + t * (vx + 0.5 * t * ax), self.y + t * (vy + 0.5 * t * ay)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Caller:
-    """State of a caller in data association."""
+    """A caller's state in data association: label, position, tracks, and test of the position."""
 
     label: int
     place: CallerPlace | None = None
@@ -422,7 +422,7 @@ class Caller:
 
 
 class EarlyScan(NamedTuple):
-    """A scan from before the first map, kept for `labelled_by_map`."""
+    """A scan from before the first map, kept to be labelled by a later map."""
 
     number: int
     scan: Scan
@@ -436,7 +436,7 @@ class EarlyScan(NamedTuple):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Memory:
-    """State of data association between scans."""
+    """Memory of data association between scans: landmarks, callers and unlabelled early scans."""
 
     scan: int = 0
     labels: int = 0

@@ -93,7 +93,7 @@ precise measurements that match old landmarks."""
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Limits:
-    """Largest standard deviations of measurements that are used, and that begin landmarks."""
+    """Largest standard deviations of measurements to be used, and to begin landmarks."""
 
     bearing_std: float = 0.05
     """Bearing [rad]."""
@@ -109,7 +109,7 @@ class Limits:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Sequential(Association[Memory]):
-    """Data association that works scan by scan.
+    """Data association that labels each scan when it arrives, by a matching method.
 
     Two measurements on an empty map become two landmarks, which the next scans match.
 
@@ -140,11 +140,11 @@ class Sequential(Association[Memory]):
     limits: Limits = Limits()
 
     def start(self) -> Memory:
-        """Return the memory before the first scan."""
+        """Return the empty memory of data association before the first scan."""
         return Memory()
 
     def informed(self, memory: Memory, news: Mapping[int, CallerPlace]) -> Memory:
-        """Return a memory that contains the positions of found callers, given by number."""
+        """Return the memory with found callers' positions added, given by caller number."""
         known = dict(memory.callers)
         for number, place in news.items():
             label = known[number].label if number in known else memory.labels + 1
@@ -153,7 +153,7 @@ class Sequential(Association[Memory]):
         return replace(memory, callers=known)
 
     def knowing(self, memory: Memory, known: Landmarks, callers: Int[np.ndarray, " c"]) -> Memory:
-        """Return a memory with callers on the initial map; they are not searched for."""
+        """Return the memory with the callers on the initial map, which need no search."""
         numbers = {label: number for number, label in enumerate(callers.tolist())}
         rows = zip(known.landmark.tolist(), known.mean.tolist(), strict=True)
         stated = {
@@ -166,11 +166,11 @@ class Sequential(Association[Memory]):
         return replace(memory, callers={**memory.callers, **stated})
 
     def tentative(self, memory: Memory) -> list[int]:
-        """Return the labels of unconfirmed landmarks."""
+        """Return the labels of landmarks that repeated detection has not yet confirmed."""
         return memory.known.label[~memory.known.confirmed].tolist()
 
     def associate(self, memory: Memory, belief: Belief, scan: Scan) -> tuple[Memory, Assignment]:
-        """Associate a scan; return the new memory and the assignment."""
+        """Label a scan's measurements; return the new memory and the assignment."""
         work = _Work(self, memory, belief, scan)
         if news := work.search_callers():
             return memory, Assignment(label=work.label, again=news)
@@ -180,7 +180,7 @@ class Sequential(Association[Memory]):
 
 
 class _Work:
-    """Association of a single scan."""
+    """Working state of the association of a single scan."""
 
     def __init__(self, stage: Sequential, memory: Memory, belief: Belief, scan: Scan) -> None:
         self.stage, self.memory, self.scan = stage, memory, scan
@@ -198,7 +198,7 @@ class _Work:
         self.near = np.zeros(self.joint.landmark.size + scan.landmark.size, np.bool_)
 
     def search_callers(self) -> dict[int, CallerPlace]:
-        """Track the callers still searched for; return newly found positions by caller number."""
+        """Track echoes of unlocated callers, and return newly found positions by caller number."""
         news: dict[int, CallerPlace] = {}
         for number, row in enumerate(self.scan.direct.tolist()):
             if number == OWN or (row < 0 and number not in self.callers):
@@ -212,14 +212,14 @@ class _Work:
         return news
 
     def _followed(self, number: int, caller: Caller, row: int) -> Caller:
-        """Add the measurements of this scan to a caller's tracks."""
+        """Add this scan's measurements to the tracks of an unlocated caller; return its record."""
         rows = self._some(self.rows.with_way & (self.scan.caller == number))
         direct = self.scan.bearing[row] if row >= 0 else math.nan
         tracks = followed(caller.tracks, self.scan.time, self.pose, direct, rows)
         return replace(caller, tracks=tracks)
 
     def match(self, number: int) -> None:
-        """Label a caller's measurements; begin landmarks with precise unmatched measurements."""
+        """Match a caller's measurements with landmarks; begin landmarks with precise unmatched."""
         at = OWN_CALL if number == OWN else self._heard_from(number)
         if at is None:
             return
@@ -240,14 +240,14 @@ class _Work:
         self._begin(number, begun)
 
     def _is_elsewhere(self, number: int, count: tuple[int, int]) -> bool:
-        """Return whether a moving caller is misplaced: few of its measurements match landmarks."""
+        """Return whether a moving caller's estimate is wrong: too few of its echoes match."""
         known, own = self.memory.known, self.label[self.scan.caller == OWN]
         before = known.confirmed & ~np.isnan(known.source[:, number])
         often = int(before.sum()) >= count[1]
         return often and may_have_turned(*count) and bool((own != UNLABELLED).any())
 
     def _follow_turn(self, number: int, at: int) -> None:
-        """Move a moving caller to where its measurements match the map, if it may have turned."""
+        """Move a moving caller to where its echoes match the map, if it may have turned."""
         direct, rows = self._direct(number), self.rows.with_way & (self.scan.caller == number)
         if direct < 0:
             return
@@ -261,7 +261,7 @@ class _Work:
         self.joint = turned(joint, at, float(self.scan.bearing[direct]), costs)
 
     def _heard_from(self, number: int) -> int | None:
-        """Return a caller's index in the joint mean, or None if its measurements are unusable."""
+        """Return a caller's index in the joint mean; None if its measurements are unusable."""
         caller = self.callers.get(number)
         if caller is None:
             return UNPLACED
@@ -274,7 +274,7 @@ class _Work:
         return UNPLACED if at < 0 else at
 
     def finished(self) -> tuple[Memory, Assignment]:
-        """Return the memory after the scan, and the assignment."""
+        """Update, delete and merge landmarks by the labelled scan; return memory and assignment."""
         memory, scan, (known, at) = self.memory, self.scan, self._judged()
         lost = self._lost(known)
         gone = {*known.label[known.odds < GONE].tolist(), *lost}
@@ -304,7 +304,7 @@ class _Work:
         )
 
     def _without(self, known: Known, gone: set[int]) -> tuple[Known, tuple[int, ...]]:
-        """Delete labels from scan and landmarks; return the other landmarks, and the old labels."""
+        """Delete labels from scan and records; return the kept records and the known of them."""
         memory, left = self.memory, np.array([*gone])
         for labels in (self.label, self.named):
             labels[is_among(labels, left)] = UNLABELLED
@@ -312,7 +312,7 @@ class _Work:
         return some(known, ~is_among(known.label, left)), tuple(sorted(gone & before))
 
     def _early(self, scan: Scan) -> tuple[EarlyScan, ...]:
-        """Return the stored early scans, with this scan if it is early."""
+        """Return the stored scans from before the first map, with this scan if it is early too."""
         early, number = self.memory.early, self.memory.scan
         placed = any(caller.told and caller.since < number for caller in self.callers.values())
         landmarks = self.memory.known.label.size + len(self.new)
@@ -322,7 +322,7 @@ class _Work:
         return *early, EarlyScan(number, scan, self.rows, self.scan.direct, pose)
 
     def _labelled_by_map(self, early: tuple[EarlyScan, ...], known: Known) -> dict[int, Scan]:
-        """Label early scans by the map; return them by number, or none if no caller is mapped."""
+        """Label early scans by the map; return them by number, none if no caller is mapped."""
         joint, stage, places = self.joint, self.stage, {}
         sure = known.label[known.confirmed].tolist()
         for number, caller in self.callers.items():
@@ -339,7 +339,7 @@ class _Work:
         }
 
     def _judged(self) -> tuple[Known, Int[np.ndarray, " l"]]:
-        """Return all landmarks with updated log odds, and their joint-mean indices (-1: absent)."""
+        """Return all landmarks with updated log odds, and joint-mean indices (-1: absent)."""
         memory, scan, rows = self.memory, self.scan, self.rows
         size = max(1 + scan.caller.max(initial=0), scan.direct.size, memory.known.source.shape[1])
         known = with_new(memory.known, self.new, memory.scan, size)
@@ -353,7 +353,7 @@ class _Work:
         return judged(known, heard, place, near, memory.scan, self.stage.limits.sight), at
 
     def _doubles(self, known: Known, at: Int[np.ndarray, " l"]) -> tuple[tuple[int, int], ...]:
-        """Return duplicate landmarks that are due for a test, as (older, newer) labels."""
+        """Return the pairs of duplicate landmarks to merge now, as (older, newer) labels."""
         old, apart, asked = asked_of(tuple(known), at, self.memory.scan)
         if not asked.size:
             return ()
@@ -361,7 +361,7 @@ class _Work:
         return tuple((label[a], label[b]) for a, b in doubles(self.joint, at[old], apart, asked))
 
     def _another(self) -> int:
-        """Return a new label that no caller has."""
+        """Return a new label for a landmark or caller, which no caller has."""
         taken = {caller.label for caller in self.callers.values()}
         self.labels += 1
         while self.labels in taken:
@@ -369,23 +369,23 @@ class _Work:
         return self.labels
 
     def _where(self, label: int) -> int:
-        """Return the index of a landmark in the joint mean, or -1."""
+        """Return the index of a landmark in the joint mean by its label, or -1 if absent."""
         return place_of(label, self.joint.landmark)
 
     def _direct(self, number: int) -> int:
-        """Return the index of a caller's direct call in the scan, or -1."""
+        """Return the index of a caller's direct call in this scan, or -1 without."""
         return direct_row(self.scan.direct, number)
 
     def _joint(self) -> Joint:
-        """Return the joint Gaussian as a tuple for kernels."""
+        """Return the joint Gaussian's labels, mean and covariance, for compiled functions."""
         return self.joint.landmark, self.joint.mean, self.joint.covariance
 
     def _some(self, rows: Bool[np.ndarray, " m"]) -> Rows:
-        """Select measurements by a mask."""
+        """Return the measurements of this scan that a mask selects."""
         return Rows(*part_of(self.rows, np.flatnonzero(rows), 0.0))
 
     def _tell(self, number: int, caller: Caller) -> None:
-        """Set the range of a found caller's direct call, which puts the caller on the map."""
+        """Put a caller with a found position on the map, by a range for its direct call."""
         row = self._direct(number)
         if caller.place is None or row < 0 or self.scan.time < caller.place.since:
             return
@@ -399,7 +399,7 @@ class _Work:
         self.callers[number] = told
 
     def _match_direct(self, number: int, label: int, at: int) -> None:
-        """Label a caller's direct call if its bearing is within the gate."""
+        """Label a caller's direct call, if not outside the gate of a fixed caller's bearing."""
         row = self._direct(number)
         if row < 0:
             return
@@ -410,7 +410,7 @@ class _Work:
         self.label[row] = label
 
     def _begin(self, number: int, begun: Int[np.ndarray, " b"]) -> None:
-        """Begin a landmark with each given measurement."""
+        """Begin a new landmark with each of the given measurements of a caller."""
         labels, rows = [self._another() for _ in begun], self.rows
         self.label[begun] = labels
         self.new += labels
@@ -420,14 +420,14 @@ class _Work:
             self.joint = with_points(self.joint, labels, points)
 
     def _judge_caller(self, number: int, count: tuple[int, int]) -> None:
-        """Record how many of a caller's precise measurements match, and their number."""
+        """Record how many of a mapped caller's precise measurements match landmarks."""
         caller = self.callers.get(number)
         if caller is not None and self._where(caller.label) >= 0:
             trial = (*caller.trial[1 - TRIAL :], count)
             self.callers[number] = replace(caller, trial=trial)
 
     def _lost(self, known: Known) -> list[int]:
-        """Delete misplaced callers and the landmarks that depend on them; return all labels."""
+        """Delete misplaced callers; return their labels and the landmarks that depend on them."""
         lost: list[int] = []
         for number, caller in [*self.callers.items()]:
             if len(caller.trial) < TRIAL or self.memory.scan > caller.since + PROBATION:
@@ -451,7 +451,7 @@ density."""
 
 
 def left_out(config: Config, scans: Iterable[Scan]) -> dict[str, Float[np.ndarray, " n"]]:
-    """Return the standard deviations of measurements that association discards, by setting.
+    """Return the stds of all measurements that limits of the association discard, by setting.
 
     Keys are ``bearing_std`` [rad] and ``way_std`` [m]; a setting that discards nothing is absent.
     """
@@ -470,13 +470,13 @@ def left_out(config: Config, scans: Iterable[Scan]) -> dict[str, Float[np.ndarra
 
 
 def _assumed(config: Config) -> tuple[float, float, float]:
-    """Return the default standard deviations of bearing, range and excess path."""
+    """Return the default standard deviations of bearing, range and excess path from a config."""
     told = config.filter
     return told.bearing_std, told.range_std, told.excess_path_std
 
 
 def association_of(config: Config) -> Association | None:
-    """Build the association that ``association.method`` names; None for known labels.
+    """Build the data association that ``association.method`` names; None for known labels.
 
     A class from outside, ``module:Class``, is built by its ``from_config(config)``, or as a
     dataclass with an optional field ``config`` for all settings. Raises InputError if it is
