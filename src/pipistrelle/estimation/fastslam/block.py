@@ -59,7 +59,7 @@ ROUNDING = 1e-12
 
 @inlined
 def _bearing(pose: Poses, member: Member, row: Row, i: Whole) -> tuple[float, float, float, Flag]:
-    """Return the innovation of a bearing, its derivatives by x and y, and whether it is defined."""
+    """Return a bearing's innovation, its derivatives by position, and whether it is defined."""
     dx, dy = member[X + i] - pose[X + i], member[Y + i] - pose[Y + i]
     squared = dx * dx + dy * dy
     inverse = 1.0 / max(squared, NEAREST * NEAREST)
@@ -69,7 +69,7 @@ def _bearing(pose: Poses, member: Member, row: Row, i: Whole) -> tuple[float, fl
 
 @inlined
 def _bearing_gain(pose: Poses, h0: float, h1: float, i: Whole) -> tuple[float, float, float]:
-    """Return the covariance of a pose with a bearing of the derivatives (h0, h1, -1)."""
+    """Return the cross-covariance of a pose with a bearing, from the bearing's derivatives."""
     return (
         h0 * pose[PXX + i] + h1 * pose[PXY + i] - pose[PXH + i],
         h0 * pose[PXY + i] + h1 * pose[PYY + i] - pose[PYH + i],
@@ -79,7 +79,7 @@ def _bearing_gain(pose: Poses, h0: float, h1: float, i: Whole) -> tuple[float, f
 
 @inlined
 def _spread(member: Member, h0: float, h1: float, i: Whole) -> float:
-    """Return the bearing variance due to a hypothesis' position."""
+    """Return the variance of a bearing that is due to the landmark hypothesis' covariance."""
     cross = 2.0 * h0 * h1 * member[XY + i]
     return h0 * h0 * member[XX + i] + cross + h1 * h1 * member[YY + i]
 
@@ -103,7 +103,7 @@ def expect_bearing(
     printed: bool,
     log_likelihood: Lanes,
 ) -> None:
-    """Write the log likelihood of a bearing for each lane's hypothesis j (Eq. (19)).
+    """Write the log likelihood of a bearing under each particle's hypothesis j (Eq. (19)).
 
     It lacks the constant, and is minus infinity in lanes without hypothesis j. If the hypothesis is
     too near, the bearing is uniform over the circle, or ignored if there is no other. ``printed``:
@@ -124,7 +124,7 @@ def expect_bearing(
 def _expect_as_printed(
     pose: Poses, member: Member, row: Row, count: Counts, j: Whole, log_likelihood: Lanes
 ) -> None:
-    """Write the log of Eq. (19) with the root inside the exponent; zero for too near hypotheses."""
+    """Write each particle's log likelihood of a bearing by the literal reading of Eq. (19)."""
     for i in range(LANES):
         innovation, S, far = _foreseen(pose, member, row, i)
         value = -0.5 * (innovation * innovation / S) / math.sqrt(2.0 * math.pi * S)
@@ -136,7 +136,7 @@ def _expect_as_printed(
 def bearing_beyond(
     pose: Poses, member: Member, row: Row, count: Counts, j: Whole, bound: float
 ) -> bool:
-    """Return whether a bearing is outside the gate of hypothesis j in every lane that has it."""
+    """Return whether a bearing is gated by hypothesis j in all particles that have it."""
     beyond = 0
     for i in range(LANES):
         innovation, S, far = _foreseen(pose, member, row, i)
@@ -147,7 +147,7 @@ def bearing_beyond(
 
 @no_alloc
 def refine_by_bearing(pose: Poses, member: Member, row: Row, share: Lanes) -> None:
-    """Update each particle's pose with a bearing, its information scaled by ``share``."""
+    """Update each particle's pose by a bearing to a hypothesis, with the weight ``share``."""
     for i in range(LANES):
         innovation, h0, h1, far = _bearing(pose, member, row, i)
         a0, a1, a2 = _bearing_gain(pose, h0, h1, i)
@@ -168,7 +168,7 @@ def refine_by_bearing(pose: Poses, member: Member, row: Row, share: Lanes) -> No
 
 @no_alloc
 def correct_by_bearing(pose: Poses, member: Member, row: Row, share: Lanes) -> None:
-    """Update a hypothesis with a bearing from known poses, its information scaled by ``share``."""
+    """Update a hypothesis by a bearing from known poses, with a weight ``share`` per particle."""
     for i in range(LANES):
         innovation, h0, h1, far = _bearing(pose, member, row, i)
         a0 = -h0 * member[XX + i] - h1 * member[XY + i]
@@ -199,7 +199,7 @@ def _active(
 def _whitened(
     nu0: float, nu1: float, S00: float, S01: float, S11: float
 ) -> tuple[float, float, float, float, float]:
-    """Return two innovations whitened by their covariance, and the transformation's factors."""
+    """Return two innovations, made independent with unit variance, and the factors used for it."""
     i0 = 1.0 / math.sqrt(S00)
     L10 = S01 * i0
     i1 = 1.0 / math.sqrt(S11 - L10 * L10)
@@ -211,7 +211,7 @@ def _whitened(
 def _active_spread(
     pose: Poses, member: Member, c: float, s: float, k: float, row: Row, i: Whole
 ) -> tuple[float, float, float, float, float, float, float, float, float]:
-    """Return the covariance of range and bearing with the pose, and of their innovations."""
+    """Return the covariances of range and bearing with a pose, and of their innovations."""
     h0, h1 = s * k, -c * k
     a0 = -c * pose[PXX + i] - s * pose[PXY + i]
     a1 = -c * pose[PXY + i] - s * pose[PYY + i]
@@ -229,7 +229,7 @@ def _active_spread(
 def expect_active(
     pose: Poses, member: Member, row: Row, count: Counts, j: Whole, log_likelihood: Lanes
 ) -> None:
-    """Write the log likelihood of range and bearing for each lane's hypothesis j."""
+    """Write the log likelihood of range and bearing under each particle's hypothesis j."""
     for i in range(LANES):
         nu0, nu1, c, s, k, far = _active(pose, member, row, i)
         _, _, _, _, _, _, S00, S01, S11 = _active_spread(pose, member, c, s, k, row, i)
@@ -244,7 +244,7 @@ def expect_active(
 
 @no_alloc
 def active_beyond(pose: Poses, member: Member, row: Row, count: Counts, bound: float) -> bool:
-    """Return whether range and bearing are outside the gate in every lane, all initialised."""
+    """Return whether range and bearing are gated in all particles, with no ray in any."""
     beyond = 0
     for i in range(LANES):
         nu0, nu1, c, s, k, far = _active(pose, member, row, i)
@@ -257,7 +257,7 @@ def active_beyond(pose: Poses, member: Member, row: Row, count: Counts, bound: f
 
 @no_alloc
 def squared_innovation(pose: Poses, member: Member, row: Row, i: Whole) -> float:
-    """Return the squared normalised innovation in lane i, or NaN if the landmark is too near."""
+    """Return particle i's squared normalised innovation, or NaN if the landmark is too near."""
     nu0, nu1, c, s, k, far = _active(pose, member, row, i)
     _, _, _, _, _, _, S00, S01, S11 = _active_spread(pose, member, c, s, k, row, i)
     if not far:
@@ -272,7 +272,7 @@ def squared_innovation(pose: Poses, member: Member, row: Row, i: Whole) -> float
 def refine_by_active(
     pose: Poses, member: Member, row: Row, count: Counts, log_weight: Lanes
 ) -> None:
-    """Update and weigh poses with range and bearing, in lanes with a fully initialised landmark."""
+    """Update and weigh particles' poses by range and bearing to an initialised landmark."""
     for i in range(LANES):
         nu0, nu1, c, s, k, far = _active(pose, member, row, i)
         a0, a1, a2, b0, b1, b2, S00, S01, S11 = _active_spread(pose, member, c, s, k, row, i)
@@ -296,7 +296,7 @@ def refine_by_active(
 
 @no_alloc
 def correct_by_active(pose: Poses, member: Member, row: Row, count: Counts) -> None:
-    """Update a landmark with range and bearing, in lanes that have it fully initialised."""
+    """Update a landmark by range and bearing in all particles that have it fully initialised."""
     for i in range(LANES):
         nu0, nu1, c, s, k, far = _active(pose, member, row, i)
         g0, g1 = -s * k, c * k
@@ -322,7 +322,7 @@ def correct_by_active(pose: Poses, member: Member, row: Row, count: Counts) -> N
 def initialise_member(
     pose: Poses, member: Member, row: Row, log_weight: float, count: Counts
 ) -> None:
-    """Initialise a hypothesis at range and bearing, in lanes without the landmark (Eq. (16))."""
+    """Set a hypothesis to range and bearing in particles without the landmark initialised."""
     distance, range_variance = row.range, row.range_variance
     across = row.bearing_variance * distance * distance
     for i in range(LANES):
@@ -371,14 +371,14 @@ def _log_density(gaussian: Poses, pose: Poses, i: Whole) -> float:
 
 @no_alloc
 def weigh_sample(prior: Poses, proposal: Poses, pose: Poses, log_weight: Lanes) -> None:
-    """Weigh sampled poses by the density ratio of prior and proposal."""
+    """Multiply particles' weights by the ratio of prior to proposal density at sampled poses."""
     for i in range(LANES):
         log_weight[i] += _log_density(prior, pose, i) - _log_density(proposal, pose, i)
 
 
 @no_alloc
 def sample_pose(pose: Poses, normal: Lanes) -> None:
-    """Sample the poses from their Gaussians by standard normals, and reset their covariances."""
+    """Sample each particle's pose from its Gaussian by standard normals; zero its covariance."""
     for i in range(LANES):
         L00, L10, L11, L20, L21, L22 = _lower(pose, i)
         n0, n1, n2 = normal[X + i], normal[Y + i], normal[HEADING + i]
@@ -393,7 +393,7 @@ Members = Float[np.ndarray, "h numbers"]
 
 
 class Scratch(NamedTuple):
-    """Workspace for updates of a block's rays; L is `LANES`."""
+    """Workspace to update bearing-only landmarks in a block of L = `LANES` particles."""
 
     likelihood: Float[np.ndarray, "h lanes"]  # log, of each hypothesis
     posterior: Float[np.ndarray, "h lanes"]  # log, of each hypothesis
@@ -408,7 +408,7 @@ class Scratch(NamedTuple):
 
 @kernel
 def scratch_for(members: Whole) -> Scratch:
-    """Allocate a workspace for rays with a number of hypotheses."""
+    """Allocate the temporary arrays to update a landmark with a number of hypotheses."""
     return Scratch(
         np.empty((members, LANES)),
         np.empty((members, LANES)),
@@ -424,7 +424,7 @@ def scratch_for(members: Whole) -> Scratch:
 
 @no_alloc
 def part_lanes(count: Counts, scratch: Scratch) -> None:
-    """Separate the lanes by whether a landmark is initialised or a ray."""
+    """Mark which particles of a block have a landmark initialised, and which not, as 1 and 0."""
     for i in range(LANES):
         scratch.alone[i] = 1.0 if count[i] == 1 else 0.0
         scratch.ray[i] = 1.0 - scratch.alone[i]
@@ -432,7 +432,7 @@ def part_lanes(count: Counts, scratch: Scratch) -> None:
 
 @no_alloc
 def _largest(logs: Float[np.ndarray, "h lanes"], members: Whole, largest: Lanes) -> None:
-    """Write the largest log of each lane."""
+    """Write each particle's largest log weight over its hypotheses."""
     for i in range(LANES):
         largest[i] = -np.inf
     for j in range(members):
@@ -443,7 +443,7 @@ def _largest(logs: Float[np.ndarray, "h lanes"], members: Whole, largest: Lanes)
 
 @no_alloc
 def _weigh(rows: Members, members: Whole, scratch: Scratch) -> None:
-    """Write normalised log weights (Eq. (18)) to ``posterior``, and log sums to ``total``."""
+    """Write hypotheses' log weights after a bearing, normalised per particle (Eq. (18))."""
     largest, total = scratch.largest, scratch.total
     for j in range(members):
         row, likelihood, posterior = rows[j], scratch.likelihood[j], scratch.posterior[j]
@@ -465,7 +465,7 @@ def _weigh(rows: Members, members: Whole, scratch: Scratch) -> None:
 
 @no_alloc
 def _share(members: Whole, params: UpdateParams, turn: Lanes, scratch: Scratch) -> None:
-    """Write shares proportional to a power of the likelihoods, aggregated or not (Eq. (19))."""
+    """Write the share of a bearing's information that each hypothesis receives (Eq. (19))."""
     logs = scratch.posterior if params.aggregated else scratch.likelihood
     smallest = SMALLEST_AGGREGATED_SHARE if params.aggregated else SMALLEST_SHARE
     largest, total = scratch.largest, scratch.total
@@ -485,14 +485,14 @@ def _share(members: Whole, params: UpdateParams, turn: Lanes, scratch: Scratch) 
 
 @no_alloc
 def _add(log_likelihood: Lanes, numbers: Whole, turn: Lanes, log_weight: Lanes) -> None:
-    """Add log likelihoods of ``numbers`` measured numbers, with constants, to log weights."""
+    """Add a measurement's log likelihood to the log weights of particles where ``turn`` is set."""
     for i in range(LANES):
         log_weight[i] += log_likelihood[i] - numbers * HALF_LOG_TAU if turn[i] > 0.0 else 0.0
 
 
 @no_alloc
 def most_members(count: Counts) -> Whole:
-    """Return the largest number of hypotheses in a lane."""
+    """Return the largest number of hypotheses that any particle has for a landmark."""
     largest = 1
     for i in range(LANES):
         largest = max(largest, count[i])
@@ -503,7 +503,7 @@ def most_members(count: Counts) -> Whole:
 def _expect_ray(
     pose: Poses, rows: Members, count: Counts, row: Row, printed: bool, scratch: Scratch
 ) -> None:
-    """Write the log likelihoods of a bearing for all hypotheses to ``likelihood``."""
+    """Write a bearing's log likelihood under each hypothesis of a landmark in each particle."""
     for j in range(most_members(count)):
         likelihood = scratch.likelihood[j]
         expect_bearing(pose, rows[j], row, count, j, printed, likelihood)
@@ -519,7 +519,7 @@ def weigh_by_bearing(
     scratch: Scratch,
     log_weight: Lanes,
 ) -> None:
-    """Weigh poses by the mixture density of a bearing over a landmark's hypotheses."""
+    """Weigh particles by a bearing's mixture likelihood over a landmark's hypotheses."""
     _expect_ray(pose, rows, count, row, False, scratch)
     if most_members(count) == 1:
         _add(scratch.likelihood[0], 1, turn, log_weight)
@@ -539,7 +539,7 @@ def refine_by_ray(
     scratch: Scratch,
     log_weight: Lanes,
 ) -> None:
-    """Update poses by a bearing to a landmark, and weigh them by its likelihood."""
+    """Update particles' poses by a bearing to a landmark, and weigh them by its likelihood."""
     members = most_members(count)
     weigh_by_bearing(pose, rows, count, row, turn, scratch, log_weight)
     if members == 1:
@@ -566,7 +566,7 @@ def weigh_by_active(
     scratch: Scratch,
     log_weight: Lanes,
 ) -> None:
-    """Weigh poses by the mixture density of range and bearing over a landmark's hypotheses."""
+    """Weigh particles by the likelihood of range and bearing over a landmark's hypotheses."""
     members = most_members(count)
     for j in range(members):
         expect_active(pose, rows[j], row, count, j, scratch.likelihood[j])
@@ -578,7 +578,7 @@ def weigh_by_active(
 def _refine_to_mixture(
     pose: Poses, rows: Members, members: Whole, row: Row, turn: Lanes, scratch: Scratch
 ) -> None:
-    """Set poses to mean and covariance of the mixture of their updates by each hypothesis."""
+    """Set poses to the mean and covariance of their mixture of updates by each hypothesis."""
     for j in range(members):
         refined, weight = scratch.refined[j], scratch.posterior[j]
         for k in range(POSE):
@@ -615,7 +615,7 @@ def correct_ray(
     turn: Lanes,
     scratch: Scratch,
 ) -> None:
-    """Weigh, update, prune and merge a landmark's hypotheses from known poses, in place."""
+    """Update, weigh, prune and merge a landmark's hypotheses by a bearing from known poses."""
     members = most_members(count)
     if members == 1:
         correct_by_bearing(pose, rows[0], row, turn)
@@ -636,7 +636,7 @@ def correct_ray(
 def heaviest_to_range(
     pose: Poses, rows: Members, count: Counts, distance: float, turn: Lanes
 ) -> None:
-    """Move the heaviest hypothesis to a range, keeping its bearing and covariance."""
+    """Move the heaviest hypothesis of a landmark to a range, keeping its bearing and covariance."""
     for i in range(LANES):
         if turn[i] > 0.0:
             best = 0
@@ -650,7 +650,7 @@ def heaviest_to_range(
 
 @no_alloc
 def _prune(rows: Members, count: Counts, members: Whole, prune: float, scratch: Scratch) -> None:
-    """Remove hypotheses of small aggregated likelihood, but not the heaviest (Eq. (21))."""
+    """Remove a landmark's hypotheses of small weight, but never the heaviest (Eq. (21))."""
     largest, total = scratch.largest, scratch.total
     _largest(scratch.posterior, members, largest)
     least = largest  # reuses the array
@@ -677,7 +677,7 @@ def _prune(rows: Members, count: Counts, members: Whole, prune: float, scratch: 
 
 @no_alloc
 def _merge_members(rows: Members, count: Counts, limit: float) -> None:
-    """Merge neighbouring hypotheses of a ray that agree, near to far, as `ekf.correction` does."""
+    """Merge neighbouring hypotheses of a bearing-only landmark that agree, from near to far."""
     for i in range(LANES):
         last = 0
         for j in range(1, count[i]):
@@ -692,7 +692,7 @@ def _merge_members(rows: Members, count: Counts, limit: float) -> None:
 
 @no_alloc
 def _merged(one: Member, other: Member, limit: float, i: Whole) -> Flag:
-    """Replace the first of two hypotheses by their mixture if they agree; return if they do."""
+    """Replace the first of two hypotheses by their mixture if they agree; return whether so."""
     x, y = other[X + i] - one[X + i], other[Y + i] - one[Y + i]
     xx, xy = 0.5 * (one[XX + i] + other[XX + i]), 0.5 * (one[XY + i] + other[XY + i])
     yy = 0.5 * (one[YY + i] + other[YY + i])
@@ -711,7 +711,7 @@ def _merged(one: Member, other: Member, limit: float, i: Whole) -> Flag:
 
 @no_alloc
 def _close_up(rows: Members, count: Counts, keep: Float[np.ndarray, "_ lanes"]) -> None:
-    """Move the kept hypotheses to the front of each lane."""
+    """Move the kept hypotheses of a landmark to the front in each particle, and count them."""
     for i in range(LANES):
         left = 0
         for j in range(count[i]):

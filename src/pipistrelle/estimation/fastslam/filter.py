@@ -94,7 +94,7 @@ _PACKED = ([0, 0, 1, 0, 1, 2], [0, 1, 1, 2, 2, 2])
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class FastSlamBelief(Belief):
-    """Particles with poses, maps and weights, and their estimate.
+    """The belief of FastSLAM: particles with poses, maps and weights, and their estimate.
 
     Innovations are of the heaviest particle before each scan.
     Particles are kept in b blocks of L = `block.LANES`: a row of L numbers is a number of each of a
@@ -120,11 +120,11 @@ class FastSlamBelief(Belief):
     before: "FastSlamBelief | None" = None  # belief before resampling, until the next motion
 
     def pose(self) -> Gaussian:
-        """Return the vehicle's pose, (3) and (3, 3)."""
+        """Return the estimated vehicle pose: mean [m, m, rad] and 3 x 3 covariance."""
         return self.estimate
 
     def landmarks(self) -> Landmarks:
-        """Return the map, one row per hypothesis, from all particles or from the heaviest."""
+        """Return the map, a row per hypothesis, from all particles or from the heaviest."""
         if self.mixed:
             return mixture_map(self.before or self)
         return _rows(self.landmark, self.first, self.best_count, self.best_member)
@@ -138,7 +138,7 @@ class FastSlamBelief(Belief):
         return joint_of(self)
 
     def edited(self, remove: Sequence[int], merge: Sequence[tuple[int, int]]) -> "FastSlamBelief":
-        """Return the belief with landmarks removed and merged."""
+        """Return the belief with some landmarks removed and some pairs of landmarks merged."""
         return replace(self, **edits(self, remove, merge), before=None)
 
     def cloud(self) -> Float[np.ndarray, "p 3"]:
@@ -149,7 +149,7 @@ class FastSlamBelief(Belief):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class FastSlam:
-    """FastSLAM 2.0 (Bradley & Abaid, Sec. III-B) with rays (Sec. III-C).
+    """FastSLAM 2.0 (Bradley & Abaid, Sec. III-B) with bearing-only landmarks (Sec. III-C).
 
     >>> from pipistrelle.detection.scans import make_scan
     >>> motion = Motion(model="bicycle", control_std=(0.1, 0.03), wheelbase=0.2)
@@ -170,11 +170,11 @@ class FastSlam:
     settings: FastSlamConfig = _PAPER
 
     def __post_init__(self) -> None:
-        """Check that the gate is a probability."""
+        """Raise InputError unless the gate is a probability in (0, 1]."""
         check_gate(self.gate)
 
     def init(self, pose: Gaussian) -> FastSlamBelief:
-        """Return the initial belief at a pose, (3) and (3, 3), without landmarks."""
+        """Return the initial particles at a start pose with its covariance, without landmarks."""
         pose = usable_pose(pose)
         particles = self.settings.particles
         blocks = -(-particles // LANES)
@@ -239,7 +239,7 @@ class FastSlam:
     def update(
         self, belief: FastSlamBelief, scan: Scan, rng: np.random.Generator
     ) -> FastSlamBelief:
-        """Update the belief with a scan: refine, sample, correct, place, resample (Eqs. (12)-(22)).
+        """Update the belief by a scan: refine and sample poses, update maps, weigh and resample.
 
         Draws three normals, then a uniform number, per particle; nothing for an empty scan.
         """
@@ -284,13 +284,13 @@ class FastSlam:
         return self._resampled(after, stratified(weight, uniform))
 
     def _estimating(self, weight: Float[np.ndarray, " p"], best: int) -> Float[np.ndarray, " p"]:
-        """Return the particle weights of the pose estimate."""
+        """Return the weights for the pose estimate: of all particles, or 1 for the heaviest."""
         if self.settings.estimate != "heaviest":
             return weight
         return (np.arange(weight.size) == best).astype(float)
 
     def _resampled(self, belief: FastSlamBelief, ancestor: Int[np.ndarray, " p"]) -> FastSlamBelief:
-        """Replace the particles by copies of the ancestors, with equal weights."""
+        """Replace the particles by copies of their drawn ancestors, with equal weights."""
         poses, count, member = resample_into(_arrays(belief), ancestor)
         if self.settings.resampled_rays == "restart":
             restart_rays(belief.first, count, member)
@@ -306,7 +306,7 @@ class FastSlam:
         )
 
     def _inside(self, belief: FastSlamBelief, scan: Scan, params: UpdateParams) -> tuple[Scan, int]:
-        """Discard measurements outside every particle's gate; return the scan and their number."""
+        """Discard measurements outside all particles' gates; return the scan and their number."""
         if self.gate >= 1.0:
             return scan, 0
         gated = gated_by_all(_arrays(belief), columns_of(scan), params)
@@ -314,7 +314,7 @@ class FastSlam:
 
 
 def _arrays(belief: FastSlamBelief) -> Arrays:
-    """Return a belief's particles as a tuple for kernels."""
+    """Return the arrays of a belief's particles as a tuple for compiled functions."""
     return belief.poses, belief.landmark, belief.first, belief.count, belief.member
 
 
@@ -324,7 +324,7 @@ def _rows(
     count: Int[np.ndarray, " n"],
     member: Float[np.ndarray, "c 6"],
 ) -> Landmarks:
-    """Return a particle's map, a row per hypothesis."""
+    """Convert a particle's map to a `Landmarks` record, a row per hypothesis."""
     label = np.repeat(landmark, count)
     offset = np.arange(label.size) - np.repeat(np.cumsum(count) - count, count)
     rows = member[np.repeat(first[:-1], count) + offset]
@@ -346,7 +346,7 @@ def _placed_by_most(
     Float[np.ndarray, "p k"],
     Float[np.ndarray, "k 2"],
 ]:
-    """Return the k landmarks that most of the p particles, by weight, have initialised.
+    """Return landmarks that most particles, by weight, have initialised, and their states.
 
     Returns their indices, the weight of each particle, whether it has the landmark initialised,
     position, covariance and log weight in each, the weight among the particles that have it, and
@@ -365,7 +365,7 @@ def _placed_by_most(
 
 
 def mixture_map(belief: FastSlamBelief) -> Landmarks:
-    r"""Return the map of all particles: mean and covariance of each landmark over them.
+    r"""Return the map of all particles: mean and covariance of each landmark over particles.
 
     .. math:: \bar l = \sum_i w_i l_i, \qquad
               P = \sum_i w_i \left( (l_i - \bar l)(l_i - \bar l)^T + P_i \right)
@@ -400,7 +400,7 @@ def mixture_map(belief: FastSlamBelief) -> Landmarks:
 
 
 def joint_of(belief: FastSlamBelief) -> JointGaussian:
-    r"""Return pose and initialised landmarks of all particles as a joint Gaussian.
+    r"""Return the joint Gaussian of pose and initialised landmarks over all particles.
 
     .. math:: \bar x = \sum_i w_i x_i, \qquad
               P = \sum_i w_i \left( (x_i - \bar x)(x_i - \bar x)^T + P_i \right)
@@ -424,21 +424,21 @@ def joint_of(belief: FastSlamBelief) -> JointGaussian:
 
 
 def _numbers(blocks: np.ndarray, count: int) -> np.ndarray:
-    """Convert numbers by block and lane to numbers by particle, moved to the last axis."""
+    """Rearrange numbers stored by blocks of particles into an array with a row per particle."""
     middle = blocks.shape[1:-1]
     lanes = blocks.reshape(len(blocks), *middle, count, LANES)
     return np.moveaxis(lanes, -1, 1).reshape(len(blocks) * LANES, *middle, count)
 
 
 def _lanes(count: np.ndarray) -> np.ndarray:
-    """Convert counts by block, landmark and lane to counts by particle and landmark."""
+    """Rearrange counts stored by blocks of particles into an array by particle and landmark."""
     return np.swapaxes(count, 1, 2).reshape(len(count) * LANES, count.shape[1])
 
 
 def edits(
     belief: FastSlamBelief, remove: Sequence[int], merge: Sequence[tuple[int, int]]
 ) -> dict[str, Any]:
-    """Remove and merge landmarks of a belief; return its changed arrays.
+    """Remove and merge landmarks in all particles; return the belief's changed arrays by name.
 
     A merged pair keeps the landmark that most particles have initialised, the first if both are.
     """
@@ -456,7 +456,7 @@ def edits(
 
 
 def _number(belief: FastSlamBelief, label: int) -> int:
-    """Return the index of a landmark; raise InputError if it is not on the map."""
+    """Return a landmark's index in a belief; raise InputError if it is not on the map."""
     found = np.flatnonzero(belief.landmark == label)
     if not found.size:
         raise InputError(f"association: found landmark {label} to change, which is not on the map")
@@ -466,7 +466,7 @@ def _number(belief: FastSlamBelief, label: int) -> int:
 def _without(
     belief: FastSlamBelief, landmark: np.ndarray, kept: Bool[np.ndarray, " n"]
 ) -> dict[str, Any]:
-    """Return a belief's arrays reduced to selected landmarks, with new labels."""
+    """Return the belief's arrays by name, limited to selected landmarks, with changed labels."""
     rows = np.diff(belief.first)
     members = np.repeat(kept, rows)
     return {

@@ -73,7 +73,7 @@ from pipistrelle.jit import Whole, kernel, no_alloc, no_alloc_inlined
 
 
 class Particles(NamedTuple):
-    """All particles: arrays of a `FastSlamBelief`."""
+    """All particles' poses and maps, as the arrays of a `FastSlamBelief`."""
 
     pose: Float[np.ndarray, "b rows"]
     landmark: Int[np.ndarray, " n"]
@@ -87,7 +87,7 @@ Arrays = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]
 
 
 class Block(NamedTuple):
-    """Poses, log-weight gains and maps of a block of particles."""
+    """A block of particles: their poses, gains in log weight, and maps."""
 
     pose: Poses
     gained: Lanes
@@ -98,7 +98,7 @@ class Block(NamedTuple):
 
 @kernel
 def _slots(landmark: Int[np.ndarray, " n"], columns: Columns) -> Int[np.ndarray, " m"]:
-    """Return the index of each measurement's landmark on the map; -1 if new."""
+    """Return the index of each measurement's landmark on the map; -1 if it is new."""
     slot = np.full(rows_with_bearing(columns), -1)
     for m in range(slot.size):
         for n in range(landmark.size):
@@ -133,7 +133,7 @@ def gated_by_all(arrays: Arrays, columns: Columns, params: UpdateParams) -> Bool
 
 @kernel
 def innovations_of(arrays: Arrays, columns: Columns, particle: Whole) -> tuple[float, float]:
-    """Sum a particle's squared innovations of initialised landmarks and their dimensions."""
+    """Return a particle's sum of squared normalised innovations, and their degrees of freedom."""
     particles = Particles(*arrays)
     slot, b, i = _slots(particles.landmark, columns), particle // LANES, particle % LANES
     squared, degrees = 0.0, 0.0
@@ -153,7 +153,7 @@ def innovations_of(arrays: Arrays, columns: Columns, particle: Whole) -> tuple[f
 def _correct_by_range(
     pose: Poses, rows: Members, count: Counts, row: Row, params: UpdateParams, scratch: Scratch
 ) -> None:
-    """Update a landmark by range and bearing, a ray as ``rays.ranged`` selects, in place."""
+    """Update a landmark in a block of particles by range and bearing, in place."""
     part_lanes(count, scratch)
     correct_by_active(pose, rows[0], row, count)
     if most_members(count) == 1:
@@ -175,7 +175,7 @@ def _refine(
     params: UpdateParams,
     scratch: Scratch,
 ) -> None:
-    """Refine and weigh a block's poses by all measurements of mapped landmarks."""
+    """Update and weigh a block of particles' poses by all measurements of mapped landmarks."""
     for m in range(slot.size):
         n = slot[m]
         if n < 0:
@@ -203,7 +203,7 @@ def _weigh_at_sample(
     params: UpdateParams,
     scratch: Scratch,
 ) -> None:
-    """Weigh a block's sampled poses by prior x likelihood / proposal at the sample."""
+    """Weigh a block of particles by prior times likelihood over proposal at the sampled poses."""
     block.gained[:] = 0.0
     weigh_sample(before[0], before[1], block.pose, block.gained)
     for m in range(slot.size):
@@ -231,7 +231,7 @@ def _correct(
     params: UpdateParams,
     scratch: Scratch,
 ) -> None:
-    """Update a block's measured landmarks from its sampled poses, in place."""
+    """Update the measured landmarks of a block of particles from the sampled poses, in place."""
     for m in range(slot.size):
         n = slot[m]
         if n < 0:
@@ -252,7 +252,7 @@ def _place(
     columns: Columns,
     params: UpdateParams,
 ) -> None:
-    """Initialise a block's new landmarks: a single hypothesis, or a ray (Eqs. (16) to (18))."""
+    """Add new landmarks to a block of particles: a hypothesis, or several along a bearing."""
     new = known
     for m in range(slot.size):
         if slot[m] < 0:
@@ -274,7 +274,7 @@ def _place(
 def _rows(
     particles: Particles, slot: Int[np.ndarray, " m"], columns: Columns, rays: Whole
 ) -> tuple[Int[np.ndarray, " n"], Int[np.ndarray, " n+1"], Whole]:
-    """Return all labels, each landmark's first row, and the largest number of rows."""
+    """Return all labels, each landmark's first row in the map array, and the largest row count."""
     known, fresh, widest = particles.landmark.size, 0, 1
     for m in range(slot.size):
         fresh += slot[m] < 0
@@ -298,7 +298,7 @@ def _rows(
 
 @no_alloc
 def _copy_members(particles: Particles, b: Whole, block: Block) -> None:
-    """Copy the hypotheses of a block to their new rows."""
+    """Copy a block of particles' map to an array with room for new landmarks."""
     for n in range(particles.landmark.size):
         for j in range(block.first[n + 1] - block.first[n]):
             source = particles.member[b, particles.first[n] + j]
@@ -317,7 +317,7 @@ def correct_particles(
     params: UpdateParams,
     sampled: bool,
 ) -> tuple[Arrays, Float[np.ndarray, " p"]]:
-    """Refine, sample, update and extend a copy of all particles; return it and its log weights.
+    """Update a copy of all particles by a scan (FastSLAM 2.0); return it and its log weights.
 
     With ``sampled``, particles are weighed at the sampled pose.
     """
@@ -346,7 +346,7 @@ def correct_particles(
 
 @kernel
 def mean_full(count: Int[np.ndarray, "b n lanes"], weight: Float[np.ndarray, " p"]) -> float:
-    """Return the mean number of fully initialised landmarks; exact if all particles agree."""
+    """Return the mean number of fully initialised landmarks over the weighted particles."""
     first, more = 0, 0.0
     for p in range(weight.size):
         full = 0
@@ -363,7 +363,7 @@ def resample_into(
 ) -> tuple[
     Float[np.ndarray, "b rows"], Int[np.ndarray, "b n lanes"], Float[np.ndarray, "b c numbers"]
 ]:
-    """Copy the ancestors to the resampled particles; spare lanes repeat the last."""
+    """Return arrays of resampled particles, each a copy of its drawn ancestor."""
     old = Particles(*arrays)
     pose, count = np.empty_like(old.pose), np.empty_like(old.count)
     member, source = np.empty_like(old.member), np.empty(LANES, dtype=np.int64)
@@ -389,7 +389,7 @@ def restart_rays(
     count: Int[np.ndarray, "b n lanes"],
     member: Float[np.ndarray, "b c numbers"],
 ) -> None:
-    """Give the hypotheses of each ray equal weights, in place."""
+    """Give all hypotheses of each landmark the same weight in every particle, in place."""
     for b in range(count.shape[0]):
         for n in range(count.shape[1]):
             for j in range(first[n], first[n + 1]):
@@ -398,7 +398,7 @@ def restart_rays(
 
 
 def normalised(log_weight: Float[np.ndarray, " p"]) -> Float[np.ndarray, " p"]:
-    """Return the weights that sum to 1, from their logs; equal weights if no log is finite.
+    """Return particle weights that sum to 1, from log weights; equal weights if none is finite.
 
     The sum is rounded only once, so that it is independent of the order of particles.
 
@@ -412,7 +412,7 @@ def normalised(log_weight: Float[np.ndarray, " p"]) -> Float[np.ndarray, " p"]:
 
 @kernel
 def _shifted(log_weight):
-    """Return the exponentials relative to the largest; zero where the log is not finite."""
+    """Return the exponentials of logs minus their maximum; zero where a log is not finite."""
     weight, largest = np.zeros(log_weight.size), -np.inf
     for j in range(log_weight.size):
         if math.isfinite(log_weight[j]):
@@ -440,7 +440,7 @@ def effective_particles(weight: Float[np.ndarray, " p"]) -> float:
 def stratified(
     weight: Float[np.ndarray, " p"], uniform: Float[np.ndarray, " p"]
 ) -> Int[np.ndarray, " p"]:
-    """Draw each particle's ancestor, from the strata of the cumulated weights, in rising order.
+    """Draw each particle's ancestor by stratified resampling; return indices in rising order.
 
     The weights sum to 1, ``uniform`` is in [0, 1). Bradley & Abaid, Sec. III-B; Douc, Cappe &
     Moulines (2005).
@@ -457,7 +457,7 @@ def stratified(
 
 @no_alloc
 def _add_moments(pose: Poses, weight: Lanes, sums: Poses) -> None:
-    """Add a block's weighted positions and directions, lane by lane."""
+    """Add a block of particles' weighted positions, and cosines and sines of heading, to sums."""
     for i in range(LANES):
         c, s = cosine_and_sine(pose[HEADING + i])
         sums[X + i] += weight[i] * pose[X + i]
@@ -470,7 +470,7 @@ def _add_moments(pose: Poses, weight: Lanes, sums: Poses) -> None:
 def _add_spread(
     pose: Poses, weight: Lanes, x: float, y: float, heading: float, sums: Poses
 ) -> None:
-    """Add a block's weighted covariances and squared distances from the mean, lane by lane."""
+    """Add a block of particles' weighted pose covariances about the mean pose to sums."""
     for i in range(LANES):
         dx, dy, turn = pose[X + i] - x, pose[Y + i] - y, wrapped(pose[HEADING + i] - heading)
         sums[PXX + i] += weight[i] * (dx * dx + pose[PXX + i])
@@ -483,7 +483,7 @@ def _add_spread(
 
 @kernel
 def _add_lanes(sums: Poses) -> Float[np.ndarray, "9"]:
-    """Return the sum of each row over its lanes."""
+    """Return the sum of each of a block's nine pose numbers over its particles."""
     total = np.empty(POSE // LANES)
     for row in range(total.size):
         so_far = 0.0
@@ -497,7 +497,7 @@ def _add_lanes(sums: Poses) -> Float[np.ndarray, "9"]:
 def summarise(
     pose: Float[np.ndarray, "b rows"], weight: Float[np.ndarray, " p"]
 ) -> tuple[Pose, PoseCovariance]:
-    """Return mean (circular in the heading) and covariance of all particles with theirs."""
+    """Return the weighted mean pose (circular in heading) of all particles, and its covariance."""
     blocks = pose.shape[0]
     lanes, sums = np.zeros((blocks, LANES)), np.zeros(POSE)
     for p in range(weight.size):
@@ -522,7 +522,7 @@ def summarise(
 
 @no_alloc
 def _propagate_block(pose: Poses, step: tuple[float, ...], q0: float, q1: float) -> None:
-    """Predict a block's poses by a control step in the vehicle's frame (Eq. (10))."""
+    """Predict the poses of a block of particles through a control step, in place (Eq. (10))."""
     ahead, aside, turn, u00, u10, u20, u01, u11, u21 = step
     for i in range(LANES):
         c, s = cosine_and_sine(pose[HEADING + i])
@@ -543,7 +543,7 @@ def _propagate_block(pose: Poses, step: tuple[float, ...], q0: float, q1: float)
 
 @no_alloc
 def _propagate_block_by(pose: Poses, step: tuple[float, ...], noise: tuple[float, ...]) -> None:
-    """Predict a block's poses by a motion and its covariance, both in the vehicle's frame."""
+    """Predict the poses of a block of particles by a relative motion with covariance, in place."""
     ahead, aside, turn = step[0], step[1], step[2]
     qxx, qxy, qxh, qyy, qyh, qhh = noise
     for i in range(LANES):
@@ -574,7 +574,7 @@ def propagate(
     pose_means: Float[np.ndarray, "k 3"],
     pose_covariances: Float[np.ndarray, "k 3 3"],
 ) -> None:
-    """Predict all particles through control steps, in place, and summarise after each."""
+    """Predict all particles through control steps, in place; write the mean pose after each."""
     for k in range(dt.size):
         control = controls[k]
         step = motion_increment(motion, 0.0, control, dt[k])
