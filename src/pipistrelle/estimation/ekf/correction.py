@@ -83,7 +83,7 @@ from pipistrelle.jit import Flag, Whole, kernel, no_alloc, no_alloc_inlined
 
 @no_alloc
 def merge_members(state: State, first: Whole, count: Whole, limit: float, scratch: Scratch) -> None:
-    """Merge neighbouring hypotheses of a ray that agree, from near to far."""
+    """Merge neighbouring hypotheses of a bearing-only landmark that agree, from near to far."""
     kept, last = 0, 0  # last: hypothesis into which the next may be merged
     for j in range(count):
         scratch.keep[j] = j == 0 or not _agree(state, first + last, first + j, limit)
@@ -97,7 +97,7 @@ def merge_members(state: State, first: Whole, count: Whole, limit: float, scratc
 
 @no_alloc
 def _agree(state: State, one: Whole, other: Whole, limit: float) -> Flag:
-    """Return whether the distance of two hypotheses is within a limit of their mean covariance."""
+    """Return whether two hypotheses are within ``limit`` standard deviations of each other."""
     joint, size = state.joint, 3 + 2 * state.members[0]
     i, j = 3 + 2 * one, 3 + 2 * other
     ax, ay = point_rows(joint, size, i)
@@ -109,7 +109,7 @@ def _agree(state: State, one: Whole, other: Whole, limit: float) -> Flag:
 
 @no_alloc
 def _merge(state: State, one: Whole, other: Whole) -> None:
-    """Replace the first of two hypotheses by their mixture."""
+    """Replace the first of two hypotheses of a landmark by the Gaussian of their mixture."""
     joint, weight, size = state.joint, state.weight, 3 + 2 * state.members[0]
     flush(joint, size)
     mean, P, i, j = joint.mean, joint.covariance, 3 + 2 * one, 3 + 2 * other
@@ -133,7 +133,7 @@ def _merge(state: State, one: Whole, other: Whole) -> None:
 def _correct_ray(
     state: State, first: Whole, count: Whole, row: Row, params: UpdateParams, scratch: Scratch
 ) -> Whole:
-    """Weigh a ray's hypotheses by a bearing and share it among them; GATED if outside all gates."""
+    """Update a bearing-only landmark's hypotheses by a bearing; return GATED if it fits none."""
     joint, mean, size = state.joint, state.joint.mean, 3 + 2 * state.members[0]
     weight, outcome = state.weight[first:], GATED
     bearing, variance = row.bearing, row.bearing_variance
@@ -161,7 +161,7 @@ def _correct_ray(
 def _correct_ranged_ray(
     state: State, first: Whole, count: Whole, row: Row, params: UpdateParams, scratch: Scratch
 ) -> Whole:
-    """Update a ray with range and bearing as ``rays.ranged`` selects; return GATED or APPLIED."""
+    """Update a bearing-only landmark by its first range, and bearing; return GATED or APPLIED."""
     joint, distance = state.joint, row.range
     if params.ranged == MOVED:
         i, mean = 3 + 2 * (first + heaviest_member(state.weight[first:], count)), joint.mean
@@ -181,7 +181,7 @@ def _correct_ranged_ray(
 def _correct_partial(
     state: State, first: Whole, count: Whole, row: Row, params: UpdateParams, scratch: Scratch
 ) -> Whole:
-    """Update a ray with a bearing, prune and merge it; return GATED or APPLIED."""
+    """Update, prune and merge a bearing-only landmark by a bearing; return GATED or APPLIED."""
     if _correct_ray(state, first, count, row, params, scratch) == GATED:
         return GATED
     kept = survivors(state.weight[first:], count, params.prune, scratch.keep)
@@ -196,7 +196,7 @@ def _correct_partial(
 def _correct_precisely(
     state: State, first: Whole, count: Whole, row: Row, params: UpdateParams, scratch: Scratch
 ) -> Whole:
-    """Cross a stored bearing, or update a ray, with a precise bearing; return GATED or APPLIED."""
+    """Update a partially initialised landmark by a precise bearing; return GATED or APPLIED."""
     if state.weight[first] != WAITING_WEIGHT:
         variance = member_linearity(params) ** 2
         coarse = Row(row.landmark, row.bearing, row.range, variance, row.range_variance)
@@ -211,7 +211,7 @@ def _correct_precisely(
 def _correct_placed(
     state: State, first: Whole, row: Row, params: UpdateParams, scratch: Scratch
 ) -> Whole:
-    """Update an initialised landmark and accumulate its innovations; return GATED or APPLIED."""
+    """Update an initialised landmark by a measurement; return GATED or APPLIED."""
     joint, size, i = state.joint, 3 + 2 * state.members[0], 3 + 2 * first
     distance, bearing, variance = row.range, row.bearing, row.bearing_variance
     if math.isnan(distance):
@@ -232,7 +232,7 @@ def _correct_placed(
 
 @no_alloc
 def _correct_known(state: State, row: Row, params: UpdateParams, scratch: Scratch) -> Whole:
-    """Update with a measurement of a mapped landmark; return GATED or APPLIED."""
+    """Update the joint Gaussian by a mapped landmark's measurement; return GATED or APPLIED."""
     first, count = members_of(state.landmark, state.members[0], row.landmark)
     if params.robust and state.weight[first] != WAITING_WEIGHT:
         row = inflated(state, first, count, row)
@@ -248,7 +248,7 @@ def _correct_known(state: State, row: Row, params: UpdateParams, scratch: Scratc
 
 @no_alloc
 def _add_new(state: State, row: Row, params: UpdateParams, moves: bool) -> None:
-    """Append a measurement's landmark: one hypothesis, or a ray (Eqs. (16) to (18)).
+    """Append a measured new landmark to the state: a hypothesis, or several along its bearing.
 
     A moving caller becomes a ray even by a precise bearing, as its bearings do not cross.
     """
@@ -279,7 +279,7 @@ def _take_in(
     params: UpdateParams,
     scratch: Scratch,
 ) -> Whole:
-    """Update mapped landmarks, then append new landmarks; return the number of gated rows."""
+    """Update mapped landmarks, then append new landmarks; return the gated measurements' number."""
     gated = 0
     for m in range(known.size):
         if known[m]:
@@ -316,7 +316,7 @@ def corrected(
     params: UpdateParams,
     turns: float,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, Whole, float, float]:
-    """Update, prune and extend a copy of the arrays of an `EkfBelief`.
+    """Update a copy of an EKF belief's arrays by a scan, and append new landmarks; return all.
 
     Returns its arrays, the number of gated measurements, and the numbers of `beliefs.Innovations`.
     """

@@ -47,7 +47,7 @@ from pipistrelle.jit import Whole, kernel, no_alloc
 
 
 class Scratch(NamedTuple):
-    """Workspace for the hypotheses of a landmark and the order of the state."""
+    """Workspace to update a landmark's hypotheses, and the sums of the innovations."""
 
     likelihood: Float[np.ndarray, " m"]
     share: Float[np.ndarray, " m"]
@@ -58,7 +58,7 @@ class Scratch(NamedTuple):
 
 @kernel
 def scratch_for(members: Whole) -> Scratch:
-    """Allocate a workspace for a number of hypotheses."""
+    """Allocate the temporary arrays for a number of landmark hypotheses."""
     return Scratch(
         np.empty(members),
         np.empty(members),
@@ -91,20 +91,20 @@ many bearings of small angle would seem to cross at once."""
 
 @no_alloc
 def member_linearity(params: UpdateParams) -> float:
-    """Return the linearisation error [rad] of the bearing of a ray hypothesis from the side."""
+    """Return the error [rad] of linearising the bearing of a hypothesis along a bearing."""
     share = params.ray_stds[0] / params.ray_ranges[0]
     return 0.5 * share * share
 
 
 @no_alloc
 def is_precise(row: Row, params: UpdateParams) -> bool:
-    """Return whether a bearing is too precise for ray hypotheses and must be stored."""
+    """Return whether a bearing is too precise for a Gaussian mixture along it."""
     return params.sharing == FITTED and row.bearing_variance < member_linearity(params) ** 2
 
 
 @no_alloc
 def second_order_bearing(joint: Joint, size: Whole, i: Whole, row: Row) -> tuple[float, float]:
-    """Return a bearing without second-order bias, and its larger variance, for the point at i."""
+    """Correct a bearing for its second-order bias; return it and its larger variance."""
     mean = joint.mean
     _, _, c, s, k = observe(mean[0], mean[1], mean[2], mean[i], mean[i + 1])
     xx, xy, yy = relative_covariance(joint, size, i)
@@ -118,7 +118,7 @@ def second_order_bearing(joint: Joint, size: Whole, i: Whole, row: Row) -> tuple
 
 @no_alloc
 def add_waiting_bearing(state: State, row: Row, params: UpdateParams) -> None:
-    """Append the two points of a stored bearing: vehicle position, and a point in its direction."""
+    """Append a bearing line to the state as two points: the vehicle, and a point ahead."""
     through = params.ray_ranges[params.ray_ranges.size // 2]
     for ahead in (0.0, through):
         member = state.members[0]
@@ -130,7 +130,7 @@ def add_waiting_bearing(state: State, row: Row, params: UpdateParams) -> None:
 
 @no_alloc
 def place_at_crossing(state: State, first: Whole, row: Row, robust: bool) -> bool:
-    """Initialise a landmark at the crossing of two bearings; return False if it is too uncertain.
+    """Initialise a landmark where two bearings cross; return False if this is too uncertain.
 
     It replaces the first stored point; the caller drops the second. ``robust``: larger angles only.
     """

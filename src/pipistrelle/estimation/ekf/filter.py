@@ -80,7 +80,7 @@ _SUM = UNLABELLED - 1
 
 @kernel
 def velocity_of(label: Whole) -> Whole:
-    """Convert a caller's label to the label of its velocity, and back.
+    """Convert a caller's label to the label of its velocity in the state, and back.
 
     >>> velocity_of(51), velocity_of(velocity_of(51))
     (-53, 51)
@@ -89,12 +89,12 @@ def velocity_of(label: Whole) -> Whole:
 
 
 def is_velocity(landmark: Labels) -> Bool[np.ndarray, " h"]:
-    """Return which entries of a state are velocities."""
+    """Return a mask of the entries of a state that are callers' velocities."""
     return landmark < UNLABELLED
 
 
 def is_standing(landmark: Labels) -> Bool[np.ndarray, " h"]:
-    """Return which entries of a state are neither moving callers nor their velocities.
+    """Return a mask of a state's landmark entries, without moving callers and their velocities.
 
     >>> is_standing(np.array([4, 51, -53]))
     array([ True, False, False])
@@ -113,7 +113,7 @@ def propagate_callers(
     dt: Durations,
     walk_std: float,
 ) -> None:
-    """Predict moving callers through steps [s], in place; ``walk_std``: velocity std after 1 s."""
+    """Predict moving callers through control steps, in place; their velocities are random walks."""
     q, size, seconds = walk_std * walk_std, mean.size, dt.sum()
     for velocity in range(landmark.size):
         if landmark[velocity] >= UNLABELLED:
@@ -149,7 +149,7 @@ MERGE_BOUND = 100.0
 
 @kernel
 def is_placed(landmark: Labels) -> Bool[np.ndarray, " h"]:
-    """Return which hypotheses are their landmark's or caller's only hypothesis.
+    """Return a mask of the hypotheses that are the only hypothesis of their landmark or caller.
 
     >>> is_placed(np.array([4, 7, 7, 51, -53]))
     array([ True, False, False,  True, False])
@@ -162,7 +162,7 @@ def is_placed(landmark: Labels) -> Bool[np.ndarray, " h"]:
 
 
 def removed(belief: "EkfBelief", label: int) -> "EkfBelief":
-    """Remove a landmark's hypotheses, with its velocity if it moves."""
+    """Return the belief without a landmark, or without a moving caller and its velocity."""
     state = belief.mean, belief.covariance, belief.landmark, belief.weight
     mean, covariance, landmark, weight = _left(*state, _present(belief, label))
     return replace(belief, mean=mean, covariance=covariance, landmark=landmark, weight=weight)
@@ -176,7 +176,7 @@ def _left(
     weight: Float[np.ndarray, " h"],
     label: Whole,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Remove a landmark from the arrays of a state."""
+    """Return a state's mean, covariance, labels and weights without a landmark."""
     kept = np.flatnonzero((landmark != label) & (landmark != velocity_of(label)))
     left, P = np.empty(3 + 2 * kept.size), np.empty((3 + 2 * kept.size, 3 + 2 * kept.size))
     at = np.arange(left.size)
@@ -190,7 +190,7 @@ def _left(
 
 
 def merged(belief: "EkfBelief", kept: int, gone: int) -> "EkfBelief":
-    """Merge two fixed landmarks under the label of the first.
+    """Return the belief with two fixed landmarks merged under the label of the first.
 
     An initialised landmark replaces a ray; of two rays the first remains.
     """
@@ -216,7 +216,7 @@ def merged(belief: "EkfBelief", kept: int, gone: int) -> "EkfBelief":
 def _equated(
     mean: Mean, P: Covariance, k: Whole, g: Whole, error: float
 ) -> tuple[Mean, Covariance]:
-    """Update mean and covariance by the constraint that two points coincide."""
+    """Condition mean and covariance on the points at k and g coinciding; return both."""
     w0, w1 = P[:, k] - P[:, g], P[:, k + 1] - P[:, g + 1]
     a = math.sqrt(w0[k] - w0[g] + MERGED_STD * MERGED_STD)
     b = (w0[k + 1] - w0[g + 1]) / a
@@ -239,7 +239,7 @@ def _equated(
 
 
 def _present(belief: "EkfBelief", label: int) -> int:
-    """Return a label that is on the map; raise InputError for others."""
+    """Return a landmark's label if it is on the map, and raise InputError otherwise."""
     if label < 0 or label not in belief.landmark:
         raise InputError(f"association: found landmark {label} to change, which is not on the map")
     return label
@@ -247,7 +247,7 @@ def _present(belief: "EkfBelief", label: int) -> int:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class EkfBelief(Recoverable):
-    r"""A joint Gaussian over pose x and landmark hypotheses m (Bradley & Abaid, Eqs. (8) and (9)).
+    r"""Joint Gaussian of pose x and landmark hypotheses m (Bradley & Abaid, Eqs. (8) and (9)).
 
     .. math:: P = \begin{bmatrix} P_{xx} & P_{xm} \\ P_{mx} & P_{mm} \end{bmatrix}
        :label: eq-9
@@ -269,7 +269,7 @@ class EkfBelief(Recoverable):
     """Start position [m] for the invariant error; (0, 0) for the linear error."""
 
     def pose(self) -> Gaussian:
-        """Return the vehicle's pose, (3) and (3, 3), with the covariance of the linear error."""
+        """Return the vehicle's pose: mean [m, m, rad] and 3 x 3 covariance of the linear error."""
         mean, covariance = self.mean[:3].copy(), self.covariance[:3, :3].copy()
         if self.error == LINEAR:
             return Gaussian(mean=mean, covariance=covariance)
@@ -279,15 +279,15 @@ class EkfBelief(Recoverable):
         return Gaussian(mean=mean, covariance=linear, invariant=True)
 
     def landmarks(self) -> Landmarks:
-        """Return the map of fixed landmarks, one row per hypothesis."""
+        """Return the map of landmarks that do not move, a row per hypothesis."""
         return self.rows(is_standing(self.landmark))
 
     def moving(self) -> Landmarks:
-        """Return the moving callers, one row per hypothesis."""
+        """Return the estimates of moving callers, a row per hypothesis."""
         return self.rows(~is_standing(self.landmark) & ~is_velocity(self.landmark))
 
     def rows(self, kept: Bool[np.ndarray, " h"]) -> Landmarks:
-        """Return selected hypotheses with covariances of the linear error."""
+        """Return selected landmark hypotheses with means and covariances in linear coordinates."""
         mean, covariance = self._linear(kept, with_pose=False)
         return _map_of(self.landmark[kept], self.weight[kept], mean.reshape(-1, 2), covariance)
 
@@ -302,7 +302,7 @@ class EkfBelief(Recoverable):
     def _linear(
         self, kept: Bool[np.ndarray, " h"], *, with_pose: bool
     ) -> tuple[Durations, Float[np.ndarray, "k k"]]:
-        """Return mean and covariance of the linear error of selected hypotheses (`linear_part`)."""
+        """Return mean and covariance of selected hypotheses in x and y, not the invariant error."""
         invariant = self.error == INVARIANT
         return linear_part(self.mean, self.covariance, self.origin, kept, with_pose, invariant)
 
@@ -311,7 +311,7 @@ class EkfBelief(Recoverable):
         return sorted({*self.landmark[~is_velocity(self.landmark)].tolist()})
 
     def edited(self, remove: Sequence[int], merge: Sequence[tuple[int, int]]) -> "EkfBelief":
-        """Return the belief with landmarks removed and merged."""
+        """Return the belief with some landmarks removed and some pairs of landmarks merged."""
         belief = self
         for kept, gone in merge:
             belief = merged(belief, kept, gone)
@@ -320,7 +320,7 @@ class EkfBelief(Recoverable):
         return belief
 
     def freed(self, pose: Pose, stds: Pose) -> "EkfBelief":
-        """Move the vehicle to a pose, with an independent error added."""
+        """Return the belief with the vehicle moved to a pose, and its covariance enlarged."""
         here = np.append(pose[:2] - self.origin, pose[2])
         mean, P = np.append(here, self.mean[3:]), self.covariance.copy()
         noise = np.zeros((mean.size, 3))
@@ -341,7 +341,7 @@ def _map_of(
     mean: Float[np.ndarray, "h 2"],
     covariance: Covariance,
 ) -> Landmarks:
-    """Return a map, one row per hypothesis, from the joint covariance (2h, 2h).
+    """Convert hypotheses and their joint covariance (2h, 2h) to a map, a row per hypothesis.
 
     A stored bearing becomes two hypotheses of equal weight, at half and twice the distance of its
     second point, with standard deviations of half their range.
@@ -363,7 +363,7 @@ def _map_of(
 def _with_points(
     belief: EkfBelief, known: Landmarks, by_state: Float[np.ndarray, "n d"]
 ) -> EkfBelief:
-    """Append points with errors ``by_state`` times the state's error, plus independent errors."""
+    """Return the belief with new points; errors are ``by_state`` times its error, plus noise."""
     P, cross = belief.covariance, by_state @ belief.covariance
     own = np.zeros((len(by_state), len(by_state)))
     for row, covariance in enumerate(known.covariance):
@@ -378,7 +378,7 @@ def _with_points(
 
 
 def _with_velocities(belief: EkfBelief, moving: Int[np.ndarray, " v"], std: float) -> EkfBelief:
-    """Add a velocity of 0, with a std [m/s] along each axis, for each moving caller without."""
+    """Add a velocity of 0 with a std [m/s] to the state for each moving caller that has none."""
     if moving.size == 0:
         return belief
     velocity = _SUM - moving
@@ -397,7 +397,7 @@ def _with_velocities(belief: EkfBelief, moving: Int[np.ndarray, " v"], std: floa
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class EkfSlam:
-    """EKF-SLAM (Bradley & Abaid, Sec. III-A) with rays (Sec. III-C).
+    """EKF-SLAM (Bradley & Abaid, Sec. III-A) with bearing-only landmarks (Sec. III-C).
 
     >>> from pipistrelle.config import RayConfig
     >>> from pipistrelle.detection.scans import make_scan
@@ -425,11 +425,11 @@ class EkfSlam:
     """Error of the initial belief: `gaussian.LINEAR` or `gaussian.INVARIANT`."""
 
     def __post_init__(self) -> None:
-        """Check that the gate is a probability."""
+        """Raise InputError unless the gate is a probability in (0, 1]."""
         check_gate(self.gate)
 
     def init(self, pose: Gaussian) -> EkfBelief:
-        """Return the initial belief at a pose, (3) and (3, 3), without landmarks."""
+        """Return the initial belief at a start pose with its covariance, without landmarks."""
         pose = usable_pose(pose)
         origin = np.zeros(2) if self.error == LINEAR else pose.mean[:2]
         return EkfBelief(
@@ -442,7 +442,7 @@ class EkfSlam:
         )
 
     def knowing(self, belief: EkfBelief, known: Landmarks) -> EkfBelief:
-        r"""Return the initial belief with known landmarks on its map.
+        r"""Return the initial belief with known landmarks added to its map.
 
         Their positions are independent of the vehicle's heading: their invariant error is
         :math:`\xi_l = e_l - J\hat l\,\xi_\theta`, with independent errors e.
@@ -519,7 +519,7 @@ class EkfSlam:
         return recovering(self._corrected, belief, scan, self.gate, self.rays.range_bounds[1])
 
     def _corrected(self, belief: EkfBelief, scan: Scan) -> EkfBelief:
-        """Update the belief with the measurements that pass the gate."""
+        """Update the belief by a scan's measurements that pass the gate, and return it."""
         mean, covariance, landmark, weight, gated, squared, degrees = corrected(
             belief.mean,
             belief.covariance,

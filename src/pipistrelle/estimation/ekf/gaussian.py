@@ -73,7 +73,7 @@ Labels = Int[np.ndarray, " h"]
 
 
 def rotated_left(points: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, " m"]:
-    """Rotate points by 90 degrees to the left (J l), and flatten them."""
+    """Rotate points by 90 degrees to the left, and flatten them to a vector."""
     return (points @ np.array([[0.0, 1.0], [-1.0, 0.0]])).ravel()
 
 
@@ -86,7 +86,7 @@ def linear_part(
     with_pose: bool,
     invariant: bool,
 ) -> tuple[Durations, Float[np.ndarray, "k k"]]:
-    """Return mean and covariance of the linear error of selected hypotheses, or with the pose."""
+    """Return mean and covariance of selected hypotheses in x and y, perhaps with the pose."""
     at, size = np.empty(mean.size, np.int64), 0
     for i in range(mean.size):
         if with_pose if i < 3 else kept[(i - 3) // 2]:
@@ -109,7 +109,7 @@ def linear_part(
 
 @no_alloc
 def shifted_covariance(P: Covariance, x: float, y: float, shifted: PoseCovariance) -> None:
-    """Convert a pose's covariance from invariant to linear error, at (x, y).
+    """Convert a pose's covariance from the invariant error to the error in x, y and heading.
 
     Writes M P M^T with M = [[1, 0, -y], [0, 1, x], [0, 0, 1]]; (-x, -y) converts back.
     """
@@ -132,7 +132,7 @@ def propagate_invariant(
     pose_means: Float[np.ndarray, "k 3"],
     pose_covariances: Float[np.ndarray, "k 3 3"],
 ) -> None:
-    """Predict mean and covariance of the invariant error in place, through control steps.
+    """Predict mean and covariance of the right-invariant EKF through control steps, in place.
 
     ``pose_covariances`` are of the linear error.
     """
@@ -175,7 +175,7 @@ MAX_WAITING, WAITING = 32, 0
 
 
 class Joint(NamedTuple):
-    """A Gaussian during an update, in arrays with room for a frame's new points."""
+    """A Gaussian during an EKF update, in arrays with room for a frame's new points."""
 
     mean: Float[np.ndarray, " n"]  # (n)
     covariance: Float[np.ndarray, "n m"]
@@ -188,7 +188,7 @@ class Joint(NamedTuple):
 
 
 class State(NamedTuple):
-    """The Gaussian that EKF-SLAM updates, and the labels of its points."""
+    """The joint Gaussian that EKF-SLAM updates, and the labels and weights of its points."""
 
     joint: Joint
     landmark: Labels
@@ -199,13 +199,13 @@ class State(NamedTuple):
 
 @kernel
 def _lanes(size: Whole) -> Whole:
-    """Round a size up to full cache lines."""
+    """Round a number of floats up to a whole number of cache lines."""
     return (size + LANE - 1) // LANE * LANE
 
 
 @kernel
 def _on_cache_lines(rows: Whole, width: Whole) -> Float[np.ndarray, "rows width"]:
-    """Allocate an array (rows, width) aligned to cache lines."""
+    """Allocate an uninitialised array (rows, width) that begins on a cache line."""
     buffer = np.empty(rows * width + LANE)
     start = -(buffer.ctypes.data // 8) % LANE
     return buffer[start : start + rows * width].reshape(rows, width)
@@ -213,7 +213,7 @@ def _on_cache_lines(rows: Whole, width: Whole) -> Float[np.ndarray, "rows width"
 
 @kernel
 def joint_of(mean: Mean, covariance: Covariance, room: Whole, turns: float) -> Joint:
-    """Copy a mean (d) and a covariance (d, d) to a `Joint` with capacity ``room``."""
+    """Copy a mean and a covariance to a `Joint` with room for ``room`` state entries."""
     size, width = mean.size, _lanes(mean.size)
     longer, wider = np.empty(room), _on_cache_lines(room, _lanes(room))
     W = _on_cache_lines(MAX_WAITING, _lanes(room))
@@ -233,7 +233,7 @@ def joint_of(mean: Mean, covariance: Covariance, room: Whole, turns: float) -> J
 def point_rows(
     joint: Joint, size: Whole, i: Whole
 ) -> tuple[Float[np.ndarray, " m"], Float[np.ndarray, " m"]]:
-    """Apply the deferred columns to rows i and i + 1 of the covariance, and return these rows."""
+    """Bring rows i and i + 1 of the covariance up to date with deferred updates; return them."""
     pi, pj, W = joint.covariance[i], joint.covariance[i + 1], joint.W
     first, last, width = joint.taken[i], joint.taken[WAITING], _lanes(size)
     joint.taken[i] = last
@@ -256,7 +256,7 @@ def point_rows(
 
 @no_alloc
 def flush(joint: Joint, size: Whole) -> None:
-    """Apply all deferred columns to every row."""
+    """Bring the whole covariance up to date with all deferred updates, in place."""
     covariance = joint.covariance
     for i in range(3, size, 2):
         pi, pj = point_rows(joint, i + 2, i)
@@ -268,7 +268,7 @@ def flush(joint: Joint, size: Whole) -> None:
 
 @no_alloc
 def defer(joint: Joint, size: Whole, w: Float[np.ndarray, " m"], step: float) -> None:
-    """Add step w to the mean, subtract w w^T from the pose's rows, and defer the points' rows."""
+    """Apply a rank-1 update w to mean and pose rows now, and defer it for the points' rows."""
     mean, p0, p1, p2 = joint.mean, joint.covariance[0], joint.covariance[1], joint.covariance[2]
     x, y, h = w[0], w[1], w[2]
     for a in range(size):
@@ -288,7 +288,7 @@ def retract(
     w1: Float[np.ndarray, " m"],
     e1: float,
 ) -> None:
-    """Move the mean by the exponential of the invariant error e0 w0 + e1 w1."""
+    """Move an invariant EKF's mean by the exponential map of the error e0 w0 + e1 w1, in place."""
     turn = e0 * w0[2] + e1 * w1[2]
     c, s = math.cos(turn), math.sin(turn)
     if abs(turn) < 1e-4:
@@ -314,7 +314,7 @@ def propagate(
     pose_means: Float[np.ndarray, "k 3"],
     pose_covariances: Float[np.ndarray, "k 3 3"],
 ) -> None:
-    """Predict mean and covariance in place, through control steps; ``motion``: `MotionNumbers`."""
+    """Predict mean and covariance of the EKF through control steps, in place."""
     pose, P, numbers = mean[:3], covariance[:3, :3].copy(), MotionNumbers(*motion)
     shift_x = shift_y = 0.0  # entries (0, 2) and (1, 2) of the product of the F
     for k in range(controls.shape[0]):
@@ -349,7 +349,7 @@ def relative_covariance(joint: Joint, size: Whole, i: Whole) -> tuple[float, flo
 
 @no_alloc
 def bearing_variance(joint: Joint, size: Whole, i: Whole, c: float, s: float, k: float) -> float:
-    """Return H P H^T, the predicted variance of the bearing of the hypothesis at index i."""
+    """Return the predicted variance of the bearing to the hypothesis at index i."""
     h0, h1, turns = s * k, -c * k, joint.turns  # by pose: (h0, h1, -turns); by point: (-h0, -h1)
     p0, p1, p2 = joint.covariance[0], joint.covariance[1], joint.covariance[2]
     pi, pj = point_rows(joint, size, i)
@@ -368,7 +368,7 @@ def bearing_variance(joint: Joint, size: Whole, i: Whole, c: float, s: float, k:
 def correct_bearing(
     joint: Joint, size: Whole, i: Whole, bearing: float, variance: float, bound: float
 ) -> float:
-    """Update with the bearing of the hypothesis at index i, unless it exceeds the gate.
+    """Update the state by a bearing to the hypothesis at index i, unless it exceeds the gate.
 
     Returns the squared normalised innovation, BEYOND or UNFORESEEN.
     """
@@ -410,7 +410,7 @@ def correct_active(
     bearing_variance: float,
     bound: float,
 ) -> float:
-    """Update with range and bearing, unless they exceed the gate; returns as `correct_bearing`."""
+    """Update the state by range and bearing unless gated; return squared innovation or BEYOND."""
     mean = joint.mean
     near, expected, c, s, k = observe(mean[0], mean[1], mean[2], mean[i], mean[i + 1])
     if near < NEAREST:
@@ -457,7 +457,7 @@ def initialise(
     range_variance: float,
     bearing_variance: float,
 ) -> None:
-    """Write a hypothesis at state index i, at a range and bearing from the pose (Eq. (16))."""
+    """Write a landmark hypothesis at index i, by range and bearing from the pose (Eq. (16))."""
     mean, covariance = joint.mean, joint.covariance
     direction = mean[2] + bearing
     c, s = math.cos(direction), math.sin(direction)
@@ -488,7 +488,7 @@ def drop_members(
     keep: Bool[np.ndarray, " h"],
     source: Int[np.ndarray, " n"],
 ) -> None:
-    """Remove the hypotheses of a landmark that are not kept; ``source`` is workspace."""
+    """Remove a landmark's hypotheses that ``keep`` does not mark from the state, in place."""
     joint, landmark, weight, members = state.joint, state.landmark, state.weight, state.members[0]
     size = 3 + 2 * members
     flush(joint, size)
@@ -511,13 +511,13 @@ def drop_members(
 
 @no_alloc
 def _excess(squared: float, S: float) -> float:
-    """Return the addition to S that limits an innovation to `HUBER_K` standard deviations."""
+    """Return the variance to add to S to limit an innovation to `HUBER_K` standard deviations."""
     return S * max(math.sqrt(squared / S) / HUBER_K - 1.0, 0.0)
 
 
 @no_alloc
 def inflated(state: State, first: Whole, count: Whole, row: Row) -> Row:
-    """Inflate the variances of a landmark's measurement by Huber's rule."""
+    """Return a measurement with variances inflated by Huber's rule, if its innovation is large."""
     joint, mean, size = state.joint, state.joint.mean, 3 + 2 * state.members[0]
     across, least, along = 0.0, math.inf, 0.0
     for j in range(count):

@@ -60,7 +60,7 @@ MAX_RELATIVE_RANGE_STD = 0.1
 
 @no_alloc
 def _bend(dx: float, dy: float, xx: float, xy: float, yy: float) -> float:
-    """Return the variance perpendicular to a segment (dx, dy), divided by its length."""
+    """Return the position variance perpendicular to a segment (dx, dy), divided by its length."""
     square = dx * dx + dy * dy
     across = dy * dy * xx - 2.0 * dx * dy * xy + dx * dx * yy
     return max(across, 0.0) / max(square * math.sqrt(square), NEAREST**3)
@@ -70,7 +70,7 @@ def _bend(dx: float, dy: float, xx: float, xy: float, yy: float) -> float:
 def _expected(
     joint: Joint, size: Whole, i: Whole, ib: Whole, w: Float[np.ndarray, " m"]
 ) -> tuple[float, float]:
-    """Predict an excess path via the point at i from the caller at ib; write P H^T into w."""
+    """Predict an excess path via point i from the caller at ib; return it and its variance."""
     mean = joint.mean
     excess_path, lx, ly, bx, by = excess_path_slopes(
         mean[0], mean[1], mean[i], mean[i + 1], mean[ib], mean[ib + 1]
@@ -118,7 +118,7 @@ def correct_excess_path(
     bound: float,
     robust: bool,
 ) -> Whole:
-    """Update with an excess path via the point at i from the caller at ib; GATED or APPLIED."""
+    """Update the state by an excess path via point i from the caller at ib; GATED or APPLIED."""
     if joint.taken[WAITING] == MAX_WAITING:
         flush(joint, size)
     w = joint.W[joint.taken[WAITING]]
@@ -143,7 +143,7 @@ def correct_excess_path(
 def _leverage(
     joint: Joint, iy: Whole, of_caller: Flag, excess_path: float, direction: float
 ) -> tuple[float, float, float, float, float]:
-    """Return the range of a point by excess path and direction (0 if none), a, k and e_x . u_perp.
+    """Return a point's range by excess path and direction (0 if none), and its derivatives.
 
     The other end is the initialised point at index iy.
     """
@@ -172,7 +172,7 @@ def relative_range_std(
     of_caller: Flag,
     measured: tuple[float, float, float, float],
 ) -> float:
-    """Return the relative standard deviation of a range by excess path and bearing, or infinity.
+    """Return a range's relative standard deviation by excess path and bearing, or infinity.
 
     ``measured`` is excess path, its variance, bearing and its variance. ``of_caller`` selects the
     caller's range, with a landmark at index iy. It is infinite above `MAX_RELATIVE_RANGE_STD`, or
@@ -209,7 +209,7 @@ def place_by_excess_path(
     of_caller: Flag,
     measured: tuple[float, float, float, float],
 ) -> None:
-    """Initialise the hypothesis at index i by excess path, bearing and the point at index iy.
+    """Write a point's position and covariance at index i, by its bearing and excess path.
 
     Arguments as in `relative_range_std`; no columns may be deferred.
     """
@@ -251,7 +251,7 @@ def _single(state: State, label: Whole) -> Whole:
 
 @no_alloc
 def _surest(state: State, row: Row, paths: ExcessPaths, robust: bool) -> Whole:
-    """Return the excess path that gives the most precise range of a measurement's landmark, or -1.
+    """Return the index of the excess path that best gives a landmark's range, or -1.
 
     It is of this landmark with an initialised caller, or via an initialised landmark if this
     landmark is the caller. ``robust``: precise even with the bearing std multiplied by
@@ -279,7 +279,7 @@ def _surest(state: State, row: Row, paths: ExcessPaths, robust: bool) -> Whole:
 def placed_by_excess_path(
     state: State, row: Row, paths: ExcessPaths, robust: bool, scratch: Scratch
 ) -> bool:
-    """Initialise a new landmark, a ray or a stored bearing by bearing and excess path, if possible.
+    """Initialise a landmark by bearing and excess path, if precise; return whether it was.
 
     Returns whether it was possible.
     """
@@ -310,7 +310,7 @@ def placed_by_excess_path(
 def correct_by_excess_path(
     state: State, paths: ExcessPaths, d: Whole, params: UpdateParams, scratch: Scratch
 ) -> Whole:
-    """Update landmark, caller and vehicle by excess path d; GATED or APPLIED.
+    """Update landmark, caller and vehicle by the excess path at index d; GATED or APPLIED.
 
     If the other end is a ray, its hypotheses are weighed and pruned.
     """
