@@ -20,7 +20,7 @@ MAX_CALLER_STD = 2.0
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Gaussian:
-    """A mean and its covariance; leading axes, if any, count instances."""
+    """A normal distribution, or an array of them: mean and covariance."""
 
     mean: Float[np.ndarray, "*n d"]
     """Mean, (*n, d)."""
@@ -33,7 +33,7 @@ class Gaussian:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Landmarks:
-    """The map: one row per hypothesis; a landmark with a single row is fully initialised."""
+    """A map: a row per Gaussian hypothesis; a landmark with a single row is fully initialised."""
 
     landmark: Int[np.ndarray, " h"]
     """Label of each row's landmark."""
@@ -60,14 +60,14 @@ def no_landmarks() -> Landmarks:
 
 
 def some_of(landmarks: Landmarks, rows: Bool[np.ndarray, " h"]) -> Landmarks:
-    """Select rows of a map by a mask."""
+    """Return the rows of a map that a mask selects."""
     return Landmarks(
         **{part.name: getattr(landmarks, part.name)[rows] for part in fields(Landmarks)}
     )
 
 
 def joined(some: Landmarks, others: Landmarks) -> Landmarks:
-    """Concatenate the rows of two maps."""
+    """Return a map with the rows of two maps."""
     names = [part.name for part in fields(Landmarks)]
     return Landmarks(
         **{name: np.concatenate((getattr(some, name), getattr(others, name))) for name in names}
@@ -75,7 +75,7 @@ def joined(some: Landmarks, others: Landmarks) -> Landmarks:
 
 
 def placed(landmarks: Landmarks) -> Bool[np.ndarray, " h"]:
-    """Return which rows of a map are fully initialised landmarks.
+    """Return a mask of the rows of a map that are fully initialised landmarks.
 
     A landmark of several rows is partially initialised (Bradley & Abaid, Sec. V-A).
 
@@ -102,7 +102,7 @@ def in_sight(moving: Landmarks) -> Landmarks:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class JointGaussian:
-    """Joint Gaussian of pose and n initialised landmarks; the covariance is of the linear error."""
+    """Joint Gaussian of pose and n initialised landmarks, for errors in x, y and heading."""
 
     landmark: Int[np.ndarray, " n"]
     """Labels of the landmarks."""
@@ -112,7 +112,7 @@ class JointGaussian:
 
 
 class Innovations(NamedTuple):
-    """Sums over the used measurements of initialised landmarks."""
+    """Sum of squared normalised innovations, and its degrees of freedom."""
 
     squared: float = 0.0
     """Squared innovations, each divided by its expected variance."""
@@ -120,7 +120,7 @@ class Innovations(NamedTuple):
     """Degrees of freedom: two for range and bearing, else one per measurement."""
 
     def plus(self, squared: float, degrees: float) -> "Innovations":
-        """Return the sums with others added."""
+        """Return the sums with a further squared innovation and its degrees of freedom added."""
         return Innovations(self.squared + squared, self.degrees + degrees)
 
 
@@ -129,7 +129,7 @@ NO_INNOVATIONS = Innovations()
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Track:
-    """Estimated trajectory and map: one pose at the start and one after each control step."""
+    """An estimated trajectory, with a pose at the start and after each control step, and map."""
 
     time: Float[np.ndarray, " k"]
     """Times, (k) [s]."""
@@ -158,7 +158,7 @@ class Track:
 
 
 def at_steps(track: Track, steps: Int[np.ndarray, " k"]) -> Track:
-    """Select steps of a track."""
+    """Return a track with the trajectories at selected steps only."""
     if steps.size == track.time.size:
         return track
 
@@ -189,30 +189,30 @@ class Belief(ABC):
 
     @abstractmethod
     def pose(self) -> Gaussian:
-        """Return the vehicle's pose, (3) and (3, 3)."""
+        """Return the vehicle's pose: mean [m, m, rad] and 3 x 3 covariance."""
 
     @abstractmethod
     def landmarks(self) -> Landmarks:
-        """Return the map."""
+        """Return the map of landmarks, a row per Gaussian hypothesis."""
 
     def moving(self) -> Landmarks:
-        """Return the moving callers."""
+        """Return the estimated positions of moving callers; an empty map by default."""
         return no_landmarks()
 
     def path(self) -> Gaussian | None:
-        """Return a smoother's trajectory, (k + 1, 3) and (k + 1, 3, 3)."""
+        """Return a smoother's trajectory, the start and k steps; None for other estimators."""
         return None
 
     def tracks(self) -> Mapping[int, Gaussian] | None:
-        """Return a smoother's past positions of callers by label; (k + 1, 2), NaN if unknown."""
+        """Return a smoother's past positions of callers by label, NaN if unknown; else None."""
         return None
 
     def calibration(self) -> Mapping[str, tuple[float, float]]:
-        """Return value and standard deviation of calibration parameters, by name."""
+        """Return each calibration parameter's value and standard deviation, by name."""
         return {}
 
     def cloud(self) -> Float[np.ndarray, "p 3"] | None:
-        """Return the poses of particles [m, m, rad]."""
+        """Return the poses of all particles [m, m, rad], or None without particles."""
         return None
 
     def joint(self) -> JointGaussian:
@@ -220,11 +220,11 @@ class Belief(ABC):
         raise InputError(f"association: found a {type(self).__name__}, expected one with joint()")
 
     def labels(self) -> Sequence[int] | None:
-        """Return the labels of all landmarks and callers, for data association."""
+        """Return the labels of all landmarks and callers, or None if not supported."""
         return None
 
     def edited(self, remove: Sequence[int], merge: Sequence[tuple[int, int]]) -> Self:
-        """Return the belief without some labels, and with the second of each pair merged."""
+        """Return the belief without some landmarks, and with pairs of duplicates merged."""
         raise InputError(
             f"association: found landmarks to remove or to merge, but a {type(self).__name__} "
             "cannot; expected a belief with edited(remove, merge) and labels(), as the EKFs' have"
@@ -232,12 +232,12 @@ class Belief(ABC):
 
 
 def revises_path(belief: Belief) -> bool:
-    """Return whether a belief has a smoothed trajectory (`Belief.path`)."""
+    """Return whether a belief's class provides a smoothed trajectory (`Belief.path`)."""
     return getattr(type(belief), "path", Belief.path) is not Belief.path
 
 
 class Completed:
-    """An object of an outside class, with the defaults of a base class."""
+    """Wrapper of an external object that takes missing methods from a base class."""
 
     def __init__(self, part: Any, base: type) -> None:
         self.part, self.base = part, base
@@ -250,7 +250,7 @@ class Completed:
 
 
 def completed(part: Any, base: type[T]) -> T:
-    """Return an object with the defaults of a base class for methods that its class lacks."""
+    """Wrap an object so that methods that its class lacks come from a base class."""
     return part if isinstance(part, base) else cast(T, Completed(part, base))
 
 
@@ -271,7 +271,7 @@ class Estimator(Protocol[B]):
     """A SLAM estimator: an immutable record of settings, with beliefs passed in and out."""
 
     def init(self, pose: Gaussian) -> B:
-        """Return the initial belief at a pose, (3) and (3, 3), without landmarks."""
+        """Return the initial belief at a start pose with its covariance, without landmarks."""
         ...
 
     def predict(
@@ -285,5 +285,5 @@ class Estimator(Protocol[B]):
         ...
 
     def update(self, belief: B, scan: Scan, rng: np.random.Generator) -> B:
-        """Update a belief with a frame's measurements."""
+        """Update a belief with the measurements of a scan, and return it."""
         ...

@@ -19,7 +19,7 @@ from pipistrelle.refusals import meant
 
 
 class Role(NamedTuple):
-    """Kind of an external class: its name in error messages, and its methods."""
+    """Kind of a user's class, such as an estimator: its name in messages, and required methods."""
 
     key: str
     """Option or setting that names the class, the prefix of error messages."""
@@ -81,7 +81,7 @@ def class_of(role: Role, name: str) -> type:
 
 
 def build(role: Role, name: str, kind: Any, given: tuple[Any, ...], values: dict[str, Any]) -> Any:
-    """Build an object of an external class; raise InputError if that fails.
+    """Build an object of a user's class; raise InputError if that fails.
 
     `given`: arguments of its ``from_config``, if any; `values`: for a dataclass, by field.
     """
@@ -94,7 +94,7 @@ def build(role: Role, name: str, kind: Any, given: tuple[Any, ...], values: dict
 
 
 def _arguments(role: Role, kind: Any, values: dict[str, Any]) -> dict[str, Any]:
-    """Select the values for the fields of a dataclass."""
+    """Return the values of a dataclass' fields; raise InputError if a required value is missing."""
     if not is_dataclass(kind):
         raise InputError(f"it is no dataclass; make it one, or write {role.from_config}")
     asked = [field for field in fields(kind) if field.init]
@@ -108,7 +108,7 @@ def _arguments(role: Role, kind: Any, values: dict[str, Any]) -> dict[str, Any]:
 
 
 def worded(error: BaseException) -> str:
-    r"""Format an error of an external class: its type, and the first line of its message.
+    r"""Format an error of a user's class: its type, and the first line of its message.
 
     >>> worded(ArithmeticError("\nno solution\nsee the manual"))
     'ArithmeticError: no solution'
@@ -135,7 +135,7 @@ GATE = 0.999
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Entry:
-    """Properties of an estimator for the rest of the package."""
+    """Properties of an estimator: names, builder, settings, limits and features."""
 
     name: str
     """Name in settings, tables and files."""
@@ -163,7 +163,7 @@ class Entry:
 
 
 def gate_of(name: str, config: Config) -> float:
-    """Return an estimator's gate by ``filter.gate``: accepted share of predicted distributions.
+    """Return an estimator's gate from the settings, as a share of the predicted distribution.
 
     >>> from pipistrelle.config import FilterConfig
     >>> gate_of("ekf", Config()), gate_of("ekf", Config(filter=FilterConfig(gate="auto")))
@@ -179,7 +179,7 @@ def gate_of(name: str, config: Config) -> float:
 
 
 def entry(name: str) -> Entry:
-    """Look up an estimator by its name here, or as an external class ``module:Class``.
+    """Return an estimator's properties by its name in the catalogue or as ``module:Class``.
 
     The module is installed or in the current folder, which has priority. The class is an
     `Estimator`. Its classmethod ``from_config(config, motion)`` builds it, or it is a dataclass
@@ -245,7 +245,7 @@ def check_name(name: str, *groups: str, where: str = "filter") -> str:
 
 
 def short_name(name: str) -> str:
-    """Return an estimator's name for files: for an external estimator, the class.
+    """Return an estimator's name for files: for ``module:Class`` only the class.
 
     >>> short_name("ekf"), short_name("mine.filters:DeadReckoning")
     ('ekf', 'DeadReckoning')
@@ -254,7 +254,7 @@ def short_name(name: str) -> str:
 
 
 def title_of(name: str) -> str:
-    """Return an estimator's title for readers, without importing it.
+    """Return an estimator's title for readers, without importing an external module.
 
     External estimators have the name of their class until they are imported (`entry`).
 
@@ -269,7 +269,7 @@ def title_of(name: str) -> str:
 
 
 def check_distinct(names: Iterable[str], where: str = "filter") -> None:
-    """Raise InputError if estimators share a file name; ``where``: their origin, for the message.
+    """Raise InputError if two estimators would write the same files; ``where``: name's origin.
 
     >>> check_distinct(["ekf", "a:Own", "b:Own"])
     Traceback (most recent call last):
@@ -287,7 +287,7 @@ Options = Callable[[Config, "Motion"], dict[str, Any]]
 
 
 def _builder(name: str, where: str, options: Options) -> "Callable[[Config, Motion], Estimator]":
-    """Return a function that builds an estimator, given as ``module:Class`` within `estimation`."""
+    """Return a function that builds an estimator from settings, importing its class when called."""
 
     def build(config: Config, motion: "Motion") -> "Estimator":
         module, _, kind = where.partition(":")
@@ -299,7 +299,7 @@ def _builder(name: str, where: str, options: Options) -> "Callable[[Config, Moti
 
 
 def _ekf_options(config: Config, _: "Motion") -> dict[str, Any]:
-    """Return the arguments common to the EKFs and the smoother."""
+    """Return the keyword arguments common to EKFs and smoother, from the settings."""
     settings = config.filter
     return {
         "robust": settings.robust == "huber",
@@ -309,7 +309,7 @@ def _ekf_options(config: Config, _: "Motion") -> dict[str, Any]:
 
 
 def _smoother_options(config: Config, motion: "Motion") -> dict[str, Any]:
-    """Return the arguments of the smoother."""
+    """Return the smoother's keyword arguments from the settings and the motion model."""
     from pipistrelle.estimation.smoother.preintegration import calibration_of
 
     own = {
@@ -320,7 +320,7 @@ def _smoother_options(config: Config, motion: "Motion") -> dict[str, Any]:
 
 
 def _smoother_bytes(landmarks: int, _: int, config: Config) -> float:
-    """Estimate the smoother's memory [bytes]: three separator rows per pose, and measurements."""
+    """Estimate the smoother's memory [bytes] from the numbers of landmarks and poses."""
     poses = config.scenario.steps / config.scenario.steps_per_frame
     each = 2.0 * COPIES * 3 * (1 + 2 * landmarks) + 12 * landmarks
     return DOUBLE * (poses * each + COPIES * (1 + 2 * landmarks) ** 2)
@@ -332,7 +332,7 @@ def _ekf_bytes(landmarks: int, members: int, _: Config) -> float:
 
 
 def _fastslam_bytes(landmarks: int, members: int, config: Config) -> float:
-    """Estimate the memory [bytes] of three sets of particles: before, updated and resampled."""
+    """Estimate FastSLAM's memory [bytes]: particles before and after an update, and resampled."""
     slopes = 4 if config.listening.timing else 0
     each = 6 * landmarks * members + landmarks + slopes * landmarks
     return COPIES * DOUBLE * config.fastslam.particles * each

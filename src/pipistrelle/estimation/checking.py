@@ -92,7 +92,7 @@ def check_gate(gate: Any) -> None:
 
 
 def check_belief(belief: Any, kind: type) -> None:
-    """Raise InputError unless a belief belongs to this estimator."""
+    """Raise InputError unless a belief is of an estimator's belief class."""
     if not isinstance(belief, kind):
         raise InputError(
             f"belief: found {shown(belief)}, expected one of this filter, {kind.__name__}; init "
@@ -101,7 +101,7 @@ def check_belief(belief: Any, kind: type) -> None:
 
 
 def usable_pose(pose: Gaussian) -> Gaussian:
-    """Return a copy of an initial pose, (3) and (3, 3); raise InputError if it is invalid."""
+    """Return a copy of a start pose with covariance; raise InputError if it is invalid."""
     if not isinstance(pose, Gaussian):
         raise InputError(
             f"init: found {shown(pose)}, expected a Gaussian of a pose, (3), and its covariance, "
@@ -125,7 +125,7 @@ def usable_pose(pose: Gaussian) -> Gaussian:
 
 
 def usable_known(known: Landmarks) -> Landmarks:
-    """Return known landmarks with valid arrays; raise InputError if they are invalid."""
+    """Return known landmarks with arrays of valid type; raise InputError if they are invalid."""
     if not isinstance(known, Landmarks):
         raise InputError(
             f"knowing: found {shown(known)}, expected Landmarks; they are in "
@@ -220,7 +220,7 @@ def usable_scan(scan: Scan) -> Scan:
 
 
 def _is_laid_out(scan: Scan) -> bool:
-    """Return whether a scan's columns are arrays as kernels require them."""
+    """Return whether a scan's columns have the types, shapes and layout for compiled functions."""
     # Written out, as it is done twice for each scan.
     landmark, caller, numbers = scan.landmark, scan.caller, scan.numbers
     callers, moving = scan.callers, scan.moving
@@ -239,12 +239,12 @@ def _is_laid_out(scan: Scan) -> bool:
 
 
 def _is_plain(values: Any, kind: np.dtype = FLOAT) -> bool:
-    """Return whether values are an array as kernels require it."""
+    """Return whether values are a contiguous array of the given type, for compiled functions."""
     return type(values) is np.ndarray and values.dtype == kind and values.flags.carray
 
 
 def _converted(values: Any, kind: np.dtype) -> np.ndarray | None:
-    """Convert values to an array for kernels; None if their type does not permit it."""
+    """Convert values to a contiguous array of a type; None if their type does not permit it."""
     try:
         given = np.asarray(values)
     except (TypeError, ValueError):  # rows of unequal lengths
@@ -255,7 +255,7 @@ def _converted(values: Any, kind: np.dtype) -> np.ndarray | None:
 
 
 def _shape_of(values: Any) -> str:
-    """Describe type and shape of a value that is not a valid array."""
+    """Describe the type and shape of a value for an error message."""
     try:
         given = np.asarray(values)
     except (TypeError, ValueError):
@@ -264,7 +264,7 @@ def _shape_of(values: Any) -> str:
 
 
 def _worded(scan: Scan, fault: int) -> str:
-    """Format a scan's fault, with the affected landmarks."""
+    """Format an error message for the code of a scan's fault, with the affected landmarks."""
     if fault == NO_CALLERS:
         return (
             f"the callers' labels {scan.callers.tolist()} and {scan.moving.tolist()} for who "
@@ -283,7 +283,7 @@ def _fault(
     callers: Int[np.ndarray, " c"],
     moving: Int[np.ndarray, " v"],
 ) -> int:
-    """Return the code of the first fault in a scan; 0 if it is valid."""
+    """Return the code of the first fault found in a scan's arrays; 0 if they are valid."""
     for m in range(landmark.size):
         fault = _fault_of_row(landmark, caller, numbers, m)
         if fault:
@@ -304,7 +304,7 @@ def _fault_of_row(
     numbers: Float[np.ndarray, "8 m"],
     m: Whole,
 ) -> int:
-    """Return the code of a measurement's fault, or 0."""
+    """Return the code of the fault of measurement m in a scan, or 0 if it is valid."""
     if landmark[m] < UNLABELLED or landmark[m] >= LABELS_END:
         return NO_LABEL
     if caller[m] < 0:
@@ -350,7 +350,7 @@ def _are_steps(steps: Controls, times: Durations, most: tuple[float, ...], poses
 
 @kernel
 def is_covariance(entries: Float[np.ndarray, "6"]) -> Flag:
-    """Return whether xx, xy, xh, yy, yh and hh form a covariance, up to rounding."""
+    """Return whether six entries (xx, xy, xh, yy, yh, hh) form a covariance, up to rounding."""
     xx, yy, hh = entries[0], entries[3], entries[5]
     if not (0.0 <= xx <= LARGEST**2 and 0.0 <= yy <= LARGEST**2 and 0.0 <= hh <= LARGEST**2):
         return False
@@ -364,7 +364,7 @@ def is_covariance(entries: Float[np.ndarray, "6"]) -> Flag:
 
 @kernel
 def _correlation(covariance: float, one: float, other: float) -> float:
-    """Return the correlation of two numbers; infinite for a covariance without variance."""
+    """Return a correlation from a covariance and two variances; infinite if a variance is 0."""
     if covariance == 0.0:
         return 0.0
     return covariance / math.sqrt(one * other)

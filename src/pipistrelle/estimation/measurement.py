@@ -35,7 +35,7 @@ HUBER_K = 2.0
 
 
 class Row(NamedTuple):
-    """A bearing and a range of a scan as scalars."""
+    """A measured bearing and range with their variances, as scalars."""
 
     landmark: Whole
     bearing: float  # [rad]
@@ -45,7 +45,7 @@ class Row(NamedTuple):
 
 
 class ExcessPaths(NamedTuple):
-    """Excess paths of a scan from callers with known labels."""
+    """Measured excess paths of a scan, with landmark, caller and variance of each."""
 
     landmark: Int[np.ndarray, " d"]  # never the caller
     caller: Int[np.ndarray, " d"]
@@ -62,12 +62,12 @@ Timings = tuple[Int[np.ndarray, " m"], Int[np.ndarray, " callers"], Int[np.ndarr
 
 
 def columns_of(scan: Scan) -> Columns:
-    """Return a scan as a tuple for kernels, faster to pass than a record."""
+    """Return a scan's labels and numbers as a tuple of arrays, for compiled functions."""
     return scan.landmark, np.ascontiguousarray(scan.numbers)
 
 
 def timings_of(scan: Scan) -> Timings | None:
-    """Return the caller columns of a scan for kernels, or None if it names no caller.
+    """Return a scan's callers as arrays for compiled functions, or None if it names no caller.
 
     For None, kernels are compiled without code for excess paths.
     """
@@ -78,7 +78,7 @@ def timings_of(scan: Scan) -> Timings | None:
 
 @no_alloc
 def rows_with_bearing(columns: Columns) -> Whole:
-    """Count the measurements with a bearing; others, with only an excess path, come last."""
+    """Count a scan's measurements with a bearing; others, with only an excess path, come last."""
     rows, bearing = columns[0].size, columns[1][BEARING]
     while rows > 0 and math.isnan(bearing[rows - 1]):
         rows -= 1
@@ -87,7 +87,7 @@ def rows_with_bearing(columns: Columns) -> Whole:
 
 @no_alloc
 def row_of(columns: Columns, m: Whole) -> Row:
-    """Return measurement m as scalars."""
+    """Return bearing and range of measurement m in a scan, with variances, as scalars."""
     landmark, numbers = columns
     across, along = numbers[BEARING_STD, m], numbers[RANGE_STD, m]
     return Row(landmark[m], numbers[BEARING, m], numbers[RANGE, m], across * across, along * along)
@@ -95,7 +95,7 @@ def row_of(columns: Columns, m: Whole) -> Row:
 
 @kernel
 def excess_paths(columns: Columns, timings: Timings) -> ExcessPaths:
-    """Return the excess paths of a scan, without the callers' direct calls.
+    """Return the excess paths in a scan, without the callers' direct calls.
 
     >>> from dataclasses import replace
     >>> from pipistrelle.detection.scans import make_scan
@@ -121,7 +121,7 @@ def excess_paths(columns: Columns, timings: Timings) -> ExcessPaths:
 
 
 def caller_labels(scan: Scan) -> Int[np.ndarray, " m"]:
-    """Return the label of the caller of each row's excess path; UNLABELLED without one."""
+    """Return the caller's label for each measurement with an excess path, else UNLABELLED."""
     labels, timings = np.full(scan.landmark.size, UNLABELLED), timings_of(scan)
     if timings is not None:
         found = excess_paths(columns_of(scan), timings)
@@ -133,7 +133,7 @@ def caller_labels(scan: Scan) -> Int[np.ndarray, " m"]:
 def observe(
     x: float, y: float, heading: float, px: float, py: float
 ) -> tuple[float, float, float, float, float]:
-    """Return range, bearing, direction cosines and inverse range of a point, for kernels.
+    """Return range, bearing, direction cosines and inverse range of a point from a pose.
 
     Returns range [m], bearing [rad], cos c and sin s of the direction in the world, and k, the
     inverse of the range, bounded by `NEAREST`. The Jacobians follow: d range = (-c, -s, 0; c, s)
@@ -175,7 +175,7 @@ def measurement_jacobians(
 def excess_path_slopes(
     x: float, y: float, px: float, py: float, bx: float, by: float
 ) -> tuple[float, float, float, float, float]:
-    """Return the excess path via a point and its derivatives, for kernels.
+    """Return the excess path via a point, and its derivatives by point and caller.
 
     The vehicle is at (x, y), the point at (px, py) and the caller at (bx, by). Returns the excess
     path [m], its derivatives by the point (2) and by the caller (2); the derivatives by the vehicle
@@ -189,7 +189,7 @@ def excess_path_slopes(
 
 @kernel
 def _away(x: float, y: float, px: float, py: float) -> tuple[float, float, float]:
-    """Return the direction cosines and distance from (x, y) to (px, py)."""
+    """Return the unit vector and the distance from (x, y) to (px, py)."""
     dx, dy = px - x, py - y
     distance = math.sqrt(dx * dx + dy * dy)
     inverse = 1.0 / max(distance, NEAREST)
@@ -200,7 +200,7 @@ def _away(x: float, y: float, px: float, py: float) -> tuple[float, float, float
 def range_by_excess_path(
     path: float, dx: float, dy: float, c: float, s: float, of_caller: Flag
 ) -> float:
-    """Return the range of a point in direction (c, s), for a caller at (dx, dy) from the vehicle.
+    """Return a point's range [m] in direction (c, s) from its excess path and a caller's position.
 
     ``of_caller`` selects the range of a caller, for a point at (dx, dy). It is infinite or negative
     if nothing in this direction has the excess path (`landmark_range`).

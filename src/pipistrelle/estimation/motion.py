@@ -42,7 +42,7 @@ Durations = Float[np.ndarray, " k"]
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Motion:
-    """A motion model and the noise of its controls."""
+    """A motion model (bicycle, unicycle, poses or car) and the noise of its controls."""
 
     model: Literal["bicycle", "unicycle", "poses", "ackermann"]
     """Motion model by name. Controls are speed [m/s] and steering angle [rad] for a bicycle (pose:
@@ -60,7 +60,7 @@ class Motion:
     """Whether a step without motion is noisy, not exact."""
 
     def __post_init__(self) -> None:
-        """Raise InputError for an unknown model or noise of the wrong size."""
+        """Raise InputError for an unknown model, a bad wheelbase or noise of the wrong size."""
         if self.model not in MOTION_MODELS:
             known = ", ".join(MOTION_MODELS)
             raise InputError(f"motion: found the model {self.model!r}, expected one of {known}")
@@ -83,7 +83,7 @@ class Motion:
 
 
 class MotionNumbers(NamedTuple):
-    """A motion model for kernels; variances of one control step."""
+    """A motion model as plain numbers for compiled functions, with variances of a control step."""
 
     model: int
     wheelbase: float
@@ -96,7 +96,7 @@ class MotionNumbers(NamedTuple):
 
 @lru_cache(maxsize=16)
 def motion_numbers(motion: Motion) -> MotionNumbers:
-    """Convert a motion model to numbers for kernels."""
+    """Convert a motion model to plain numbers for compiled functions."""
     return MotionNumbers(
         model=MOTION_MODELS.index(motion.model),
         wheelbase=float(motion.wheelbase),
@@ -112,7 +112,7 @@ def motion_numbers(motion: Motion) -> MotionNumbers:
 def motion_increment(
     motion: MotionNumbers, heading: float, control: Float[np.ndarray, " c"], dt: float
 ) -> tuple[float, float, float, float, float, float, float, float, float]:
-    """Return the motion of a noise-free control step and its Jacobian, for kernels.
+    """Return a vehicle's motion in a noise-free control step, and its derivatives by the control.
 
     Returns dx, dy, dheading, then the Jacobian U by speed (x, y, heading) and by turn (x, y,
     heading). The derivatives of x and y by heading are -dy and dx. For poses, the column by the
@@ -145,7 +145,7 @@ def motion_increment(
 def _arc(
     heading: float, speed: float, turn: float, dt: float
 ) -> tuple[float, float, float, float, float, float, float, float, float]:
-    """Return the motion along the arc of a speed and an angular rate, as `motion_increment`."""
+    """Return the motion along a circular arc at a speed and turn rate, and its derivatives."""
     half = 0.5 * turn * dt
     if abs(half) < 1e-4:
         sinc, slope = 1.0 - half * half / 6.0, -half / 3.0
@@ -167,7 +167,7 @@ def _arc(
 def _car_increment(
     motion: MotionNumbers, heading: float, control: Float[np.ndarray, " c"], dt: float
 ) -> tuple[float, float, float, float, float, float, float, float, float]:
-    """Return the motion of a car (Ackermann steering), as `motion_increment`."""
+    """Return a car's motion (Ackermann steering) in a control step, and its derivatives."""
     bend = math.tan(control[1]) / motion.wheelbase
     share = 1.0 / (1.0 - motion.speed_offset * bend)
     speed = control[0] * share
@@ -187,7 +187,7 @@ def _car_increment(
 def relative_noise(
     control: Float[np.ndarray, " c"], motion: MotionNumbers
 ) -> tuple[float, float, float, float, float, float]:
-    """Return the covariance of a motion, xx, xy, xh, yy, yh, hh, in the axes of the pose before."""
+    """Return the covariance of a step's motion in the vehicle's axes: xx, xy, xh, yy, yh, hh."""
     moves = control[0] != 0.0 or control[1] != 0.0 or control[2] != 0.0
     if not (motion.noise_at_rest or moves):
         return 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
@@ -266,7 +266,7 @@ def motion_step(motion: Motion, pose: Pose, control: Float[np.ndarray, " c"], dt
 def relative_motions(
     motion: Motion, controls: Controls, dt: Durations
 ) -> tuple[Float[np.ndarray, "k 3"], Float[np.ndarray, "k 3 3"]]:
-    """Return the motion of each control step in the vehicle's previous axes, and its covariance.
+    """Return each control step's motion relative to the previous pose, and its covariance.
 
     ``controls`` (k, c) as in `Motion.model`, ``dt`` (k) [s]; returns (k, 3) [m, m, rad] and (k, 3,
     3).
@@ -284,7 +284,7 @@ def relative_motions(
 def _relative_motions(
     controls: Controls, dt: Durations, motion: MotionNumbers
 ) -> tuple[Float[np.ndarray, "k 3"], Float[np.ndarray, "k 3 3"]]:
-    """Predict a pose at the origin through each control step separately."""
+    """Return each control step's motion and covariance, relative to the pose before the step."""
     ways, covariances = np.zeros((dt.size, 3)), np.zeros((dt.size, 3, 3))
     for k in range(dt.size):
         propagate_pose(ways[k], covariances[k], controls[k], dt[k], motion)
@@ -294,7 +294,7 @@ def _relative_motions(
 def controls_between(
     path: Float[np.ndarray, "t 3"], dt: float | Float[np.ndarray, " t-1"], motion: Motion
 ) -> Float[np.ndarray, "t-1 2"]:
-    r"""Return the controls from each pose to the next, as exactly as the motion model permits.
+    r"""Return the controls that lead from each pose to the next, as far as the model permits.
 
     A unicycle's arc has the turn of the heading, and a bicycle's front wheel the steering angle
     :math:`\sin\gamma = B \Delta\theta / (V \Delta_t)`; the speed is along the arc's chord or the
@@ -320,7 +320,7 @@ def controls_between(
 def motion_jacobians(
     motion: Motion, pose: Pose, control: Float[np.ndarray, " c"], dt: float
 ) -> tuple[PoseCovariance, Float[np.ndarray, "3 n"]]:
-    """Return the derivatives of `motion_step` by the pose, F, and by the noisy control, U.
+    """Return the derivatives of a control step's pose by the pose before, F, and by control, U.
 
     Arguments as in `motion_step`; F is (3, 3) and U (3, 2), for poses (3, 3). Source: Bradley &
     Abaid, with Eq. (10).
@@ -340,7 +340,7 @@ def motion_jacobians(
 
 
 def motion_noise(motion: Motion, control: Float[np.ndarray, " c"]) -> Float[np.ndarray, "n n"]:
-    """Return the covariance Q of a control step's noise, (2, 2), for poses (3, 3).
+    """Return the covariance of a control step's noise: 2 x 2, or 3 x 3 for the model of poses.
 
     ``control`` (c) may contain the covariance of a relative pose. Q is zero at rest if that is
     exact. Source: Bradley & Abaid, with Eq. (10).
@@ -359,7 +359,7 @@ def motion_noise(motion: Motion, control: Float[np.ndarray, " c"]) -> Float[np.n
 def _increment(
     motion: Motion, pose: Pose, control: Float[np.ndarray, " c"], dt: float
 ) -> tuple[float, ...]:
-    """Call `motion_increment` with arrays."""
+    """Return motion and derivatives of a control step by `motion_increment`, from a `Motion`."""
     numbers = motion_numbers(motion)
     control = np.asarray(control, dtype=float)
     return motion_increment(numbers, pose[2], control, dt)

@@ -98,7 +98,7 @@ _SHARING = {
 
 
 def ray_members(rays: RayConfig) -> tuple[Float[np.ndarray, " h"], Float[np.ndarray, " h"]]:
-    """Return the ranges of a new ray's hypotheses and their standard deviations, (h) each [m].
+    """Return the ranges [m] of a new bearing-only landmark's hypotheses, and their stds.
 
     Ranges s_j rise; sigma_j = alpha s_j. Source: Bradley & Abaid, Eq. (17), with sigma_j corrected
     (see the module docstring).
@@ -116,7 +116,7 @@ def ray_members(rays: RayConfig) -> tuple[Float[np.ndarray, " h"], Float[np.ndar
 
 
 class UpdateParams(NamedTuple):
-    """Parameters of gates and rays for kernels."""
+    """Parameters of gates and of bearing-only landmarks, for compiled functions."""
 
     passive_bound: float  # largest squared Mahalanobis distance of a bearing
     active_bound: float  # largest squared Mahalanobis distance of range and bearing
@@ -135,7 +135,7 @@ class UpdateParams(NamedTuple):
 
 @lru_cache(maxsize=16)
 def gate_bounds(gate: float) -> tuple[float, float]:
-    """Return the chi-square quantiles of one and two degrees of freedom; infinite for a gate of 1.
+    """Return the chi-square gates for one and two degrees of freedom; infinite for a gate of 1.
 
     >>> [round(bound, 2) for bound in gate_bounds(0.999)]
     [10.83, 13.82]
@@ -149,7 +149,7 @@ def gate_bounds(gate: float) -> tuple[float, float]:
 def update_params(
     rays: RayConfig, gate: float, *, robust: bool = False, exact: bool = False
 ) -> UpdateParams:
-    """Return the parameters of gates and rays for kernels; ``exact``: Gaussian mixture."""
+    """Return parameters of gates and bearing-only landmarks; ``exact``: full mixture update."""
     passive_bound, active_bound = gate_bounds(gate)
     ray_ranges, ray_stds = ray_members(rays)
     ray_ranges.setflags(write=False)  # shared by all estimators with the same settings
@@ -171,7 +171,7 @@ def update_params(
 
 @kernel
 def log_likelihood(innovation: float, variance: float, printed: bool) -> float:
-    """Return log N(innovation; 0, variance) without constant, or of Eq. (19) as printed."""
+    """Return a normal log density without constant, or with Eq. (19) as literally printed."""
     squared = innovation * innovation / variance
     if printed:
         return -0.5 * squared / math.sqrt(2.0 * math.pi * variance)
@@ -180,7 +180,7 @@ def log_likelihood(innovation: float, variance: float, printed: bool) -> float:
 
 @no_alloc
 def heaviest_member(weights: Float[np.ndarray, " h"], count: Whole) -> Whole:
-    """Return the index of the largest weight, the first of equals."""
+    """Return the index of the largest of the first ``count`` weights, the first of equals."""
     best = 0
     for j in range(1, count):
         if weights[j] > weights[best]:
@@ -197,7 +197,7 @@ def weigh_and_share(
     aggregated: bool,
     share: Float[np.ndarray, " m"],
 ) -> float:
-    """Multiply the hypotheses' weights by their likelihoods and compute their shares.
+    """Multiply hypotheses' weights by likelihoods, and write each hypothesis' share of an update.
 
     ``weights`` (Lambda) and ``share`` (rho) are written; hypotheses with a share of zero are not
     updated. Returns the log of the ray's likelihood, the sum of Lambda lambda, without constant.
@@ -245,7 +245,7 @@ def weigh_and_share(
 def survivors(
     weights: Float[np.ndarray, " h"], count: Whole, prune: float, keep: Bool[np.ndarray, " m"]
 ) -> Whole:
-    """Mark the hypotheses that survive pruning, renormalise their weights and return their number.
+    """Mark hypotheses to keep after pruning, renormalise their weights and return their number.
 
     Pruned are weights under prune / count, but not the heaviest. Bradley & Abaid, Eq. (21).
     """

@@ -64,7 +64,7 @@ SINGULAR = 1e-12
 
 @dataclass(frozen=True, kw_only=True)
 class Recoverable(Belief):
-    """A belief that supports recovery from odometry failures."""
+    """A belief that allows recovery after an odometry failure, such as a skid."""
 
     doubt: float = 0.0
     """Cumulative gain of discarding the odometry in the last scans."""
@@ -75,7 +75,7 @@ class Recoverable(Belief):
 
     @abstractmethod
     def freed(self, pose: Pose, stds: Pose) -> Self:
-        """Move the vehicle to a pose, with an independent error added."""
+        """Return the belief with the vehicle moved to a pose, and an independent error added."""
 
 
 B = TypeVar("B", bound=Recoverable)
@@ -85,7 +85,7 @@ Fit = tuple[Pose, float, Bool[np.ndarray, "2 m"]]
 
 @cache
 def odometry_bound(gate: float) -> float:
-    """Return the cost of an odometry outlier: the chi-square quantile of three degrees of freedom.
+    """Return the gain above which odometry counts as failed: a chi-square quantile.
 
     >>> round(odometry_bound(0.999), 2)
     16.27
@@ -98,7 +98,7 @@ def odometry_bound(gate: float) -> float:
 def recovering(
     correct: Callable[[B, Scan], B], belief: B, scan: Scan, gate: float, reach: float
 ) -> B:
-    """Update a belief with a scan, discarding the previous odometry if it failed (`recovered`)."""
+    """Update a belief by a scan; discard the odometry before it if the scan refutes it."""
     after: Any = correct(belief, scan)
     if gate >= 1.0 or (after.gated == belief.gated and after.doubt == 0.0):
         return after
@@ -110,7 +110,7 @@ def recovering(
 
 
 def recovered(before: B, after: B, scan: Scan, gate: float, reach: float) -> tuple[B, Scan] | float:
-    """Test whether the odometry before a scan failed.
+    """Test whether odometry failed; return a belief without it and the inliers, or the gain.
 
     ``before`` and ``after`` the update by the scan; ``gate``: accepted share of a predicted
     distribution; ``reach``: std [m] of the position without odometry (heading: half a turn).
@@ -140,7 +140,7 @@ and its covariance given the pose."""
 
 
 def _problem(joint: JointGaussian, scan: Scan) -> Problem:
-    """Return a scan and the map as arrays for kernels."""
+    """Return a scan's numbers and the map, with its covariance given the pose, as arrays."""
     at = {label: 3 + 2 * n for n, label in enumerate(joint.landmark.tolist())}
     calls = [scan.callers[n] if n < scan.callers.size else UNLABELLED for n in scan.caller]
     landmarks = [at.get(label, -1) for label in scan.landmark.tolist()]
@@ -151,7 +151,7 @@ def _problem(joint: JointGaussian, scan: Scan) -> Problem:
 
 @kernel
 def _given_pose(P: Float[np.ndarray, "d d"]) -> Float[np.ndarray, "d d"]:
-    """Return the covariance of the landmarks given the pose, by eliminating its three numbers."""
+    """Return the covariance of landmarks given the vehicle's pose, from the joint covariance."""
     left = P.copy()
     for e in range(3):
         pivot, row = max(left[e, e], SINGULAR), left[e].copy()
@@ -163,7 +163,7 @@ def _given_pose(P: Float[np.ndarray, "d d"]) -> Float[np.ndarray, "d d"]:
 
 @kernel
 def _fitted(problem: Problem, predicted: Pose, stds: Pose) -> Fit:
-    """Return the pose of least cost, by graduated non-convexity from the predicted pose."""
+    """Return the pose that best fits a scan with outliers, by graduated non-convexity."""
     pose, (_, ratios) = predicted.copy(), _cost(problem, predicted, stds[0])
     largest = max(ratios.max(), 1.0)
     convexity = 1.0 / (2.0 * largest - 1.0)
@@ -193,7 +193,7 @@ def _fitted(problem: Problem, predicted: Pose, stds: Pose) -> Fit:
 
 @kernel
 def _cost(problem: Problem, pose: Pose, reach: float) -> tuple[float, Float[np.ndarray, "2 m"]]:
-    """Return the cost of a pose, and the ratio of squared residual to bound for each measurement.
+    """Return a pose's truncated cost, and each squared residual relative to its outlier bound.
 
     The first row is for bearings with ranges, the second for excess paths; 0 if not measured.
     """
@@ -219,7 +219,7 @@ def _outlier(spread: float, det: float, size: Whole) -> float:
 def _step(
     problem: Problem, pose: Pose, weights: Float[np.ndarray, "2 m"], predicted: Pose, stds: Pose
 ) -> float:
-    """Take a Gauss-Newton step with weighted measurements, in place; return log det information."""
+    """Move a pose by a Gauss-Newton step with weighted measurements; return log det information."""
     information, A, g = 0.0, np.zeros((3, 3)), np.zeros(3)
     for a in range(3):
         off = predicted[a] - pose[a]
@@ -248,7 +248,7 @@ def _step(
 def _direction(
     problem: Problem, pose: Pose, m: Whole, weight: float, A: PoseCovariance, g: Pose
 ) -> tuple[float, float, Whole]:
-    """Return the squared residual of a bearing (with its range), det S and their number.
+    """Return a measured direction's squared residual, its variance or determinant, and size.
 
     Adds them, weighted, to the normal equations. Without bearing or mapped landmark, the residual
     is 0.
@@ -280,7 +280,7 @@ def _direction(
 def _lateness(
     problem: Problem, pose: Pose, m: Whole, weight: float, A: PoseCovariance, g: Pose
 ) -> tuple[float, float]:
-    """Return the squared residual of an excess path and S; add it to the normal equations."""
+    """Return an excess path's squared residual and variance; add it to the normal equations."""
     numbers, ends, mean, C = problem
     i, j = ends[0, m], ends[1, m]
     if i < 0 or j < 0 or i == j or math.isnan(numbers[EXCESS_PATH, m]):
@@ -302,7 +302,7 @@ def _lateness(
 def _add(
     A: PoseCovariance, g: Pose, slopes: tuple[float, float, float], weight: float, residual: float
 ) -> None:
-    """Add a residual with its derivatives to the normal equations."""
+    """Add a weighted residual with its derivatives by the pose to the normal equations A, g."""
     for a in range(3):
         g[a] += weight * slopes[a] * residual
         for b in range(3):

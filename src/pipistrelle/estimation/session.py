@@ -40,7 +40,7 @@ Leg = tuple[Controls, Durations]
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class StoredScan:
-    """A scan that data association may revise, with the belief before it."""
+    """A scan that data association may still revise, with the belief and memory before it."""
 
     number: int
     legs: Sequence[Leg]
@@ -57,7 +57,7 @@ class StoredScan:
 
 
 class SessionState(NamedTuple):
-    """Snapshot of a session, with all it needs to continue."""
+    """Snapshot of a session, with everything that it needs to continue."""
 
     belief: Any
     draws: Mapping[str, Any]
@@ -75,7 +75,7 @@ class SessionState(NamedTuple):
 
 
 class Session(Generic[B]):
-    """Online estimation of a vehicle's pose and map.
+    """Online estimation of a vehicle's pose and map from control steps and scans.
 
     Parameters
     ----------
@@ -146,7 +146,7 @@ class Session(Generic[B]):
                 self._memory = self._association.knowing(self._memory, known, callers)
 
     def move(self, controls: Controls, dt: Durations) -> Gaussian:
-        """Predict through control steps; return the pose after each, (k, 3) and (k, 3, 3)."""
+        """Predict the belief through control steps; return the vehicle's pose after each step."""
         if not self._live and len(dt) <= MOST_STEPS:
             if self._association:
                 self._legs.append((controls, dt))
@@ -163,7 +163,7 @@ class Session(Generic[B]):
         return replace(poses[0], mean=mean, covariance=covariance)
 
     def hear(self, scan: Scan) -> Scan:
-        """Associate a scan and update the belief with it; return the scan as used."""
+        """Label a scan by data association and update the belief with it; return the used scan."""
         self._open = None
         if self._association is None:
             self._legs = []
@@ -175,7 +175,7 @@ class Session(Generic[B]):
         return self._store(scan, memory, assignment)
 
     def landmarks(self) -> Landmarks:
-        """Return the map, without the association's tentative landmarks."""
+        """Return the map, without landmarks that data association considers uncertain."""
         landmarks: Landmarks = completed(self.belief, Belief).landmarks()
         if self._association is None:
             return landmarks
@@ -183,7 +183,7 @@ class Session(Generic[B]):
         return some_of(landmarks, ~is_among(landmarks.landmark, tentative))
 
     def state(self) -> SessionState:
-        """Return a snapshot of the session."""
+        """Return a snapshot of the session, to continue it later."""
         return SessionState(
             belief=self.belief,
             draws=self._rng.bit_generator.state,
@@ -197,7 +197,7 @@ class Session(Generic[B]):
         )
 
     def go_on_from(self, state: SessionState) -> None:
-        """Restore a snapshot (`state`) of a session with the same settings."""
+        """Restore a session from a snapshot (`state`) of a session with the same settings."""
         self.belief, self._memory, self._first = state.belief, state.memory, state.first
         self._rng.bit_generator.state = state.draws
         self._past = deque(state.past, maxlen=REMEMBERED)
@@ -205,7 +205,7 @@ class Session(Generic[B]):
         self.labels = [*state.labels]
 
     def _move(self, controls: Controls, dt: Durations) -> Gaussian:
-        """Predict through control steps."""
+        """Predict the belief through control steps by the estimator; return the poses."""
         predicted = self._estimator.predict(self.belief, controls, dt, self._rng)
         if not (isinstance(predicted, tuple) and len(predicted) == 2):
             expected = "the belief and the pose of each step"
@@ -215,7 +215,7 @@ class Session(Generic[B]):
         return poses
 
     def _extend(self, controls: Controls, dt: Durations) -> Gaussian:
-        """Predict again through the last, extended control steps; return the new steps' poses."""
+        """Append control steps to the last prediction and repeat it; return the new poses."""
         if self._open:
             self.belief, self._rng.bit_generator.state = self._open
             before, took = self._legs.pop()
@@ -231,7 +231,7 @@ class Session(Generic[B]):
         return replace(poses, mean=poses.mean[new], covariance=poses.covariance[new])
 
     def _update(self, scan: Scan) -> Scan:
-        """Update the belief with a labelled scan; return the scan as used."""
+        """Update the belief by the estimator with a labelled scan; return the scan as used."""
         used = usable_scan(scan)
         belief = self._estimator.update(self.belief, used, self._rng)
         if not hasattr(belief, "pose"):
@@ -240,7 +240,7 @@ class Session(Generic[B]):
         return used
 
     def _associate(self, scan: Scan) -> tuple[Any, Assignment]:
-        """Return the association's memory after a scan, and its assignment."""
+        """Run data association on a scan; return its new memory and the assignment of labels."""
         assert self._association is not None, "hear asks only where there is one"
         stated = self._noise(scan) if self._noise else scan
         found = self._association.associate(self._memory, self.belief, stated)
@@ -251,7 +251,7 @@ class Session(Generic[B]):
         return found
 
     def _store(self, scan: Scan, memory: Any, assignment: Assignment) -> Scan:
-        """Update the belief with a scan and its assignment, and store the scan."""
+        """Update the belief with a scan and its assigned labels, and store it for revision."""
         if assignment.remove:
             self._remove(assignment.remove)
         past = [*self._past]
@@ -280,7 +280,7 @@ class Session(Generic[B]):
         return used
 
     def _use(self, stored: StoredScan, since: int = 0) -> Scan:
-        """Update the belief with a stored scan; merges change labels from scan ``since`` on."""
+        """Update the belief with a stored scan; merges change the labels from scan ``since`` on."""
         self.labels[stored.number - self._first :] = [stored.label]
         for kept, gone in stored.merge:
             labels = self.labels[since:]
@@ -291,7 +291,7 @@ class Session(Generic[B]):
         return self._update(self._noise(merged) if self._noise else merged)
 
     def _remove(self, labels: tuple[int, ...]) -> None:
-        """Remove landmarks, with all of their measurements in memory."""
+        """Remove landmarks from the belief and the stored scans, repeating scans if necessary."""
         past = [*self._past]
         labels = (*labels, *(gone for one in past for kept, gone in one.merge if kept in labels))
         named = np.array(labels)
@@ -317,7 +317,7 @@ class Session(Generic[B]):
         self._past = deque(past, maxlen=REMEMBERED)
 
     def _repeat(self, past: list[StoredScan], first: int) -> None:
-        """Return to the belief before a stored scan, and repeat all scans since, as changed."""
+        """Restore the belief before a stored scan, and repeat all scans from it on, as changed."""
         self.belief = _without(past[first].belief, [*self._dropped])
         since = past[first].number - self._first
         for n in range(first, len(past)):
@@ -333,7 +333,7 @@ class Session(Generic[B]):
         self._past = deque(past, maxlen=REMEMBERED)
 
     def _associate_again(self, association: Association[Any], news: Any) -> None:
-        """Associate all stored scans again, with new information."""
+        """Repeat data association and updates for all stored scans, given new information."""
         past, legs = list(self._past), self._legs
         memory = association.informed(past[0].memory, news)
         self._past.clear()
@@ -349,30 +349,30 @@ class Session(Generic[B]):
         self._legs = legs
 
     def _move_again(self, legs: Sequence[Leg]) -> None:
-        """Predict through earlier control steps again."""
+        """Predict the belief again through control steps between stored scans."""
         for controls, dt in legs:
             self._move(controls, dt)
 
 
 def _with_columns(controls: Controls, width: int) -> Float[np.ndarray, "k w"]:
-    """Return control steps with NaN for the covariance that they lack."""
+    """Return control steps widened to a number of columns, with NaN for unknown covariances."""
     missing = np.full((len(controls), width - controls.shape[1]), np.nan)
     return np.hstack((controls, missing))
 
 
 def _present(belief: Any, labels: Sequence[int]) -> list[int]:
-    """Return the given labels that a belief contains; all, if it does not list them."""
+    """Return which of the given labels a belief contains; all, if it does not list labels."""
     held = completed(belief, Belief).labels()
     return [label for label in labels if held is None or label in held]
 
 
 def _without(belief: B, labels: Sequence[int]) -> B:
-    """Remove landmarks from a belief by label, ignoring labels that it does not contain."""
+    """Return a belief without landmarks of given labels; ignore labels that it does not contain."""
     return _edited(belief, remove=_present(belief, labels))
 
 
 def _edited(belief: B, remove: Sequence[int] = (), merge: Sequence[tuple[int, int]] = ()) -> B:
-    """Remove landmarks from a belief and merge pairs of duplicates."""
+    """Return a belief with landmarks removed and pairs of duplicates merged."""
     editable: Any = completed(belief, Belief)
     return editable.edited(remove, merge) if remove or merge else belief
 
@@ -390,7 +390,7 @@ def check_poses(method: str, poses: Gaussian, size: int) -> None:
 
 
 def _wrong_return(part: object, method: str, found: object, expected: str) -> InputError:
-    """Return an InputError for a wrong return value of an external method."""
+    """Return an InputError for a wrong return value of an external class's method."""
     kind = type(part.part if isinstance(part, Completed) else part)
     name = f"{kind.__module__}.{kind.__qualname__}.{method}"
     fix = "does it lack its return?" if found is None else "correct it"
