@@ -269,7 +269,7 @@ def title_of(name: str) -> str:
 
 
 def check_distinct(names: Iterable[str], where: str = "filter") -> None:
-    """Raise InputError if two estimators would write the same files; ``where``: name's origin.
+    """Raise InputError if two estimators would write the same files; ``where``: their origin.
 
     >>> check_distinct(["ekf", "a:Own", "b:Own"])
     Traceback (most recent call last):

@@ -248,7 +248,7 @@ def _step(
 def _direction(
     problem: Problem, pose: Pose, m: Whole, weight: float, A: PoseCovariance, g: Pose
 ) -> tuple[float, float, Whole]:
-    """Return a measured direction's squared residual, its variance or determinant, and size.
+    """Return the squared residual of a bearing (and range), its determinant and dimension.
 
     Adds them, weighted, to the normal equations. Without bearing or mapped landmark, the residual
     is 0.

@@ -80,7 +80,7 @@ ranges from which their mean is taken, and from which only the second counts."""
 
 
 class Found(NamedTuple):
-    """Result of a search for a caller: its position, the misfit, and the margin to others."""
+    """Result of a search for a caller: position, misfit, and margin over other positions."""
 
     place: CallerPlace
     misfit: float
@@ -409,7 +409,7 @@ def may_have_turned(fitting: int, rows: int) -> bool:
 
 
 def turned(joint: JointGaussian, at: int, bearing: float, costs: Costs) -> JointGaussian:
-    """Move a caller to where its echoes match best in a copy of the joint mean, if it turned."""
+    """Return a joint Gaussian with a caller moved to where its echoes match best, if it turned."""
     mean, spread = joint.mean, np.diag(joint.covariance)[at : at + 2].sum()
     least, fitting = fit(costs(mean))
     if not may_have_turned(int(fitting.sum()), fitting.size):
@@ -428,7 +428,7 @@ def turned(joint: JointGaussian, at: int, bearing: float, costs: Costs) -> Joint
 
 
 def fit(costs: Float[np.ndarray, "r n"]) -> tuple[float, Bool[np.ndarray, " r"]]:
-    """Return the total least cost of measurements (0 if unmatched), and which have a match."""
+    """Return the sum of measurements' least costs (0 for clutter), and a mask of the matched."""
     least = costs.min(axis=1, initial=0.0)
     return float(least.sum()), least < 0.0
 
@@ -510,7 +510,7 @@ def _turn(
     covariance: Float[np.ndarray, "d d"],
     there: Int[np.ndarray, " n"],
 ) -> tuple[Float[np.ndarray, " d"], float, Float[np.ndarray, "d d"]]:
-    """Return gain and variance of the map's rotation, and the covariance if it were known."""
+    """Return gain and variance of a map rotation, and the covariance without its uncertainty."""
     dx, dy = mean[there] - mean[0], mean[there + 1] - mean[1]
     squared = there.size * (dx * dx + dy * dy)
     slope = np.zeros(mean.size)

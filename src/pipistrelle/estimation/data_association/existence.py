@@ -377,7 +377,7 @@ def doubles(
     apart: Bool[np.ndarray, "l l"],
     asked: Int[np.ndarray, " a"],
 ) -> Pairs:
-    """Find pairs of duplicate landmarks in a joint map; return indices in ``at``, lower first.
+    """Find duplicate landmarks in a joint map; return pairs of their indices, lower first.
 
     ``apart``: pairs known to be distinct; ``asked``: landmarks from which groups may grow.
     """
@@ -514,7 +514,7 @@ def _equate(mean: Float[np.ndarray, " d"], P: Float[np.ndarray, "d d"], i: Whole
 
 @no_alloc
 def _take_over(apart: Bool[np.ndarray, "l l"], a: Whole, b: Whole) -> None:
-    """Combine two merged landmarks' exclusions from pairs in landmark a; exclude b from all."""
+    """Give landmark a the forbidden pairs of two merged landmarks; forbid all pairs with b."""
     for k in range(apart.shape[0]):
         apart[a, k] = apart[k, a] = apart[a, k] or apart[b, k]
     for k in range(apart.shape[0]):

@@ -71,7 +71,7 @@ FARTHEST = 1e6
 def nearest(
     costs: Float[np.ndarray, "m n"], innovate: Innovate | None = None
 ) -> Int[np.ndarray, " m"]:
-    """Assign measurements to landmarks at least total cost; NOTHING for clutter.
+    """Return each measurement's landmark by the assignment of least total cost, or NOTHING.
 
     >>> nearest(np.array([[-5.0, -4.0], [-4.5, np.inf], [3.0, np.inf]]))
     array([ 1,  0, -1])
@@ -90,7 +90,7 @@ def nearest(
 def marginal(
     costs: Float[np.ndarray, "m n"], innovate: Innovate | None = None
 ) -> Int[np.ndarray, " m"]:
-    """Assign each measurement to a landmark of high marginal probability, else NOTHING.
+    """Return each measurement's landmark if its marginal probability is high, else NOTHING.
 
     >>> marginal(np.array([[-9.0, -9.0], [np.inf, np.inf]]))
     array([-1, -1])
@@ -102,7 +102,7 @@ def marginal(
 
 @kernel
 def _what_is_sure(costs: Float[np.ndarray, "m n"]) -> Int[np.ndarray, " m"]:
-    """Assign each measurement to a landmark of high marginal probability, else NOTHING."""
+    """Return each measurement's landmark if its marginal probability is high, else NOTHING."""
     rows, landmarks, shares = _shares(costs)
     found, first = np.full(costs.shape[0], NOTHING), 0
     while first < rows.size:
@@ -120,7 +120,7 @@ def _what_is_sure(costs: Float[np.ndarray, "m n"]) -> Int[np.ndarray, " m"]:
 
 @kernel
 def probabilities(costs: Float[np.ndarray, "m n"]) -> Float[np.ndarray, "m n"]:
-    """Return each measurement's probability to be of each landmark; the remainder is for clutter.
+    """Return the probability that each measurement is of each landmark; the rest is clutter.
 
     >>> probabilities(np.array([[0.0]]))
     array([[0.5]])
@@ -199,7 +199,7 @@ def gates(numbers: int) -> Float[np.ndarray, " g"]:
 def jointly_compatible(
     costs: Float[np.ndarray, "m n"], innovate: Innovate | None
 ) -> Int[np.ndarray, " m"]:
-    """Assign measurements to landmarks by the largest jointly compatible set, else NOTHING."""
+    """Return each measurement's landmark by the largest jointly compatible set, or NOTHING."""
     found = np.full(len(costs), NOTHING)
     row, landmark = np.nonzero(costs < 0.0)
     if not row.size or innovate is None:
@@ -291,7 +291,7 @@ def _extended(
     k: Whole,
     innovations: Innovations,
 ) -> float:
-    """Extend the Cholesky factor L by a chosen pair; return the growth of the squared distance."""
+    """Extend innovations' Cholesky factor by a pair; return its part of the squared distance."""
     nu, S, _ = innovations
     for a in (2 * k, 2 * k + 1):
         whole = 2 * chosen[k] + a - 2 * k
@@ -452,7 +452,7 @@ def _spread(
     index: Int[np.ndarray, "7"],
     size: Whole,
 ) -> tuple[float, float, float]:
-    """Return the predicted variances of bearing and of range, and their covariance, H P H^T."""
+    """Return predicted variances of bearing and range, and their covariance, by Jacobian H."""
     across, both, along = 0.0, 0.0, 0.0
     for a in range(size):
         for b in range(size):

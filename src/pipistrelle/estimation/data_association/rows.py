@@ -76,7 +76,7 @@ class Tracks:
 def followed(
     tracks: Tracks, time: float, pose: Float[np.ndarray, "3"], direct: float, rows: Rows
 ) -> Tracks:
-    """Return a caller's tracks of echoes extended by a scan; ``direct``: direct bearing or NaN."""
+    """Return a caller's tracks of echoes extended by a scan; ``direct``: bearing to it or NaN."""
     now, (x, y, heading) = len(tracks.poses), pose
     ones = np.ones(len(rows.bearing))
     seen = np.column_stack(
@@ -131,7 +131,7 @@ def _costs(
 def in_window(
     tracks: Tracks, scans: int, sightings: int
 ) -> tuple[Float[np.ndarray, "t k 4"], Float[np.ndarray, "k 3"], Float[np.ndarray, " k"]]:
-    """Return the tracks seen often in recent scans (NaN if missed), poses and direct bearings."""
+    """Return a caller's often detected tracks in recent scans, with poses and direct bearings."""
     window = tracks.rows[-scans:]
     table = np.full((len(tracks.last), len(window), 4), np.nan)
     for k, rows in enumerate(window):
@@ -235,7 +235,7 @@ def _is_assumed(std: float, assumed: Float[np.ndarray, " a"]) -> Flag:
 
 @kernel
 def place_of(label: Whole, landmark: Int[np.ndarray, " n"]) -> int:
-    """Return the index of a labelled landmark in the joint mean, or -1 if absent."""
+    """Return the index of a labelled landmark in the joint mean of pose and map, or -1."""
     for n in range(landmark.size):
         if landmark[n] == label:
             return 3 + 2 * n
@@ -246,7 +246,7 @@ def place_of(label: Whole, landmark: Int[np.ndarray, " n"]) -> int:
 def places_of(
     labels: Int[np.ndarray, " l"], landmark: Int[np.ndarray, " n"], near: Bool[np.ndarray, " k"]
 ) -> tuple[Int[np.ndarray, " l"], Bool[np.ndarray, " l"]]:
-    """Return each landmark's index in the joint mean (-1: absent), and its flag from ``near``."""
+    """Return landmarks' joint-mean indices (-1: absent), and whether each is near a measurement."""
     at, close = np.empty(labels.size, np.int64), np.zeros(labels.size, np.bool_)
     for n in range(labels.size):
         at[n] = place_of(labels[n], landmark)
@@ -310,7 +310,7 @@ def bearing_fits(
 
 @kernel
 def part_of(heard: ScanRows, rows: Int[np.ndarray, " r"], spread: float) -> tuple[np.ndarray, ...]:
-    """Select measurements as columns of `pairs.Rows`; ``spread``: std added to their path [m]."""
+    """Return selected measurements as columns of `pairs.Rows`; ``spread``: added range std [m]."""
     way_std = heard.way_std[rows]
     for k in range(rows.size):
         way_std[k] = math.hypot(way_std[k], spread)
@@ -328,7 +328,7 @@ def settled(
     caller: tuple[Whole, Whole, Whole],
     chances: PlainChances,
 ) -> tuple[Int[np.ndarray, " b"], tuple[int, int]]:
-    """Label a caller's matched measurements; return unmatched that begin landmarks, and counts.
+    """Label a caller's matched measurements; return the unmatched to begin landmarks, and counts.
 
     The counts are of precise measurements: matched, and all.
     """

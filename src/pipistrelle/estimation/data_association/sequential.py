@@ -219,7 +219,7 @@ class _Work:
         return replace(caller, tracks=tracks)
 
     def match(self, number: int) -> None:
-        """Match a caller's measurements with landmarks; begin landmarks with precise unmatched."""
+        """Match a caller's measurements with landmarks; begin landmarks where none fits."""
         at = OWN_CALL if number == OWN else self._heard_from(number)
         if at is None:
             return
@@ -304,7 +304,7 @@ class _Work:
         )
 
     def _without(self, known: Known, gone: set[int]) -> tuple[Known, tuple[int, ...]]:
-        """Delete labels from scan and records; return the kept records and the known of them."""
+        """Delete landmarks from scan and records; return these and the labels known before."""
         memory, left = self.memory, np.array([*gone])
         for labels in (self.label, self.named):
             labels[is_among(labels, left)] = UNLABELLED
@@ -339,7 +339,7 @@ class _Work:
         }
 
     def _judged(self) -> tuple[Known, Int[np.ndarray, " l"]]:
-        """Return all landmarks with updated log odds, and joint-mean indices (-1: absent)."""
+        """Return all landmark records with updated log odds, and joint-mean indices or -1."""
         memory, scan, rows = self.memory, self.scan, self.rows
         size = max(1 + scan.caller.max(initial=0), scan.direct.size, memory.known.source.shape[1])
         known = with_new(memory.known, self.new, memory.scan, size)
@@ -361,7 +361,7 @@ class _Work:
         return tuple((label[a], label[b]) for a, b in doubles(self.joint, at[old], apart, asked))
 
     def _another(self) -> int:
-        """Return a new label for a landmark or caller, which no caller has."""
+        """Return the next unused label for a landmark or a caller."""
         taken = {caller.label for caller in self.callers.values()}
         self.labels += 1
         while self.labels in taken:
@@ -399,7 +399,7 @@ class _Work:
         self.callers[number] = told
 
     def _match_direct(self, number: int, label: int, at: int) -> None:
-        """Label a caller's direct call, if not outside the gate of a fixed caller's bearing."""
+        """Label a caller's direct call with its label, unless a fixed caller's gate rejects it."""
         row = self._direct(number)
         if row < 0:
             return
@@ -451,7 +451,7 @@ density."""
 
 
 def left_out(config: Config, scans: Iterable[Scan]) -> dict[str, Float[np.ndarray, " n"]]:
-    """Return the stds of all measurements that limits of the association discard, by setting.
+    """Return the stds of the measurements that data association discards, by setting.
 
     Keys are ``bearing_std`` [rad] and ``way_std`` [m]; a setting that discards nothing is absent.
     """

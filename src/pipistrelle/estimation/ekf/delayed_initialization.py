@@ -91,7 +91,7 @@ many bearings of small angle would seem to cross at once."""
 
 @no_alloc
 def member_linearity(params: UpdateParams) -> float:
-    """Return the error [rad] of linearising the bearing of a hypothesis along a bearing."""
+    """Return the linearisation error of bearings to a hypothesis from the side [rad]."""
     share = params.ray_stds[0] / params.ray_ranges[0]
     return 0.5 * share * share
 

@@ -287,7 +287,7 @@ class EkfBelief(Recoverable):
         return self.rows(~is_standing(self.landmark) & ~is_velocity(self.landmark))
 
     def rows(self, kept: Bool[np.ndarray, " h"]) -> Landmarks:
-        """Return selected landmark hypotheses with means and covariances in linear coordinates."""
+        """Return selected landmark hypotheses as a map, with covariances of x and y."""
         mean, covariance = self._linear(kept, with_pose=False)
         return _map_of(self.landmark[kept], self.weight[kept], mean.reshape(-1, 2), covariance)
 
@@ -302,7 +302,7 @@ class EkfBelief(Recoverable):
     def _linear(
         self, kept: Bool[np.ndarray, " h"], *, with_pose: bool
     ) -> tuple[Durations, Float[np.ndarray, "k k"]]:
-        """Return mean and covariance of selected hypotheses in x and y, not the invariant error."""
+        """Return selected hypotheses' mean and covariance of x and y, perhaps with the pose."""
         invariant = self.error == INVARIANT
         return linear_part(self.mean, self.covariance, self.origin, kept, with_pose, invariant)
 
@@ -341,7 +341,7 @@ def _map_of(
     mean: Float[np.ndarray, "h 2"],
     covariance: Covariance,
 ) -> Landmarks:
-    """Convert hypotheses and their joint covariance (2h, 2h) to a map, a row per hypothesis.
+    """Convert hypotheses and their joint covariance to a map, a row per hypothesis.
 
     A stored bearing becomes two hypotheses of equal weight, at half and twice the distance of its
     second point, with standard deviations of half their range.
@@ -363,7 +363,7 @@ def _map_of(
 def _with_points(
     belief: EkfBelief, known: Landmarks, by_state: Float[np.ndarray, "n d"]
 ) -> EkfBelief:
-    """Return the belief with new points; errors are ``by_state`` times its error, plus noise."""
+    """Append points to the belief, with errors partly shared with its state (``by_state``)."""
     P, cross = belief.covariance, by_state @ belief.covariance
     own = np.zeros((len(by_state), len(by_state)))
     for row, covariance in enumerate(known.covariance):

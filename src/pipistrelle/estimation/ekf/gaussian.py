@@ -268,7 +268,7 @@ def flush(joint: Joint, size: Whole) -> None:
 
 @no_alloc
 def defer(joint: Joint, size: Whole, w: Float[np.ndarray, " m"], step: float) -> None:
-    """Apply a rank-1 update w to mean and pose rows now, and defer it for the points' rows."""
+    """Apply a rank-1 Kalman update to mean and pose covariance now; defer it for landmarks."""
     mean, p0, p1, p2 = joint.mean, joint.covariance[0], joint.covariance[1], joint.covariance[2]
     x, y, h = w[0], w[1], w[2]
     for a in range(size):
@@ -511,7 +511,7 @@ def drop_members(
 
 @no_alloc
 def _excess(squared: float, S: float) -> float:
-    """Return the variance to add to S to limit an innovation to `HUBER_K` standard deviations."""
+    """Return the variance to add so that an innovation is within `HUBER_K` standard deviations."""
     return S * max(math.sqrt(squared / S) / HUBER_K - 1.0, 0.0)
 
 

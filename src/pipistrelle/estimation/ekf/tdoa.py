@@ -118,7 +118,7 @@ def correct_excess_path(
     bound: float,
     robust: bool,
 ) -> Whole:
-    """Update the state by an excess path via point i from the caller at ib; GATED or APPLIED."""
+    """Update the state by an excess path via point i, caller at ib; return GATED or APPLIED."""
     if joint.taken[WAITING] == MAX_WAITING:
         flush(joint, size)
     w = joint.W[joint.taken[WAITING]]
@@ -279,10 +279,7 @@ def _surest(state: State, row: Row, paths: ExcessPaths, robust: bool) -> Whole:
 def placed_by_excess_path(
     state: State, row: Row, paths: ExcessPaths, robust: bool, scratch: Scratch
 ) -> bool:
-    """Initialise a landmark by bearing and excess path, if precise; return whether it was.
-
-    Returns whether it was possible.
-    """
+    """Initialise a landmark by bearing and excess path, if precise; return whether it was."""
     first, count = members_of(state.landmark, state.members[0], row.landmark)
     if count == 1 or not math.isnan(row.range):
         return False
@@ -310,7 +307,7 @@ def placed_by_excess_path(
 def correct_by_excess_path(
     state: State, paths: ExcessPaths, d: Whole, params: UpdateParams, scratch: Scratch
 ) -> Whole:
-    """Update landmark, caller and vehicle by the excess path at index d; GATED or APPLIED.
+    """Update landmark, caller and vehicle by excess path d of a scan; return GATED or APPLIED.
 
     If the other end is a ray, its hypotheses are weighed and pruned.
     """

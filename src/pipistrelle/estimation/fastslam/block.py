@@ -244,7 +244,7 @@ def expect_active(
 
 @no_alloc
 def active_beyond(pose: Poses, member: Member, row: Row, count: Counts, bound: float) -> bool:
-    """Return whether range and bearing are gated in all particles, with no ray in any."""
+    """Return whether all particles have a landmark initialised and gate its range and bearing."""
     beyond = 0
     for i in range(LANES):
         nu0, nu1, c, s, k, far = _active(pose, member, row, i)
@@ -322,7 +322,7 @@ def correct_by_active(pose: Poses, member: Member, row: Row, count: Counts) -> N
 def initialise_member(
     pose: Poses, member: Member, row: Row, log_weight: float, count: Counts
 ) -> None:
-    """Set a hypothesis to range and bearing in particles without the landmark initialised."""
+    """Initialise a hypothesis by range and bearing in particles without it initialised."""
     distance, range_variance = row.range, row.range_variance
     across = row.bearing_variance * distance * distance
     for i in range(LANES):
@@ -578,7 +578,7 @@ def weigh_by_active(
 def _refine_to_mixture(
     pose: Poses, rows: Members, members: Whole, row: Row, turn: Lanes, scratch: Scratch
 ) -> None:
-    """Set poses to the mean and covariance of their mixture of updates by each hypothesis."""
+    """Update poses by a bearing: mean and covariance of the mixture over all hypotheses."""
     for j in range(members):
         refined, weight = scratch.refined[j], scratch.posterior[j]
         for k in range(POSE):

@@ -31,7 +31,7 @@ from pipistrelle.jit import kernel
 def edited(
     history: History, remove: Sequence[int], merge: Sequence[tuple[int, int]]
 ) -> tuple[History, Bool[np.ndarray, " l"]]:
-    """Remove and merge landmarks in a smoother's history; return it and a mask of the remaining.
+    """Remove and merge landmarks in a smoother's history; return it and a mask of landmarks kept.
 
     Their measurements are deleted or relabelled; the chain must be eliminated again.
     """
@@ -72,7 +72,7 @@ def _merged(history: History, kept: int, gone: int) -> History:
 def _with_rows(
     history: History, ends: Int[np.ndarray, "r 4"], keep: Bool[np.ndarray, " r"]
 ) -> History:
-    """Return the history with reassigned measurements (`Rows.ends`), and only the kept of them."""
+    """Return a smoother's history with changed landmark indices, and only selected measurements."""
     numbers = history.rows.entries(1)[keep]
     ends, latest = ends[keep], np.full(history.latest.size, -1)
     _link(ends, numbers, latest)
@@ -109,7 +109,7 @@ def _forgetting(history: History, slots: Sequence[int]) -> History:
 
 
 def _renumbered(history: History, kept: Bool[np.ndarray, " l"]) -> History:
-    """Return the history with only selected landmarks as unknowns, numbered without gaps."""
+    """Return a smoother's history with only selected landmarks as unknowns, renumbered."""
     number, index = np.append(0, np.cumsum(kept)), history.index.copy()
     index[index > 0] = number[index[index > 0]]
     mean, information = history.known
@@ -256,7 +256,7 @@ class SmootherBelief(Recoverable):
         return replace(belief, ahead=ahead)
 
     def freed(self, pose: Pose, stds: Pose) -> "SmootherBelief":
-        """Move and widen the pose's Gaussian, spread over the control steps since the last scan."""
+        """Shift the pose and widen its covariance, gradually over the steps since the last scan."""
         if not len(self.odometry.mean):
             return self
         x, y, turned = pose - self.at.mean

@@ -90,7 +90,7 @@ LEAST_STD = 1e-4
 def transition(
     work: Work, k: Whole, legs: Legs, places: Places, points: PointArrays, noise: NoiseModel
 ) -> float:
-    """Linearise the motion between two scans, in the workspace; return its chi-square cost."""
+    """Linearise the motion of vehicle and callers between two scans; return its chi-square cost."""
     F, u, Q, (at, border) = work.F, work.u, work.Q, points
     F[:], Q[:] = 0.0, 0.0
     x, y, heading = at[k - 1, 0], at[k - 1, 1], at[k - 1, 2]
@@ -133,7 +133,7 @@ def _odometry(
     u: ChainState,
     Q: Square,
 ) -> float:
-    r"""Linearise odometry: write offset u and noise covariance Q, and return its chi-square cost.
+    r"""Linearise an odometry step: write offset u and covariance Q; return its chi-square cost.
 
     The residual is the logarithm of SE(2), :math:`r = V^{-1}(\theta)\,(x, y)` and :math:`\theta`;
     ``axes``: cosine and sine of the heading.
@@ -233,7 +233,7 @@ def eliminate(
     noise: NoiseModel,
     span: tuple[Whole, Whole, Whole, Whole, Whole],
 ) -> float:
-    """Eliminate the poses of several scans from the equations, in place; return their chi-square.
+    """Eliminate the poses of several scans from the smoother's equations; return their chi-square.
 
     ``span``: node of the front, first node to update, end of the nodes, columns, node of link 0.
     """
@@ -260,7 +260,7 @@ def step_to(
     noise: NoiseModel,
     span: Span,
 ) -> float:
-    """Predict the last state (pose, callers) to the next scan; return the motion's chi-square."""
+    """Predict the newest state (pose, callers) to the next scan; return the step's chi-square."""
     front, legs, (k, n, base) = Front(*front), Legs(*legs), span
     work = work_of(front.C.shape[0], n, legs.slopes.shape[2])
     cost = transition(work, k, legs, Places(*places), points, noise)
@@ -273,7 +273,7 @@ def begin(
     front: Arrays, legs: PlainLegs, at: Float[np.ndarray, "k d"], border: Border,
     parameters: Float[np.ndarray, " p"], damping: float
 ) -> float:  # fmt: skip
-    """Begin the elimination with priors of start pose and parameters; return their chi-square."""
+    """Start a smoother's elimination by priors of pose and parameters; return their chi-square."""
     front[0][:], front[1][:], front[2][:] = 0.0, 0.0, 0.0
     work, start = work_of(POSE, 1, 0), Legs(*legs)
     mean, turn = start.mean[0], wrap_angle(at[0, 2] - start.mean[0, 2])
@@ -322,7 +322,7 @@ def leave(
     column: Int[np.ndarray, " g"],
     left: tuple[Float[np.ndarray, "g 2 n"], Float[np.ndarray, "g 2 d"], Float[np.ndarray, "g 2 2"]],
 ) -> None:
-    r"""Eliminate landmarks from the equations in sequence, in place, and store their conditionals.
+    r"""Eliminate landmarks from the smoother's equations; store each given the remaining unknowns.
 
     With c the columns of a landmark, :math:`V = \Lambda_{cc}^{-1}`, :math:`H = -V \Lambda_c` and
     :math:`C_c` the derivatives of the state by it,
@@ -377,7 +377,7 @@ def leave(
 
 @no_alloc
 def advance(front: Front, work: Work, n: Whole) -> None:
-    """Predict the last state through a linearised motion, in place; its prior stays in ``work``."""
+    """Predict the newest state through a linearised motion in place; keep its prior in ``work``."""
     write(front.P, work.M)
     for a in range(work.u.size):
         for j in range(n):
@@ -394,7 +394,7 @@ def advance(front: Front, work: Work, n: Whole) -> None:
 
 @no_alloc
 def step(front: Front, work: Work, links: Links, k: Whole, n: Whole) -> None:
-    """Predict the last state to the next scan, and store its conditional given the next state."""
+    """Predict the newest state to the next scan; store the previous state's Gaussian given it."""
     advance(front, work, n)
     D, G, S, d = links.D[k], links.G[k], links.S[k], front.P.shape[0]
     multiply(work.F, work.M, work.A)
@@ -417,7 +417,7 @@ def step(front: Front, work: Work, links: Links, k: Whole, n: Whole) -> None:
 
 @no_alloc
 def correct(front: Front, work: Work, n: Whole) -> None:
-    """Update the last state with the accumulated measurements of a scan, in place."""
+    """Update the newest state with all accumulated measurements of a scan, in place."""
     if work.alone[0]:
         return
     C, T, E, M = front.C, work.T, work.E, work.M
@@ -433,7 +433,7 @@ def correct(front: Front, work: Work, n: Whole) -> None:
 
 @no_alloc
 def _inform(front: Front, work: Work, E: Slopes, n: Whole) -> None:
-    """Add the information of a scan's update to the information on landmarks and parameters."""
+    """Add a scan's information on landmarks and parameters to their information matrix."""
     C, G, before = front.C, work.G, work.C
     for i in range(n):
         row = front.information[i]
@@ -462,7 +462,7 @@ Left = tuple[Float[np.ndarray, "g 2 n"], Float[np.ndarray, "g 2 d"], Float[np.nd
 def trace_back(
     links: Arrays, beta: Border, last: ChainState, count: Whole
 ) -> Float[np.ndarray, "k d"]:
-    """Return the last ``count`` + 1 states of the trajectory, solved by back substitution."""
+    """Solve for earlier states from the last by back substitution; return ``count`` + 1 states."""
     links, d = Links(*links), last.size
     states = np.empty((count + 1, d))
     for a in range(d):
@@ -529,7 +529,7 @@ def _make_symmetric(P: Square) -> None:
 def spread_left(
     left: Left, column: Int[np.ndarray, " g"], covariances: tuple[Square, Slopes, Factor]
 ) -> Float[np.ndarray, "g 2 2"]:
-    """Restore eliminated landmarks in the covariances, in place; return their 2 x 2 blocks."""
+    """Add eliminated landmarks to the covariances again, in place; return their 2 x 2 blocks."""
     P, X, border = covariances
     (d, n), own = X.shape, np.zeros((column.size, 2, 2))
     by_border, by_state = np.zeros((2, n)), np.zeros((2, d))
@@ -582,7 +582,7 @@ def factor(R: Factor, n: Whole) -> None:
 
 @no_alloc
 def _factor_rows(R: Factor, i: Whole, count: Whole) -> None:
-    """Factor ``count`` rows of a matrix, from row i upwards, updating only these rows."""
+    """Factor rows i - count + 1 to i of an information matrix, without changing other rows."""
     for p in range(i, i - count, -1):
         row, inverse = R[p], 1.0 / math.sqrt(R[p, p])
         for j in range(p + 1):
@@ -618,7 +618,7 @@ def rooted(R: Factor, w: Border, n: Whole) -> None:
 
 @optimised_once
 def solve(front: Arrays, n: Whole, R: Factor, beta: Border) -> tuple[ChainState, Square]:
-    """Solve for landmarks, parameters and last state; return this state's offset and covariance."""
+    """Solve for landmarks and parameters; return the newest state's correction and covariance."""
     C, P, information = front
     d = P.shape[0]
     state, covariance, Z = np.zeros(d), np.empty((d, d)), np.empty((d, n))
@@ -664,7 +664,7 @@ def joint(
     by_chain: Float[np.ndarray, "q d"],
     by_border: Float[np.ndarray, "q n"],
 ) -> Float[np.ndarray, "q q"]:
-    """Return the covariance of linear functions of the last state, the landmarks and parameters."""
+    """Return the covariance of linear functions of the newest state, landmarks and parameters."""
     C, P, _ = front
     q, d = by_chain.shape
     Z, covariance, last = by_border.copy(), np.empty((q, q)), np.zeros(q, np.int64)

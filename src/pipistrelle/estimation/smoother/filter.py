@@ -338,7 +338,7 @@ def drop_outside(
 def _part(
     work: Work, written: tuple[Whole, Whole], by_chain: ChainState, by_border: Border
 ) -> None:
-    """Split a Jacobian row into derivatives by the state, and by landmarks and parameters."""
+    """Split a measurement's derivatives into a part by the state and a part by the map."""
     chain, size = written
     for e in range(chain):
         by_chain[work.at[e]] += work.slope[e]
@@ -488,7 +488,7 @@ class Smoother:
         return history, eliminated(before, self.noise, solution.points, kept, first)
 
     def _forgetting(self, history: History, solution: Solution) -> History:
-        """Schedule landmarks unmeasured within the window for elimination; return the history."""
+        """Schedule landmarks unmeasured for a time window for elimination; return the history."""
         k = history.nodes - 1
         if k % STRETCH or math.isinf(self.window):
             return history
@@ -498,7 +498,7 @@ class Smoother:
         return with_leaving(history, leaving, k // STRETCH - 1) if leaving.any() else history
 
     def _heard(self, before: History, here: Sweep, estimate: Solution) -> tuple[History, Solution]:
-        """Solve with the last scan and its new landmarks; return new history and solution."""
+        """Solve with the last scan and its new landmarks; return the new history and solution."""
         history = before
         if (here.places[0][slots_heard(before)] == 0).any():
             history = _placed(before, here, estimate)

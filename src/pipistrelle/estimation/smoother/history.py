@@ -118,7 +118,7 @@ class History:
         return found
 
     def places(self, columns: Int[np.ndarray, " l"]) -> Arrays:
-        """Return which unknown each landmark and caller is, as `records.Places`."""
+        """Return where landmarks and callers are among the unknowns, as `records.Places`."""
         index = self.index
         if columns.size:
             index = np.where(index > 0, columns[np.maximum(index - 1, 0)], index)
@@ -172,7 +172,7 @@ def heard_more(history: History, odometry: Odometry, scan: Scan) -> History:
 
 @optimised_once
 def _write_leg(legs: Arrays, steps: Arrays, led: Led, span: tuple[Whole, Whole, float]) -> None:
-    """Store the motion to a scan in the arrays; ``span``: node, number of steps, duration [s]."""
+    """Store the odometry up to a scan in arrays; ``span``: scan, number of steps, duration [s]."""
     (mean, noise, seconds, _, ends, slopes), (k, last, took) = legs, span
     count = led[0].shape[0]
     first, moved = last - count, False
@@ -198,7 +198,7 @@ def _write_rows(
     seen: tuple[Int[np.ndarray, " s"], Int[np.ndarray, "s 2"]],
     span: tuple[Whole, Whole],
 ) -> bool:
-    """Store a scan's measurements in the arrays; return whether any has a range or excess path."""
+    """Store a scan's measurements in the history; return whether any has a range or excess path."""
     (spans, ends, values), (landmarks, callers, numbers) = rows, scan
     (latest, heard), (k, first) = seen, span
     spans[k, 0], spans[k, 1], ranged = first, first + landmarks.size, False
@@ -219,7 +219,7 @@ def _write_rows(
 def _slots_of(
     history: History, scan: Scan
 ) -> tuple[Int[np.ndarray, " m"], Int[np.ndarray, " m"], History]:
-    """Return the indices of a scan's landmarks and callers, and the history with new indices."""
+    """Look up indices of a scan's landmarks and callers; return them and the extended history."""
     labels, callers = scan.landmark.tolist(), caller_labels(scan).tolist()
     moving = {*scan.moving.tolist(), *history.callers}
     named = [(label, label in moving) for label in labels]
@@ -284,7 +284,7 @@ def with_caller(history: History, label: int, place: Float[np.ndarray, "2"]) -> 
 
 
 def with_leaving(history: History, numbers: Bool[np.ndarray, " l"], stretch: int) -> History:
-    """Return the history with landmarks scheduled for elimination after a trajectory segment."""
+    """Return the history with landmarks marked to be eliminated after a trajectory segment."""
     return replace(history, leaves=np.where(numbers, stretch, history.leaves))
 
 

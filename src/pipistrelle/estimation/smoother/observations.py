@@ -118,7 +118,7 @@ def _steps_back(
 
 @no_alloc
 def point_of(slot: Whole, k: Whole, places: Places, points: PointArrays) -> Point:
-    """Return the unknown's index and position of a landmark or caller at scan k, zeros if none."""
+    """Return a landmark's or caller's index among the unknowns and position at scan k, or zeros."""
     i, (at, border) = places.index[slot], points
     if i > 0:
         return i, border[i], border[i + 1]
@@ -144,7 +144,7 @@ def direction_of(view: View, numbers: Float[np.ndarray, " 8"]) -> float:
 def write_bearing(
     work: Work, view: View, seen: Seen, slope: float, i: Whole
 ) -> tuple[Whole, Whole]:
-    """Write the derivatives of a bearing by pose, parameters and position of a point as a row.
+    """Write a Jacobian row: the derivatives of a bearing by pose, parameters and measured point.
 
     This and the following functions return the number of chain entries and of all entries.
     """
@@ -156,7 +156,7 @@ def write_bearing(
 
 @no_alloc
 def write_range(work: Work, view: View, seen: Seen, i: Whole) -> tuple[Whole, Whole]:
-    """Write the derivatives of a range by pose, parameters and position of a point as a row."""
+    """Write a Jacobian row: the derivatives of a range by pose, parameters and measured point."""
     distance, _, c, s, _ = seen
     k = 1.0 / view.scale
     size = _write_view(work, view, (-k * c, -k * s, 0.0), -distance * k * k, 0.0)
@@ -167,7 +167,7 @@ def write_range(work: Work, view: View, seen: Seen, i: Whole) -> tuple[Whole, Wh
 def write_excess_path(
     work: Work, view: View, ends: tuple[Point, Point]
 ) -> tuple[float, Whole, Whole]:
-    """Write the derivatives of an excess path as a Jacobian row; return its predicted value too."""
+    """Write a Jacobian row with an excess path's derivatives; return its prediction and lengths."""
     (i, px, py), (j, bx, by) = ends
     path, lx, ly, cx, cy = excess_path_slopes(view.x, view.y, px, py, bx, by)
     k = 1.0 / view.scale
@@ -181,7 +181,7 @@ def write_excess_path(
 def _write_view(
     work: Work, view: View, by_pose: tuple[float, float, float], by_scale: float, by_lean: float
 ) -> Whole:
-    """Convert derivatives by sensor pose to vehicle pose and parameters; return their number."""
+    """Convert derivatives by the sensor's pose to derivatives by vehicle's pose and parameters."""
     at, slope, size, (by_x, by_y, by_heading) = work.at, work.slope, MISFIT + 1, by_pose
     sound, turned, place, clock = view.columns
     for a in range(POSE):
@@ -212,7 +212,7 @@ def _write_view(
 def _write_point(
     work: Work, chain: Whole, size: Whole, i: Whole, by_x: float, by_y: float
 ) -> tuple[Whole, Whole]:
-    """Insert derivatives by a position into a Jacobian row; return its numbers of entries."""
+    """Insert a measurement's derivatives by a point's position into its Jacobian row."""
     if i > 0:
         work.at[size], work.at[size + 1] = i, i + 1
         work.slope[size], work.slope[size + 1] = by_x, by_y
@@ -275,7 +275,7 @@ def _moved(point: Point, off: Off) -> Point:
 
 @no_alloc
 def _along(work: Work, written: tuple[Whole, Whole], off: Off) -> float:
-    """Return a measurement's change from linearisation point to estimate, by its Jacobian row."""
+    """Return a measurement's linearly predicted change from linearisation point to estimate."""
     chain, size = written
     total = 0.0
     for e in range(chain):
@@ -367,7 +367,7 @@ def _add_direction(
     slopes: tuple[float, float, float],
     off: tuple[float, float],
 ) -> None:
-    """Add a bearing and a range to the normal equations; faster than `_add`, if uncalibrated."""
+    """Add a bearing and range to the normal equations by closed formulas, faster than `_add`."""
     (c, s), (q, p, h), (b, r), T, G = cosines, slopes, off, work.T, work.G
     xx, yy = q * q * s * s + p * p * c * c, q * q * c * c + p * p * s * s
     xy = (p * p - q * q) * c * s
@@ -401,7 +401,7 @@ def _add_direction(
 
 @no_alloc
 def _huber(squared: float, believed: float) -> tuple[float, float]:
-    """Return a squared residual's root of the Huber weight, and twice its Huber loss."""
+    """Return the root of Huber's weight and twice Huber's loss for a squared residual."""
     if squared <= believed * believed:
         return 1.0, squared
     size = math.sqrt(squared)
@@ -432,7 +432,7 @@ def _add(work: Work, front: Front, chain: Whole, size: Whole, weight: tuple[floa
 
 @no_alloc
 def _correct_by_row(work: Work, front: Front, chain: Whole, size: Whole) -> None:
-    """Update the last state with a measurement's Jacobian row, as a Kalman filter does.
+    """Update the newest state with a measurement's Jacobian row, as a Kalman filter does.
 
     With w its derivatives by the separator and S its variance, the information gains w w^T / S.
     """

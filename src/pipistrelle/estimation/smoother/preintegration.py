@@ -91,7 +91,7 @@ class Calibration:
 
 
 def numbers_of(parameters: Iterable[str]) -> tuple[str, ...]:
-    """Return the names of the numbers of calibration parameters, in the smoother's order.
+    """Return the names of the scalar components of calibration parameters, in a fixed order.
 
     >>> numbers_of(["sensor_place", "wheelbase"])
     ('wheelbase', 'sensor_place_x', 'sensor_place_y')
@@ -170,7 +170,7 @@ def extended(
     dt: Durations,
     parameters: Int[np.ndarray, " q"],
 ) -> Odometry:
-    """Append control steps to odometry; ``parameters``: codes of the calibrated of them."""
+    """Return odometry extended by control steps; ``parameters``: codes of calibrated parameters."""
     steps = odometry.mean, odometry.covariance, odometry.slopes
     numbers = motion_numbers(motion)
     mean, covariance, slopes = _extended(steps, controls, dt, numbers, parameters)
@@ -179,7 +179,7 @@ def extended(
 
 
 def placed(start: Gaussian, odometry: Odometry, first: int = 0) -> Gaussian:
-    """Convert odometry from a start pose to world poses with covariances, from a step on."""
+    """Convert odometry to world poses with covariances, after each step from ``first`` on."""
     steps = odometry.mean[first:], odometry.covariance[first:]
     poses, spreads = _placed((start.mean, start.covariance), steps)
     return Gaussian(mean=poses, covariance=spreads)
@@ -202,7 +202,7 @@ def _extended(
     motion: MotionNumbers,
     parameters: Int[np.ndarray, " q"],
 ) -> Led:
-    """Append control steps to a sequence of poses relative to the last scan's pose."""
+    """Return poses relative to the last scan extended by control steps, with covariances."""
     (before, _, q), size = steps[2].shape, dt.size
     mean, covariance = np.empty((before + size, 3)), np.empty((before + size, 3, 3))
     slopes = np.empty((before + size, 3, q))

@@ -256,7 +256,7 @@ CALLER = 4
 
 
 class Front(NamedTuple):
-    """Distribution of the last state given the landmarks, and the information on landmarks."""
+    """Gaussian of the newest state given the landmarks, and the landmarks' information matrix."""
 
     C: Float[np.ndarray, "d n"]
     P: Float[np.ndarray, "d d"]

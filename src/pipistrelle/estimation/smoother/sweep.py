@@ -60,7 +60,7 @@ class Points:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Stretch:
-    """Trajectory segment: the state before it, and the conditionals stored by its elimination."""
+    """Trajectory segment with the results of its elimination: each state given the next."""
 
     first: int
     """First node."""
@@ -109,17 +109,17 @@ class Solution:
 
 
 class Sweep:
-    """Mutable forward elimination along a trajectory: the last state in relation to the map."""
+    """Mutable state of the smoother's forward pass, which eliminates pose after pose."""
 
     def __init__(self, history: History, noise: NoiseModel, points: Points) -> None:
-        """Prepare an elimination with all calibration parameters and no landmarks."""
+        """Prepare a forward pass with all calibration parameters and no landmarks."""
         self.history, self.noise, self.points = history, noise, points
         self.columns = np.zeros(len(history.placed), np.int64)
         self.stretches: list[Stretch] = []
         self.cost = 0.0
 
     def begin(self) -> None:
-        """Begin the elimination at the start pose, with the priors of the parameters."""
+        """Begin the forward pass at the start pose, with the priors of the parameters."""
         w, d = _room(1 + self.points.parameters.size), self.history.dimension
         self.front: Arrays = np.zeros((d, w)), np.zeros((d, d)), np.zeros((w, w))
         self.border = _padded(np.append(0.0, self.points.parameters), (w,))
@@ -136,7 +136,7 @@ class Sweep:
         front: Arrays,
         cost: float,
     ) -> None:
-        """Resume the elimination after segments that are already eliminated, from their results."""
+        """Resume the forward pass after already eliminated segments, from their results."""
         self.stretches, self.cost = list(stretches), cost
         self.columns[: columns.size], self.front = columns, tuple(map(np.copy, front))
         self.border = np.zeros(len(self.front[2]))
@@ -145,7 +145,7 @@ class Sweep:
         self._write_spots(np.flatnonzero(self.columns))
 
     def go_to_the_end(self) -> None:
-        """Eliminate all remaining segments of the trajectory."""
+        """Continue the forward pass through all remaining segments of the trajectory."""
         entering = self.history.entering
         for number in range(len(self.stretches), 1 + (self.history.nodes - 1) // STRETCH):
             self._open()
@@ -158,7 +158,7 @@ class Sweep:
                 self.part()
 
     def step(self) -> None:
-        """Predict the state to the last scan, before its measurements."""
+        """Predict the newest state to the last scan, before its measurements."""
         k = self.history.nodes - 1
         if k % STRETCH == 0:
             self.part()
@@ -172,12 +172,12 @@ class Sweep:
         )  # fmt: skip
 
     def hear(self) -> None:
-        """Update the state with the measurements of the last scan."""
+        """Update the newest state with the measurements of the last scan."""
         k = self.history.nodes - 1
         self._eliminate(k, k, k + 1)
 
     def join(self, numbers: Int[np.ndarray, " l"]) -> None:
-        """Add landmarks with their priors to the unknowns of the elimination."""
+        """Add landmarks with their priors to the unknowns of the forward pass."""
         if not numbers.size:
             return
         taken, column = {*self.columns.tolist()}, 1 + self.points.parameters.size
@@ -209,7 +209,7 @@ class Sweep:
             )
 
     def part(self) -> None:
-        """Eliminate the landmarks that are scheduled to leave after the last segment."""
+        """Eliminate the landmarks scheduled to leave the unknowns after the last segment."""
         stretch = self.history.leaves == len(self.stretches) - 1
         gone = np.flatnonzero(stretch & (self.columns > 0))
         if not gone.size:
@@ -242,7 +242,7 @@ class Sweep:
         )
 
     def _open(self) -> None:
-        """Begin a new trajectory segment at the current state."""
+        """Begin a new trajectory segment at the newest state."""
         d, w = self.front[0].shape
         none = np.empty(0, np.int64)
         self.stretches.append(
@@ -264,7 +264,7 @@ class Sweep:
         self.stretches[-1] = replace(last, links=last.links.extended(count))
 
     def _eliminate(self, stands: int, first: int, last: int) -> None:
-        """Eliminate the states of some scans of the last segment, adding to the cost."""
+        """Run the forward pass over some scans of the last segment, and add their cost."""
         stretch = self.stretches[-1]
         span = stands, first, last, self.size, stretch.first
         self.cost += eliminate(
@@ -367,7 +367,7 @@ def eliminated(
 
 
 def stepped(solution: Solution, history: History, noise: NoiseModel, guess: ChainState) -> Sweep:
-    """Extend a solution by a new scan's state, linearised at a guess; return the elimination."""
+    """Extend a solution's forward pass by a new scan's state, linearised at a guess; return it."""
     at = solution.points.at.extended(1)
     at.arrays[0][history.nodes - 1] = guess
     sweep = Sweep(history, noise, replace(solution.points, at=at))
@@ -446,7 +446,7 @@ def _beyond(points: Points, step: Float[np.ndarray, " u"], times: float) -> Poin
 
 @optimised_once
 def share_of(step: Float[np.ndarray, " u"], before: Float[np.ndarray, " u"]) -> float:
-    """Return the ratio of an optimisation step to the step before, or 0 if not to extrapolate."""
+    """Return the ratio of an optimisation step to the step before, or 0 if unfit to extrapolate."""
     along, size = 0.0, 0.0
     for i in range(step.size):
         along += step[i] * before[i]
@@ -505,7 +505,7 @@ def _earliest(
 
 
 def _links_of(stretch: Stretch) -> tuple[Arrays, int]:
-    """Return a segment's conditionals of each state given the next, and their number."""
+    """Return a segment's distributions of each state given the next, and their number."""
     arrays, size = stretch.links.arrays, stretch.links.size
     return (arrays, size) if stretch.first else (tuple(one[1:] for one in arrays), size - 1)
 
