@@ -60,11 +60,11 @@ class Association(ABC, Generic[M]):
 
     @abstractmethod
     def start(self) -> M:
-        """Return the association's memory (its state between scans) before the first scan."""
+        """Return the memory of data association, its state between scans, before the first scan."""
 
     @abstractmethod
     def associate(self, memory: M, belief: Belief, scan: Scan) -> tuple[M, Assignment]:
-        """Associate a scan: return the memory after it, and the assignment; change no argument."""
+        """Return the new memory and a scan's assignment to landmarks; change no argument."""
 
     def informed(self, memory: M, news: Any) -> M:
         """Add information from a later scan to an earlier memory, and return the memory."""

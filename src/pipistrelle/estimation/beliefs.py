@@ -60,14 +60,14 @@ def no_landmarks() -> Landmarks:
 
 
 def some_of(landmarks: Landmarks, rows: Bool[np.ndarray, " h"]) -> Landmarks:
-    """Return the rows of a map that a mask selects."""
+    """Return the part of a map that a mask of its rows selects."""
     return Landmarks(
         **{part.name: getattr(landmarks, part.name)[rows] for part in fields(Landmarks)}
     )
 
 
 def joined(some: Landmarks, others: Landmarks) -> Landmarks:
-    """Return a map with the rows of two maps."""
+    """Return a map that contains the landmarks of two maps, in this order."""
     names = [part.name for part in fields(Landmarks)]
     return Landmarks(
         **{name: np.concatenate((getattr(some, name), getattr(others, name))) for name in names}

@@ -96,7 +96,7 @@ class Found(NamedTuple):
 
 
 def searched(caller: Caller, moves: bool) -> tuple[Caller, CallerPlace | None]:
-    """Search for a caller's position if this is due; return its record, and a new position or None.
+    """Search for a caller's position if due; return its record, and the position if it is new.
 
     A second result is averaged with the first, or replaces it where they differ widely.
     """

@@ -286,7 +286,7 @@ class Rows(NamedTuple):
 
 
 class Places(NamedTuple):
-    """Index of each landmark's and caller's unknowns, and data for moving callers and sensor."""
+    """Index of the unknowns of landmarks and callers, and data on moving callers and sensor."""
 
     index: Int[np.ndarray, " s"]  # separator column; minus the index in the chain; 0: no variable
     first: Int[np.ndarray, " v"]  # node at which each moving caller joins the chain
