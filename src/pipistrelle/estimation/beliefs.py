@@ -129,7 +129,7 @@ NO_INNOVATIONS = Innovations()
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Track:
-    """An estimated trajectory, with a pose at the start and after each control step, and map."""
+    """An estimated trajectory (poses at the start and after each control step) and map."""
 
     time: Float[np.ndarray, " k"]
     """Times, (k) [s]."""

@@ -197,7 +197,7 @@ def weigh_and_share(
     aggregated: bool,
     share: Float[np.ndarray, " m"],
 ) -> float:
-    """Multiply hypotheses' weights by likelihoods, and write each hypothesis' share of an update.
+    """Multiply hypotheses' weights by their likelihoods; write how much each shares in an update.
 
     ``weights`` (Lambda) and ``share`` (rho) are written; hypotheses with a share of zero are not
     updated. Returns the log of the ray's likelihood, the sum of Lambda lambda, without constant.
