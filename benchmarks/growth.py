@@ -93,10 +93,10 @@ def _mapped(landmarks: int) -> dict[str, float]:
     from pipistrelle.detection.scans import make_scan
     from pipistrelle.estimation.beliefs import Gaussian
     from pipistrelle.estimation.catalogue import entry
-    from pipistrelle.experiments.hearing.scenario import motion_of
+    from pipistrelle.experiments.hearing.scenario import true_motion
 
     rng, label = np.random.default_rng(landmarks), np.arange(landmarks)
-    slam = entry("ekf").build(Config(), motion_of(Config().motion))
+    slam = entry("ekf").build(Config(), true_motion(Config().motion))
     start = slam.init(Gaussian(mean=np.zeros(3), covariance=np.eye(3)))
     noise = {"bearing_std": 0.15, "range_std": 0.2}
     bearing, distance = rng.uniform(-3.0, 3.0, landmarks), rng.uniform(2.0, 20.0, landmarks)

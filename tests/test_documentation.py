@@ -173,13 +173,13 @@ def test_the_guides_filter_drives_a_mission(guide):
     from pipistrelle.config import Config, ScenarioConfig
     from pipistrelle.estimation.catalogue import entry
     from pipistrelle.experiments.hearing.scenario import draw_scenario
-    from pipistrelle.experiments.hearing.trajectories import motion_of
+    from pipistrelle.experiments.hearing.trajectories import true_motion
     from pipistrelle.experiments.runs.heard_world import drive_of
     from pipistrelle.experiments.runs.trial import run_filter
 
     config = Config(scenario=ScenarioConfig(steps=40, landmarks=3))
     world = draw_scenario(config, np.random.default_rng(7))
-    lost = guide["DeadReckoning"](motion=motion_of(config.motion))
+    lost = guide["DeadReckoning"](motion=true_motion(config.motion))
     track = run_filter(lost, drive_of(world, config), (), np.random.default_rng(7))
     ekf = entry("ekf").build(config, lost.motion)
     same = run_filter(ekf, drive_of(world, config), (), np.random.default_rng(7))
@@ -309,7 +309,7 @@ def test_the_guides_filter_goes_by_its_name(tmp_path, monkeypatch):
     from pipistrelle.config import Config
     from pipistrelle.estimation.beliefs import Gaussian
     from pipistrelle.estimation.catalogue import entry
-    from pipistrelle.experiments.hearing.scenario import motion_of
+    from pipistrelle.experiments.hearing.scenario import true_motion
 
     texts = [text for text in blocks("python", DOCS / "extending.md") if "Reckoning" in text]
     (tmp_path / "guided.py").write_text("".join(texts))
@@ -318,7 +318,7 @@ def test_the_guides_filter_goes_by_its_name(tmp_path, monkeypatch):
     config, sure = Config(), Gaussian(mean=np.zeros(3), covariance=np.zeros((3, 3)))
     spread = []
     for name in ("DeadReckoning", "WarierReckoning"):
-        slam = entry(f"guided:{name}").build(config, motion_of(config.motion))
+        slam = entry(f"guided:{name}").build(config, true_motion(config.motion))
         spread.append(slam.predict(slam.init(sure), np.ones((1, 2)), np.ones(1), None)[1])
     np.testing.assert_allclose(4.0 * spread[0].covariance, spread[1].covariance, rtol=1e-12)
     assert entry("guided:WarierReckoning").title == "Dead reckoning, warier"

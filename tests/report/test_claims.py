@@ -8,7 +8,7 @@ import pytest
 
 from pipistrelle.estimation.motion import motion_step
 from pipistrelle.evaluation.comparison import pooled_std
-from pipistrelle.experiments.hearing.trajectories import motion_of
+from pipistrelle.experiments.hearing.trajectories import true_motion
 from pipistrelle.report import claims
 from pipistrelle.report.claims import (
     COMPARED,
@@ -312,7 +312,7 @@ def turning(small, **scenario):
 def test_a_lap_takes_the_time_of_a_turn_of_the_motion_model(small):
     config = small.config
     controls = np.array([config.scenario.speed, config.scenario.steering])
-    pose = motion_step(motion_of(config.motion), np.zeros(3), controls, config.scenario.step)
+    pose = motion_step(true_motion(config.motion), np.zeros(3), controls, config.scenario.step)
     assert lap_time(small) == pytest.approx(2 * np.pi / pose[2] * config.scenario.step, rel=1e-9)
     assert lap_time(small) == pytest.approx(62.1, abs=0.05), "as the paper's drive: three laps"
 

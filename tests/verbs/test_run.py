@@ -59,7 +59,7 @@ def test_a_run_prints_its_stages_scores_and_folder(obey):
     assert {"mission.png", "mission.pdf", "config.toml"} <= {p.name for p in Path("one").iterdir()}
 
 
-def test_listening_is_told_by_the_finite_scores_of_each_estimator():
+def test_fused_sensing_is_compared_with_active_by_the_finite_scores_of_each_estimator():
     active = {"landmarks_full": 20, "position_rmse_aligned_m": 0.018, "map_rmse_shared_m": 0.041}
     fused = {"landmarks_full": 38, "position_rmse_aligned_m": 0.013, "map_rmse_shared_m": 0.008}
     far = {"landmarks_full": 9, "position_rmse_aligned_m": inf, "position_rmse_m": inf}

@@ -106,7 +106,7 @@ def test_a_caller_that_moves_is_followed_in_a_log_without_an_excess_path(obey, u
 def told_by_poses(log, folder):
     """Write a log's drive as poses of a recorder, with what each step's noise comes to."""
     recorded = read_log(log)
-    motions = as_motions(replay.motion_of(recorded), recorded.controls, recorded.dt)
+    motions = as_motions(replay.log_motion(recorded), recorded.controls, recorded.dt)
     shutil.copytree(log, folder)
     text = poses_file((40.0, -7.0, 2.5), motions, recorded.time)
     (folder / "odometry.csv").write_text(text)

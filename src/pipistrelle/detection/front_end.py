@@ -72,8 +72,8 @@ from pipistrelle.detection.snapshots import (
     Columns,
     Detections,
     Detector,
-    columns_of,
     detect,
+    detection_columns,
     detections_at,
     detector,
     direct_of_faces,
@@ -134,7 +134,7 @@ def average_faces(
     (array([41.]), array([3.43]))
     """
     direct = detections.direct or DirectCalls(np.empty(0, np.int64), np.empty(0), np.empty(0), 0.0)
-    found, clutter = tuple(columns_of(detections)), np.count_nonzero(label == UNLABELLED)
+    found, clutter = tuple(detection_columns(detections)), np.count_nonzero(label == UNLABELLED)
     landmark, caller, numbers = _average(
         label, found, tuple(direct), averaging == "weighted", speed_of_sound
     )
@@ -160,7 +160,7 @@ def same_echo(
     array([0, 0, 1])
     """
     order = np.argsort(-detections.power, kind="stable")
-    return _number(order, columns_of(detections), delay_gate, bearing_gate)
+    return _number(order, detection_columns(detections), delay_gate, bearing_gate)
 
 
 @kernel

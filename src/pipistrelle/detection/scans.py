@@ -311,7 +311,7 @@ def labelled(scan: Scan, label: Int[np.ndarray, " m"]) -> Scan:
     >>> merged.landmark, merged.bearing.round(9), merged.bearing_std.round(4)
     (array([7]), array([0.3]), array([0.0707]))
     """
-    if label is scan.landmark and settled(label, scan.bearing):
+    if label is scan.landmark and is_merged(label, scan.bearing):
         return scan
     label = _checked(scan, np.asarray(label))
     if scan.direct.size:
@@ -341,7 +341,7 @@ def _checked(scan: Scan, label: np.ndarray) -> Int[np.ndarray, " m"]:
 
 
 @kernel
-def settled(label: Int[np.ndarray, " m"], bearing: Float[np.ndarray, " m"]) -> bool:
+def is_merged(label: Int[np.ndarray, " m"], bearing: Float[np.ndarray, " m"]) -> bool:
     """Return whether all rows are labelled and merged, with rows without a bearing at the end."""
     for m in range(label.size):
         bare = math.isnan(bearing[m])

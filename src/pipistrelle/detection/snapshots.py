@@ -106,7 +106,7 @@ class Columns(NamedTuple):
     delay_std: Float[np.ndarray, " m"]
 
 
-def columns_of(detections: Detections) -> Columns:
+def detection_columns(detections: Detections) -> Columns:
     """Return the columns of detections as a tuple, for compiled functions."""
     d = detections
     return Columns(

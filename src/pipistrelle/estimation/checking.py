@@ -31,8 +31,8 @@ from pipistrelle.detection.scans import (
     RANGE_STD,
     UNLABELLED,
     Scan,
+    is_merged,
     labelled,
-    settled,
 )
 from pipistrelle.estimation.beliefs import Gaussian, Landmarks
 from pipistrelle.estimation.motion import MOVED, Controls, Durations, Motion
@@ -294,7 +294,7 @@ def _fault(
     for label in moving:
         if label < 0 or label >= LABELS_END:
             return NO_CALLERS
-    return 0 if settled(landmark, numbers[BEARING]) else UNSETTLED
+    return 0 if is_merged(landmark, numbers[BEARING]) else UNSETTLED
 
 
 @kernel

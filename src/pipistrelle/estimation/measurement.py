@@ -61,7 +61,7 @@ Timings = tuple[Int[np.ndarray, " m"], Int[np.ndarray, " callers"], Int[np.ndarr
 """Caller of each measurement of a scan; labels of the callers, and of the moving callers."""
 
 
-def columns_of(scan: Scan) -> Columns:
+def scan_columns(scan: Scan) -> Columns:
     """Return a scan's labels and numbers as a tuple of arrays, for compiled functions."""
     return scan.landmark, np.ascontiguousarray(scan.numbers)
 
@@ -102,7 +102,7 @@ def excess_paths(columns: Columns, timings: Timings) -> ExcessPaths:
     >>> timed = {"excess_path": np.array([3.0, np.nan, 2.0]), "excess_path_std": 0.5}
     >>> scan = make_scan(0.0, np.array([4, 5, 9]), np.zeros(3), caller=1, **timed)
     >>> scan = replace(scan, callers=np.array([-1, 9]))
-    >>> of = excess_paths(columns_of(scan), timings_of(scan))
+    >>> of = excess_paths(scan_columns(scan), timings_of(scan))
     >>> of.landmark, of.caller, of.variance
     (array([4]), array([9]), array([0.25]))
     """
@@ -124,7 +124,7 @@ def caller_labels(scan: Scan) -> Int[np.ndarray, " m"]:
     """Return the caller's label for each measurement with an excess path, else UNLABELLED."""
     labels, timings = np.full(scan.landmark.size, UNLABELLED), timings_of(scan)
     if timings is not None:
-        found = excess_paths(columns_of(scan), timings)
+        found = excess_paths(scan_columns(scan), timings)
         labels[found.row] = found.caller
     return labels
 

@@ -209,7 +209,7 @@ def ends(found: Iterable[Series]) -> list[float]:
     ]
 
 
-def columns_of(count: int) -> int:
+def column_count(count: int) -> int:
     """Return how many columns a figure has for a number of panels.
 
     Up to `style.MAX_COLUMNS` panels are in a single row; more have that many columns if they fill
@@ -274,7 +274,7 @@ def draw_chart(chart: Chart) -> "Figure":
     count = len(chart.panels)
     if count == 0:
         raise ValueError("a chart's figure needs at least one panel")
-    columns = columns_of(count)
+    columns = column_count(count)
     rows = -(-count // columns)
     height = ROW
     if (first := chart.panels[0]).equal:

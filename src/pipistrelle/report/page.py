@@ -22,7 +22,7 @@ from pipistrelle import __version__
 from pipistrelle.evaluation.bound import IN_ONE_WORLD
 from pipistrelle.evaluation.comparison import INTERVALS
 from pipistrelle.evaluation.scores import shown_in
-from pipistrelle.figures.chart import Chart, columns_of, csv_rows, csv_text
+from pipistrelle.figures.chart import Chart, column_count, csv_rows, csv_text
 from pipistrelle.figures.style import page_colours
 from pipistrelle.files import REPORT, claim, drawn_files, upright
 from pipistrelle.report import claims as paper
@@ -271,7 +271,7 @@ def _figure(views: Mapping[Any, Chart], rules: Sequence[str]) -> dict[str, Any]:
         "name": first.name,
         "title": first.title,
         "by_rule": by_rule,
-        "columns": count if count <= 4 else columns_of(count),  # the style has four as two by two
+        "columns": count if count <= 4 else column_count(count),  # the style has four as two by two
         "place": "",
     }
 

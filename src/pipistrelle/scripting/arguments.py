@@ -243,10 +243,10 @@ def mission_settings(door: Door) -> tuple[Config, "World | None", tuple[str, ...
 
         layer = with_array(layer)
     if WORLD_KEY in layer:
-        from pipistrelle.experiments.hearing.world_folder import named_world, settled
+        from pipistrelle.experiments.hearing.world_folder import named_world, with_world
 
         world = named_world(layer)
-        layer = layer if world is None else settled(world, layer)
+        layer = layer if world is None else with_world(world, layer)
     layer, estimators = over_named(layer, default=door.default)
     base, more = resolve(layer), {}
     if duration.value is not None:

@@ -30,7 +30,7 @@ from pipistrelle.estimation.motion import relative_motions
 from pipistrelle.estimation.session import REMEMBERED
 from pipistrelle.experiments.drives import carried
 from pipistrelle.experiments.named_settings import own_config
-from pipistrelle.experiments.runs.replay import motion_of
+from pipistrelle.experiments.runs.replay import log_motion
 from pipistrelle.geometry import range_and_bearing, wrap
 from pipistrelle.scripting.arguments import has_excess_paths
 
@@ -474,7 +474,7 @@ def _path(recorded: "Log", rate: float) -> _Path:
     controls = recorded.controls.copy()
     if recorded.motion != "poses":
         controls[:, 1] *= rate
-    steps, noise = relative_motions(motion_of(recorded), controls, recorded.dt)
+    steps, noise = relative_motions(log_motion(recorded), controls, recorded.dt)
     heading = recorded.initial_pose[2] + np.concatenate([[0.0], np.cumsum(steps[:, 2])])
     c, s = np.cos(heading), np.sin(heading)
     ahead = np.array([[c[:-1], -s[:-1]], [s[:-1], c[:-1]]])

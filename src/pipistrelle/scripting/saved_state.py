@@ -33,8 +33,8 @@ from pipistrelle.estimation.beliefs import Gaussian, Innovations, JointGaussian,
 from pipistrelle.estimation.catalogue import CATALOGUE, names_class
 from pipistrelle.estimation.data_association.existence import Known
 from pipistrelle.estimation.data_association.rows import (
-    Caller,
     CallerPlace,
+    CallerState,
     EarlyScan,
     Memory,
     ScanRows,
@@ -83,8 +83,8 @@ LARGEST = np.sqrt(np.finfo(np.float64).max)
 RECORDS: dict[str, Any] = {
     kind.__name__: kind
     for kind in (
-        Caller, CallerPlace, Calibration, EarlyScan, EkfBelief, FastSlamBelief, Gaussian, History,
-        Innovations, JointGaussian, Known, Landmarks, Memory, NoiseModel, Odometry, Points,
+        Calibration, CallerPlace, CallerState, EarlyScan, EkfBelief, FastSlamBelief, Gaussian,
+        History, Innovations, JointGaussian, Known, Landmarks, Memory, NoiseModel, Odometry, Points,
         RayConfig, Scan, ScanRows, SessionState, SmootherBelief, Solution, Stack, StoredScan,
         Stretch, Tracks,
     )

@@ -149,7 +149,7 @@ def closing_table(
 
 
 def listening(estimates: Iterable[tuple[str, str, Mapping[str, Any]]]) -> Iterator[str]:
-    """Yield for each estimator a sentence on how fused sensing changes what active sensing gives.
+    """Yield a sentence for each estimator that compares its fused with its active sensing.
 
     `estimates`: strategy, estimator and scores of each.
     """

@@ -14,7 +14,7 @@ from pipistrelle.detection.logs.folder import read_log, write_log
 from pipistrelle.detection.logs.poses import jumps, motions_between, poses_along, relative_motions
 from pipistrelle.detection.logs.recording import assemble
 from pipistrelle.estimation.motion import Motion, motion_jacobians, motion_noise, motion_step
-from pipistrelle.experiments.runs.replay import motion_of
+from pipistrelle.experiments.runs.replay import log_motion
 from pipistrelle.geometry import wrap
 from pipistrelle.text_tables import Table
 from reference.odometry import ANYONE, COVARIANCE, as_motions, poses_file, wandering
@@ -96,7 +96,7 @@ def test_controls_are_motions_relative_to_the_previous_pose(tmp_path):
     np.testing.assert_allclose(log.controls, by_hand, rtol=0, atol=1e-15)
     assert log.time.tolist() == [0.0, 0.1, 0.3, 0.4]
     assert (log.motion, log.control_std, log.noise_at_rest) == ("poses", (0.02, 0.01, 0.03), True)
-    assert motion_of(log) == Motion(model="poses", control_std=(0.02, 0.01, 0.03))
+    assert log_motion(log) == Motion(model="poses", control_std=(0.02, 0.01, 0.03))
 
 
 def test_turns_are_wrapped_to_the_shorter_direction():
@@ -223,7 +223,7 @@ def test_a_rows_covariance_is_of_the_motion_that_ends_there(tmp_path):
     assert log.controls[0].tolist() == [1, 0, 0, 4, 0.5, -0.3, 2, 0.1, 1]
     assert np.isnan(log.controls[1, 3:]).all()
     np.testing.assert_array_equal(
-        motion_noise(motion_of(log), log.controls[1]).diagonal(), np.square([0.02, 0.01, 0.03])
+        motion_noise(log_motion(log), log.controls[1]).diagonal(), np.square([0.02, 0.01, 0.03])
     )
 
 

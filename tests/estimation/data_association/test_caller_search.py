@@ -13,8 +13,8 @@ from pipistrelle.estimation.data_association.caller_search import (
 )
 from pipistrelle.estimation.data_association.pairs import Rows
 from pipistrelle.estimation.data_association.rows import (
-    Caller,
     CallerPlace,
+    CallerState,
     Tracks,
     followed,
     in_window,
@@ -84,7 +84,7 @@ def found_first(factor, *, scans=20, **drive):
     """Return a caller that was found at so many times its range, and what it was heard of since."""
     tracks, poses = heard(3, scans=scans, **drive)
     x, y = poses[0, :2] + factor * (CALLER - poses[0, :2])
-    return Caller(label=1, place=CallerPlace(x, y), told=True, tracks=tracks)
+    return CallerState(label=1, place=CallerPlace(x, y), told=True, tracks=tracks)
 
 
 def test_where_a_second_search_disagrees_the_mean_of_both_is_taken():
@@ -122,11 +122,11 @@ def test_an_unsuccessful_second_search_ends_after_30_scans():
 
 def test_a_late_or_moving_caller_is_searched_for_once():
     for scans, moves, once in ((8, False, False), (18, False, False), (20, False, True)):
-        unknown = Caller(label=1, tracks=heard(3, scans=scans)[0])
+        unknown = CallerState(label=1, tracks=heard(3, scans=scans)[0])
         assert searched(unknown, moves)[1].agreed == once, scans
-    unknown = Caller(label=1, tracks=heard(3, scans=12)[0])
+    unknown = CallerState(label=1, tracks=heard(3, scans=12)[0])
     assert searched(unknown, moves=True)[1].agreed
-    unknown = Caller(label=1, tracks=heard(3, scans=9)[0])
+    unknown = CallerState(label=1, tracks=heard(3, scans=9)[0])
     assert searched(unknown, moves=False) == (unknown, None)
 
 

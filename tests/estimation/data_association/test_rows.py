@@ -13,8 +13,8 @@ from pipistrelle.estimation.data_association.rows import (
     RAREST,
     SURE_SHARE,
     compared,
+    label_matched,
     rows_of_scan,
-    settled,
 )
 
 LIMITS = 0.05, 0.35, 0.25
@@ -56,7 +56,7 @@ def test_a_row_next_to_a_louder_row_begins_no_landmark(apart, begun):
     assert costs.shape == (2, 0)
     assert not close.any()
     matched = used, np.full(2, -1), close
-    found, count = settled(label, tuple(rows), joint, none, matched, caller, CHANCES)
+    found, count = label_matched(label, tuple(rows), joint, none, matched, caller, CHANCES)
     assert found.tolist() == begun
     assert count == (0, 2)
 

@@ -12,7 +12,7 @@ from pipistrelle.estimation.beliefs import JointGaussian
 from pipistrelle.estimation.data_association.caller_search import turned
 from pipistrelle.estimation.data_association.existence import nobody, with_new
 from pipistrelle.estimation.data_association.pairs import pair_costs
-from pipistrelle.estimation.data_association.rows import Caller, CallerPlace, Memory
+from pipistrelle.estimation.data_association.rows import CallerPlace, CallerState, Memory
 from pipistrelle.estimation.data_association.sequential import association_of
 from pipistrelle.estimation.measurement import excess_path_slopes
 
@@ -71,7 +71,7 @@ def test_rows_of_a_misplaced_caller_begin_no_landmark(moves, hears_itself, heard
     known = with_new(nobody(2), list(range(1, size + 1)), 0, 2)._replace(
         confirmed=np.ones(size, bool), source=source
     )
-    caller = Caller(label=size + 1, place=CallerPlace(*EXPECTED), told=True)
+    caller = CallerState(label=size + 1, place=CallerPlace(*EXPECTED), told=True)
     memory = Memory(scan=5, labels=size + 1, known=known, callers={1: caller})
     bearing = np.append(np.arange(-3.0, 3.0, 0.3), np.arctan2(EXPECTED[1], EXPECTED[0]))
     heard = make_scan(

@@ -25,7 +25,7 @@ from pipistrelle.experiments.hearing.scenario import (
     standing_landmarks,
     world_of,
 )
-from pipistrelle.experiments.hearing.trajectories import course_of, driven, motion_of
+from pipistrelle.experiments.hearing.trajectories import course_of, driven, true_motion
 from pipistrelle.experiments.runs.heard_world import drive_of, scans_of
 from pipistrelle.geometry import wrap
 from pipistrelle.settings import from_flags, resolve
@@ -48,7 +48,7 @@ def paper(**scenario):
 
 def world_as_ever(config, iteration):
     """Draw the paper's world by itself: path, then beacon, then landmarks."""
-    setup, motion = config.scenario, motion_of(config.motion)
+    setup, motion = config.scenario, true_motion(config.motion)
     rng = np.random.default_rng(stream_key(config.seed, iteration, "scenario"))
     path, _ = driven(course_of(setup, motion), setup, motion, rng)
     for _ in range(MAX_DRAWS):

@@ -10,7 +10,7 @@ from pipistrelle.experiments.hearing.scenario import (
     draw_scenario,
     standing_landmarks,
 )
-from pipistrelle.experiments.hearing.trajectories import motion_of
+from pipistrelle.experiments.hearing.trajectories import true_motion
 
 SEEDS = range(12)
 
@@ -72,7 +72,7 @@ def test_a_longer_wheelbase_turns_the_vehicle_less_and_its_filters_know(wheelbas
     path = draw_scenario(config, np.random.default_rng(7)).path
     turned = 0.75 * 0.125 * np.sin(0.027) / wheelbase
     np.testing.assert_allclose(np.diff(path[:, 2]), turned, rtol=1e-9)
-    assert motion_of(motion).wheelbase == wheelbase
+    assert true_motion(motion).wheelbase == wheelbase
 
 
 def test_controls_are_nominal_and_the_path_is_not():

@@ -21,7 +21,7 @@ from pipistrelle.experiments.hearing.world_folder import (
     laid_over,
     named_world,
     read_world,
-    settled,
+    with_world,
     world_files,
 )
 from pipistrelle.experiments.runs.validate import checked_scenario
@@ -54,7 +54,7 @@ def test_a_world_that_was_drawn_is_read_back_to_the_bit(tmp_path, model):
     OwnFiles(tmp_path / "w", WORLD).replace(world_files(drawn, config))
     layer = from_flags({"scenario": {"world": str(tmp_path / "w")}, "seed": 99})
     world = named_world(layer)
-    again_config = resolve(settled(world, layer))
+    again_config = resolve(with_world(world, layer))
     again = heard(again_config, world)
     for name in ("time", "path", "controls", "landmarks"):
         assert getattr(again, name).tobytes() == getattr(drawn, name).tobytes()
@@ -71,7 +71,7 @@ def test_a_second_vehicles_world_is_read_back_as_a_single_vehicles(tmp_path):
     OwnFiles(tmp_path / "w", WORLD).replace(world_files(drawn, config))
     layer = from_flags({"scenario": {"world": str(tmp_path / "w")}})
     world = named_world(layer)
-    again_config = resolve(settled(world, layer))
+    again_config = resolve(with_world(world, layer))
     again = heard(again_config, world)
     assert again_config.scenario.vehicle == 1
     for one, other in zip(again.callers, drawn.callers, strict=True):
@@ -170,18 +170,18 @@ def test_columns_determine_the_kind_of_a_path(tmp_path):
 
 def test_steps_follow_from_the_path_unless_given(tmp_path):
     world = read_world(folder_with(tmp_path, path_csv="x,y\n0,0\n7.5,0\n"))
-    assert resolve(settled(world, {})).scenario.steps == 80
+    assert resolve(with_world(world, {})).scenario.steps == 80
     fast = from_flags({"scenario": {"speed": 1.5}})
-    assert resolve(settled(world, fast)).scenario.steps == 40
+    assert resolve(with_world(world, fast)).scenario.steps == 40
     given = from_flags({"scenario": {"steps": 10}})
-    assert resolve(settled(world, given)).scenario.steps == 10
+    assert resolve(with_world(world, given)).scenario.steps == 10
 
 
 def test_a_worlds_settings_are_beneath_all_others_and_over_a_plans_in_its_grid(tmp_path):
     folder = folder_with(tmp_path, world_toml="format = 1\n[config]\nair.temperature_c = 5.0\n")
     world, warm = read_world(folder), from_flags({"air": {"temperature_c": 30.0}})
-    assert resolve(settled(world, {})).air.temperature_c == 5.0
-    assert resolve(settled(world, warm)).air.temperature_c == 30.0
+    assert resolve(with_world(world, {})).air.temperature_c == 5.0
+    assert resolve(with_world(world, warm)).air.temperature_c == 30.0
     assert resolve(laid_over(world, warm, {})).air.temperature_c == 5.0
     assert resolve(laid_over(world, {}, warm)).air.temperature_c == 30.0
 
@@ -227,7 +227,7 @@ def test_callers_in_the_settings_override_the_worlds_except_in_a_grid(tmp_path):
     names = [
         heard(resolve(over), world).callers[1].name
         for over in (
-            settled(world, layer),
+            with_world(world, layer),
             laid_over(world, layer, {}),
             laid_over(world, {}, layer),
         )
@@ -407,8 +407,8 @@ def test_a_folder_without_a_world_is_refused(tmp_path):
 def test_settings_that_contradict_the_world_are_refused(tmp_path):
     world = read_world(folder_with(tmp_path, landmarks_csv=LANDMARKS))
     more = from_flags({"scenario": {"landmarks": 7}})
-    for settle in (lambda: settled(world, more), lambda: laid_over(world, {}, more)):
+    for settle in (lambda: with_world(world, more), lambda: laid_over(world, {}, more)):
         with pytest.raises(InputError, match=r"--scenario\.landmarks: found 7, but .* has 2"):
             settle()
-    assert resolve(settled(world, from_flags({"scenario": {"landmarks": 2}})))
+    assert resolve(with_world(world, from_flags({"scenario": {"landmarks": 2}})))
     assert World(name="any").settings == {}

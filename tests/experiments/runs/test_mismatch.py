@@ -7,7 +7,7 @@ from pipistrelle.arithmetic.random_stream import stream_key
 from pipistrelle.config import AssumedConfig, Config, FilterConfig, MotionConfig, ScenarioConfig
 from pipistrelle.evaluation.bound import bound_of_drawn_start, pose_bound
 from pipistrelle.experiments.hearing.scenario import assumed_motion, standing_landmarks, world_of
-from pipistrelle.experiments.hearing.trajectories import motion_of
+from pipistrelle.experiments.hearing.trajectories import true_motion
 from pipistrelle.experiments.runs.heard_world import drive_of, scans_of
 from pipistrelle.experiments.runs.trial import run_mission
 from pipistrelle.experiments.studies.plan import Plan
@@ -22,7 +22,7 @@ def with_(**sections):
 
 def test_assumptions_default_to_the_truth():
     config = with_(motion=MotionConfig(wheelbase=0.4, speed_std=0.2))
-    assert assumed_motion(config) == motion_of(config.motion)
+    assert assumed_motion(config) == true_motion(config.motion)
     assert config.assumed_sound_speed == config.air.sound_speed
 
 
@@ -104,7 +104,7 @@ def test_the_bound_of_a_drawn_start_includes_its_uncertainty():
     )
     scans = scans_of(missions[1].heard, "fused", measured)
     B = pose_bound(
-        motion_of(drawn.motion), world.controls, world.time, world.path,
+        true_motion(drawn.motion), world.controls, world.time, world.path,
         standing_landmarks(world), scans,
     )  # fmt: skip
     P = bound_of_drawn_start(B, world.path, np.diag(np.square(drawn.filter.initial_pose_std)))

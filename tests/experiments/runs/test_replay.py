@@ -17,7 +17,7 @@ from pipistrelle.estimation.measurement import excess_path_of
 from pipistrelle.estimation.motion import Motion, motion_step
 from pipistrelle.experiments.drives import NO_TRUTH, Truth
 from pipistrelle.experiments.results.writing import run_entry, tables_of
-from pipistrelle.experiments.runs.replay import as_heard_by, drive_of, load, motion_of, replay
+from pipistrelle.experiments.runs.replay import as_heard_by, drive_of, load, log_motion, replay
 from pipistrelle.experiments.runs.truth_files import read_truth, write_truth
 from pipistrelle.geometry import range_and_bearing
 from pipistrelle.scripting.arguments import with_log
@@ -378,12 +378,12 @@ def test_fused_is_the_union_of_active_and_passive():
 
 def test_the_filters_take_the_logs_motion_and_start():
     log = read_log(DATA / "bicycle_log")
-    motion, start = motion_of(log), drive_of(log, NO_TRUTH).start
+    motion, start = log_motion(log), drive_of(log, NO_TRUTH).start
     assert (motion.model, motion.control_std, motion.wheelbase) == ("bicycle", (0.1, 0.03), 0.2)
     assert motion.noise_at_rest
     assert start.mean.tolist() == [0.0, -1.0, 0.0]
     assert start.covariance.tolist() == np.diag([0.05**2, 0.05**2, 0.0436**2]).tolist()
-    assert not motion_of(load(MADE_UP, 1)[0]).noise_at_rest
+    assert not log_motion(load(MADE_UP, 1)[0]).noise_at_rest
 
 
 # How sure a measurement is

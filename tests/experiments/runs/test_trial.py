@@ -22,7 +22,7 @@ from pipistrelle.estimation.motion import Motion
 from pipistrelle.experiments.drives import Drive
 from pipistrelle.experiments.hearing.listening import listen
 from pipistrelle.experiments.hearing.scenario import draw_scenario
-from pipistrelle.experiments.hearing.trajectories import motion_of
+from pipistrelle.experiments.hearing.trajectories import true_motion
 from pipistrelle.experiments.named_settings import Case
 from pipistrelle.experiments.results.scores import score_path
 from pipistrelle.experiments.runs.heard_world import drive_of, scans_of
@@ -327,7 +327,7 @@ def test_a_path_that_is_revised_is_nearer_to_the_truth():
 
 @pytest.mark.parametrize("name", ["ekf", "fastslam"])
 def test_a_filter_predicts_after_its_only_scan_at_the_start(name):
-    motion = motion_of(Config().motion)
+    motion = true_motion(Config().motion)
     known = replace(drive(5), motion=motion)
     first = scan_with([3, 4], [0.1, -0.2], [2.0, np.nan], time=0.0)
     track = run_filter(entry(name).build(Config(), motion), known, [first], RNG(7))

@@ -1,7 +1,7 @@
 """The log of a ROS bag: rows of odometry and of echoes, made from its messages.
 
 Messages of the chosen topics are read one at a time, so memory holds only the rows. The log's
-`notes` list the choice of topics and the conversions. The functions from `motion_of` on convert
+`notes` list the choice of topics and the conversions. The functions from `odometry_use` on convert
 live messages, one at a time, to the arguments of `Slam.move` and `Slam.hear`.
 
 The poses of sensors on the vehicle come from static transforms. A transform converts points of the
@@ -542,7 +542,7 @@ def _converted(topic: str, rows: TopicEchoes, mounts: dict[str, Pose], base: str
 _LIVE = Path("ROS")
 
 
-def motion_of(model: str) -> Literal["poses", "twist"]:
+def odometry_use(model: str) -> Literal["poses", "twist"]:
     """Return whether a motion model uses the "poses" or the "twist" of odometry messages."""
     if model in ("poses", "unicycle"):
         return "poses" if model == "poses" else "twist"

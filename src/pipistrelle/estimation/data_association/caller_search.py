@@ -45,8 +45,8 @@ from pipistrelle.estimation.data_association.pairs import (
 )
 from pipistrelle.estimation.data_association.rows import (
     TURN,
-    Caller,
     CallerPlace,
+    CallerState,
     EarlyScan,
     Tracks,
     in_window,
@@ -95,7 +95,7 @@ class Found(NamedTuple):
         return self.ahead > CLEARLY and self.misfit < WELL and self.tracks >= LEAST_TRACKS
 
 
-def searched(caller: Caller, moves: bool) -> tuple[Caller, CallerPlace | None]:
+def searched(caller: CallerState, moves: bool) -> tuple[CallerState, CallerPlace | None]:
     """Search for a caller's position if due; return its record, and the position if it is new.
 
     A second result is averaged with the first, or replaces it where they differ widely.
@@ -120,7 +120,7 @@ def searched(caller: Caller, moves: bool) -> tuple[Caller, CallerPlace | None]:
     return caller, CallerPlace(x, y, agreed=True)
 
 
-def _agreed(caller: Caller, place: CallerPlace) -> Caller:
+def _agreed(caller: CallerState, place: CallerPlace) -> CallerState:
     """Fix a caller's position and end its search; return its record."""
     return replace(caller, place=place._replace(agreed=True), tracks=Tracks())
 

@@ -145,7 +145,7 @@ def merged(known: Known, pairs: Sequence[tuple[int, int]]) -> Known:
     return some(after, ~is_among(after.label, np.array([gone for _, gone in pairs])))
 
 
-Heard = tuple[
+RowColumns = tuple[
     Int[np.ndarray, " m"],
     Int[np.ndarray, " m"],
     Float[np.ndarray, " m"],
@@ -165,7 +165,7 @@ Place = tuple[
 
 def judged(
     known: Known,
-    rows: Heard,
+    rows: RowColumns,
     place: Place,
     near: Bool[np.ndarray, " l"],
     scan: int,
@@ -188,7 +188,7 @@ def _copied(columns: tuple[np.ndarray, ...]) -> tuple[np.ndarray, ...]:
 @kernel
 def _judge(
     columns: tuple[np.ndarray, ...],
-    rows: Heard,
+    rows: RowColumns,
     there: Place,
     near: Bool[np.ndarray, " l"],
     scan: Whole,
@@ -278,7 +278,7 @@ def _missed(
     c: Whole,
     far: float,
     bearing: float,
-    rows: Heard,
+    rows: RowColumns,
     place: Place,
     hidden: bool,
     sight: Sight,
@@ -317,7 +317,7 @@ def _missed(
 
 
 @no_alloc
-def _in_sight(far: float, bearing: float, rows: Heard, sight: Sight) -> bool:
+def _in_sight(far: float, bearing: float, rows: RowColumns, sight: Sight) -> bool:
     """Return whether a sensor without echo levels (a lidar) should have detected a landmark."""
     _, caller, way, level, seen, _ = rows
     if far > WITHIN * sight[0] or abs(bearing) > 0.5 * sight[1] - BEFORE:

@@ -319,7 +319,7 @@ def part_of(heard: ScanRows, rows: Int[np.ndarray, " r"], spread: float) -> tupl
 
 
 @kernel
-def settled(
+def label_matched(
     label: Int[np.ndarray, " m"],
     rows: tuple[np.ndarray, ...],
     joint: Joint,
@@ -407,7 +407,7 @@ class CallerPlace(NamedTuple):
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Caller:
+class CallerState:
     """A caller's state in data association: label, position, tracks, and test of the position."""
 
     label: int
@@ -442,7 +442,7 @@ class Memory:
     labels: int = 0
     """Number of labels issued."""
     known: Known = field(default_factory=lambda: nobody(1))
-    callers: Mapping[int, Caller] = field(default_factory=dict)
+    callers: Mapping[int, CallerState] = field(default_factory=dict)
     """Callers by number."""
     early: tuple[EarlyScan, ...] = ()
     """Scans that wait for a settled map."""

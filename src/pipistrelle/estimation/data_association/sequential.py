@@ -64,8 +64,8 @@ from pipistrelle.estimation.data_association.pairs import (
     with_points,
 )
 from pipistrelle.estimation.data_association.rows import (
-    Caller,
     CallerPlace,
+    CallerState,
     EarlyScan,
     Joint,
     Memory,
@@ -73,11 +73,11 @@ from pipistrelle.estimation.data_association.rows import (
     bearing_fits,
     compared,
     followed,
+    label_matched,
     part_of,
     place_of,
     places_of,
     rows_of_scan,
-    settled,
 )
 
 PLACE_SHARE, MOVING_SHARE = 0.12, 0.2
@@ -149,7 +149,7 @@ class Sequential(Association[Memory]):
         for number, place in news.items():
             label = known[number].label if number in known else memory.labels + 1
             memory = replace(memory, labels=max(memory.labels, label))
-            known[number] = Caller(label=label, place=place)
+            known[number] = CallerState(label=label, place=place)
         return replace(memory, callers=known)
 
     def knowing(self, memory: Memory, known: Landmarks, callers: Int[np.ndarray, " c"]) -> Memory:
@@ -157,7 +157,7 @@ class Sequential(Association[Memory]):
         numbers = {label: number for number, label in enumerate(callers.tolist())}
         rows = zip(known.landmark.tolist(), known.mean.tolist(), strict=True)
         stated = {
-            numbers[label]: Caller(
+            numbers[label]: CallerState(
                 label=label, place=CallerPlace(x, y, agreed=True), told=True, since=-PROBATION - 1
             )
             for label, (x, y) in rows
@@ -203,7 +203,7 @@ class _Work:
         for number, row in enumerate(self.scan.direct.tolist()):
             if number == OWN or (row < 0 and number not in self.callers):
                 continue
-            caller = self.callers.get(number) or Caller(label=self._another())
+            caller = self.callers.get(number) or CallerState(label=self._another())
             if caller.place is None or (caller.told and not caller.place.agreed):
                 caller, place = searched(self._followed(number, caller, row), number in self.moves)
                 if place is not None:
@@ -211,7 +211,7 @@ class _Work:
             self.callers[number] = caller
         return news
 
-    def _followed(self, number: int, caller: Caller, row: int) -> Caller:
+    def _followed(self, number: int, caller: CallerState, row: int) -> CallerState:
         """Add this scan's measurements to the tracks of an unlocated caller; return its record."""
         rows = self._some(self.rows.with_way & (self.scan.caller == number))
         direct = self.scan.bearing[row] if row >= 0 else math.nan
@@ -233,7 +233,7 @@ class _Work:
         innovate = partial(pair_innovations, part, *joint[1:], there, at)
         matched = used, self.stage.match(costs, innovate), near
         confirmed = known.label[known.confirmed]
-        begun, count = settled(self.label, rows, joint, confirmed, matched, caller, chances)
+        begun, count = label_matched(self.label, rows, joint, confirmed, matched, caller, chances)
         self._judge_caller(number, count)
         if begun.size and number in self.moves and self._is_elsewhere(number, count):
             return
@@ -384,7 +384,7 @@ class _Work:
         """Return the measurements of this scan that a mask selects."""
         return Rows(*part_of(self.rows, np.flatnonzero(rows), 0.0))
 
-    def _tell(self, number: int, caller: Caller) -> None:
+    def _tell(self, number: int, caller: CallerState) -> None:
         """Put a caller with a found position on the map, by a range for its direct call."""
         row = self._direct(number)
         if caller.place is None or row < 0 or self.scan.time < caller.place.since:

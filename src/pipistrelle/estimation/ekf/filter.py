@@ -68,7 +68,7 @@ from pipistrelle.estimation.ekf.gaussian import (
     rotated_left,
     shifted_covariance,
 )
-from pipistrelle.estimation.measurement import columns_of, timings_of
+from pipistrelle.estimation.measurement import scan_columns, timings_of
 from pipistrelle.estimation.motion import Controls, Durations, Motion, Pose, motion_numbers
 from pipistrelle.estimation.rays import update_params
 from pipistrelle.estimation.recovery import Recoverable, recovering
@@ -525,7 +525,7 @@ class EkfSlam:
             belief.covariance,
             belief.landmark,
             belief.weight,
-            columns_of(scan),
+            scan_columns(scan),
             timings_of(scan),
             update_params(self.rays, self.gate, robust=self.robust),
             belief.error,

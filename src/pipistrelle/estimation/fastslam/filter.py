@@ -82,7 +82,7 @@ from pipistrelle.estimation.fastslam.particles import (
     stratified,
     summarise,
 )
-from pipistrelle.estimation.measurement import columns_of
+from pipistrelle.estimation.measurement import scan_columns
 from pipistrelle.estimation.motion import SMALLEST_STD, Controls, Durations, Motion, motion_numbers
 from pipistrelle.estimation.rays import UpdateParams, update_params
 from pipistrelle.geometry import wrap
@@ -254,9 +254,9 @@ class FastSlam:
         params = update_params(self.rays, self.gate, exact=self.settings.mixture == "exact")
         inside, gated = self._inside(belief, scan, params)
         most = int(belief.log_weight.argmax())
-        off = innovations_of(_arrays(belief), columns_of(inside), most)
+        off = innovations_of(_arrays(belief), scan_columns(inside), most)
         (poses, landmark, first, count, member), gained = correct_particles(
-            _arrays(belief), columns_of(inside), normal, params, sampled
+            _arrays(belief), scan_columns(inside), normal, params, sampled
         )
         weight = normalised(belief.log_weight + gained)
         best = int(np.argmax(weight))
@@ -309,7 +309,7 @@ class FastSlam:
         """Discard measurements outside all particles' gates; return the scan and their number."""
         if self.gate >= 1.0:
             return scan, 0
-        gated = gated_by_all(_arrays(belief), columns_of(scan), params)
+        gated = gated_by_all(_arrays(belief), scan_columns(scan), params)
         return rows_of(scan, ~gated), int(np.count_nonzero(gated))
 
 

@@ -37,7 +37,7 @@ from pipistrelle.config import (
     caller_names,
 )
 from pipistrelle.experiments.hearing.landmark_fields import MAX_DRAWS, nearest
-from pipistrelle.experiments.hearing.trajectories import Course, course_of, driven, motion_of
+from pipistrelle.experiments.hearing.trajectories import Course, course_of, driven, true_motion
 from pipistrelle.geometry import points_at, wrap
 from pipistrelle.refusals import refusal
 from pipistrelle.settings import CALLERS, Layer
@@ -285,7 +285,7 @@ def _mission(
 ) -> tuple[Float[np.ndarray, "t 3"], Float[np.ndarray, "t-1 2"]] | None:
     """Generate random poses and controls of a second vehicle, clear of the first; else None."""
     setup, drive = around.config.scenario, around.config.motion
-    motion, bias = motion_of(drive), (drive.speed_bias, drive.turn_bias)
+    motion, bias = true_motion(drive), (drive.speed_bias, drive.turn_bias)
     course = around.course or course_of(setup, motion)
     for _ in range(MAX_DRAWS):
         angle = rng.uniform(-math.pi, math.pi)

@@ -15,7 +15,7 @@ from pipistrelle.acoustics.arrivals import Arrivals
 from pipistrelle.arrays.layout import Layout, Scattered
 from pipistrelle.config import MatchingConfig
 from pipistrelle.detection.scans import UNLABELLED
-from pipistrelle.detection.snapshots import Columns, Detections, columns_of
+from pipistrelle.detection.snapshots import Columns, Detections, detection_columns
 from pipistrelle.geometry import wrap_angle
 from pipistrelle.jit import kernel
 
@@ -66,7 +66,7 @@ def label_detections(
         arrivals.caller, arrivals.delay, arrivals.bearing, arrivals.level_db, arrivals.landmark
     )
     within = _Gates(gates.delay_gate * pulse, gates.bearing_gate, faintest_db)
-    return _label(order, tuple(columns_of(detections)), tuple(true), layout.normal, within)
+    return _label(order, tuple(detection_columns(detections)), tuple(true), layout.normal, within)
 
 
 def faintest_level_db(

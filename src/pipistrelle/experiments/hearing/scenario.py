@@ -24,7 +24,7 @@ from pipistrelle.estimation.motion import Motion
 from pipistrelle.experiments.drives import LabelledPoints
 from pipistrelle.experiments.hearing.caller_paths import Surroundings, callers_among, place_at
 from pipistrelle.experiments.hearing.landmark_fields import landmarks_in
-from pipistrelle.experiments.hearing.trajectories import Course, course_of, driven, motion_of
+from pipistrelle.experiments.hearing.trajectories import Course, course_of, driven, true_motion
 from pipistrelle.geometry import path_at, points_at, wrap
 from pipistrelle.settings import Layer
 
@@ -85,7 +85,7 @@ def draw_scenario(config: Config, rng: np.random.Generator, world: World = ALL_D
     >>> world.path.shape, world.landmarks.shape
     ((1501, 3), (50, 2))
     """
-    setup, motion = config.scenario, motion_of(config.motion)
+    setup, motion = config.scenario, true_motion(config.motion)
     time = np.arange(setup.steps + 1) * setup.step
     bias = (config.motion.speed_bias, config.motion.turn_bias)
     course = world.course or course_of(setup, motion)
@@ -177,7 +177,7 @@ def caller_labels(scenario: Scenario) -> Int[np.ndarray, " c"]:
 def assumed_motion(config: Config) -> Motion:
     """Return the motion model that estimators assume: the true model with `assumed` settings."""
     given = config.assumed.model_dump(exclude_none=True, exclude={"speed_of_sound"})
-    return motion_of(config.motion.model_copy(update=given))
+    return true_motion(config.motion.model_copy(update=given))
 
 
 def _place_beacon(

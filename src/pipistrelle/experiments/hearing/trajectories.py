@@ -58,7 +58,7 @@ class Poses:
 Course = Commands | Waypoints | Poses
 
 
-def motion_of(motion: MotionConfig) -> Motion:
+def true_motion(motion: MotionConfig) -> Motion:
     """Return the true motion model of the settings.
 
     Bradley & Abaid, Eq. (5).

@@ -100,7 +100,7 @@ def named_world(layer: Layer) -> World | None:
     return None if given is None or given.value is None else read_world(Path(str(given.value)))
 
 
-def settled(world: World, layer: Layer) -> Layer:
+def with_world(world: World, layer: Layer) -> Layer:
     """Merge a world's settings under the given settings; add its numbers of landmarks and steps."""
     beneath = world.settings | _decided(world, layer) | layer
     if world.course is not None and _STEPS not in beneath:

@@ -37,7 +37,7 @@ from pipistrelle.experiments.hearing.scenario import (
     moving_callers,
     standing_landmarks,
 )
-from pipistrelle.experiments.hearing.trajectories import motion_of
+from pipistrelle.experiments.hearing.trajectories import true_motion
 from pipistrelle.experiments.results.scores import TrialResult, drive_bound
 from pipistrelle.geometry import wrap_angle
 
@@ -151,7 +151,7 @@ class HeardWorld:
         self.beams = beams
         """Frames by the radius of the vehicle's piston [m]."""
         self._config = config
-        self._drive = replace(drive_of(scenario, config), motion=motion_of(config.motion))
+        self._drive = replace(drive_of(scenario, config), motion=true_motion(config.motion))
         # A `cache` of a method would keep this object, and so the world's sound, alive for long.
         self._scans: dict[_Key, tuple[Scan, ...]] = {}
         self._bounds: dict[_Key, Float[np.ndarray, "t 3 3"]] = {}

@@ -147,7 +147,7 @@ def as_heard_by(
     return tuple(heard)
 
 
-def motion_of(log: Log) -> Motion:
+def log_motion(log: Log) -> Motion:
     """Return the motion model of a recorded log's odometry."""
     return Motion(
         model=log.motion,
@@ -225,7 +225,7 @@ def drive_of(log: Log, truth: Truth) -> Drive:
     stds = [np.maximum(caller.place_std or KNOWN_STD, LEAST_STD) for caller in placed]
     variance = np.square(np.array(log.initial_pose_std, dtype=float))
     return Drive(
-        motion=motion_of(log),
+        motion=log_motion(log),
         start=Gaussian(mean=np.array(log.initial_pose, dtype=float), covariance=np.diag(variance)),
         time=log.time,
         controls=log.controls,

@@ -40,7 +40,7 @@ from pipistrelle.experiments.hearing.world_folder import (
     laid_over,
     named_world,
     read_world,
-    settled,
+    with_world,
 )
 from pipistrelle.experiments.named_settings import PLANS, Case, laid, over_named, parted
 from pipistrelle.files import check_ordinary, text_of
@@ -396,7 +396,7 @@ def _laid(path: Path, table: Mapping[str, Any], over: Layer, worlds: dict[str, W
     if world is None:
         return layer
     worlds[world.name] = world
-    return settled(world, layer) | {WORLD_KEY: Given(world.name, layer[WORLD_KEY].where)}
+    return with_world(world, layer) | {WORLD_KEY: Given(world.name, layer[WORLD_KEY].where)}
 
 
 def _read(path: Path, key: Key, values: Any, worlds: dict[str, World]) -> Any:

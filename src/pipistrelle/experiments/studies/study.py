@@ -21,7 +21,7 @@ from typing import TYPE_CHECKING
 from pipistrelle.config import InputError
 from pipistrelle.estimation.catalogue import CATALOGUE, look_in
 from pipistrelle.experiments.hearing.scenario import moving_callers, standing_landmarks
-from pipistrelle.experiments.hearing.trajectories import motion_of
+from pipistrelle.experiments.hearing.trajectories import true_motion
 from pipistrelle.experiments.hearing.world_folder import kept_world
 from pipistrelle.experiments.machine import check_memory, keep_freed_memory
 from pipistrelle.experiments.results.scores import OF_ASSOCIATION
@@ -309,7 +309,7 @@ def check_cases(plan: Plan, workers: int) -> None:
             heard = {"passive": case.strategy != "active", "workers": workers}
             with _named(case):
                 check_memory([case.filter], here, case.config, **heard)
-                motion = motion_of(case.config.motion)
+                motion = true_motion(case.config.motion)
                 check_filters([case.filter], motion, case.config, moving)
 
 

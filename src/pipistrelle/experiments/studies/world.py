@@ -40,7 +40,7 @@ from pipistrelle.evaluation.bound import nees_of_exact_start
 from pipistrelle.evaluation.consistency import track_nees
 from pipistrelle.experiments.hearing.listening import listen
 from pipistrelle.experiments.hearing.scenario import Scenario, World, standing_landmarks, world_of
-from pipistrelle.experiments.hearing.trajectories import motion_of
+from pipistrelle.experiments.hearing.trajectories import true_motion
 from pipistrelle.experiments.results.scores import OF_ASSOCIATION, Scores, with_bound
 from pipistrelle.experiments.results.writing import calibration_of
 from pipistrelle.experiments.runs.heard_world import HeardWorld, drive_of
@@ -159,7 +159,7 @@ def world_schemas(plan: Plan) -> "dict[str, dict[str, Any]]":
     left = {"nis_mean", "map_rmse_shared_m", *(OF_ASSOCIATION if known else ())}
     kept = (field.name for field in fields(Scores) if field.name not in left)
     scores = dict.fromkeys(kept, pl.Float64)
-    motion = motion_of(plan.config.motion)
+    motion = true_motion(plan.config.motion)
     beliefs = (first_belief(name, motion, plan.config) for name in plan.filters)
     online = any(revises_path(belief) for belief in beliefs)
     estimated = numbers_of({name for config in configs for name in config.filter.calibrate})
