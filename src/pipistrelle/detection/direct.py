@@ -44,7 +44,7 @@ EDGE_BLOCKS = 2
 
 
 class Lags(NamedTuple):
-    """Time axis of matched-filter outputs: delay of the first lag, step, and lags in a call."""
+    """Time axis of matched-filter outputs: first delay, step, and a call's length in steps."""
 
     start: float
     """Delay of lag 0 [s]."""

@@ -200,7 +200,7 @@ class BandFilters:
     def __call__(
         self, samples: Float[np.ndarray, "t f e"], noise_std: float = 1.0
     ) -> Complex[np.ndarray, "l f c e"]:
-        """Return each call's matched-filter outputs; lag i is a start at sample i times `step`.
+        """Correlate samples with each call; output i is of a call that starts at sample i * `step`.
 
         `noise_std`: of one complex sample, so that real ones have half of it. Noise has unit
         variance. If there are fewer samples than a call, the output is empty.

@@ -165,9 +165,10 @@ def listening(estimates: Iterable[tuple[str, str, Mapping[str, Any]]]) -> Iterat
         )
         said = []
         for score, title in ALIGNED.items():
-            ends = [scores.get(score) for scores in (fused, active)]
-            if all(end is not None and isfinite(end) for end in ends):
-                said.append(f"{title} by " + " instead of ".join(f"{1e3 * e:.0f} mm" for e in ends))
+            ends = (scores.get(score) for scores in (fused, active))
+            known = [f"{1e3 * end:.0f} mm" for end in ends if end is not None and isfinite(end)]
+            if len(known) == 2:
+                said.append(f"{title} by {' instead of '.join(known)}")
         if said:
             line += f"; after alignment {', and '.join(said)}"
         raw, aligned = fused.get("position_rmse_m"), fused.get(POSITION_ALIGNED)

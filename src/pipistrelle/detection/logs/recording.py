@@ -226,7 +226,7 @@ def assemble(
 
 
 def scan_at(time: float, rows: Table, callers: tuple[LogCaller, ...]) -> Scan:
-    """Build a scan from rows of measurements at the same time, as `assemble` does.
+    """Build a scan from measurements with the same time.
 
     `rows` have ``landmark``, ``bearing``, ``range``, ``caller``, perhaps other columns of a log.
     Raises InputError if a row is not valid in a log.

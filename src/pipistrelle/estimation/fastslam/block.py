@@ -443,7 +443,7 @@ def _largest(logs: Float[np.ndarray, "h lanes"], members: Whole, largest: Lanes)
 
 @no_alloc
 def _weigh(rows: Members, members: Whole, scratch: Scratch) -> None:
-    """Write hypotheses' log weights after a bearing, normalised per particle (Eq. (18))."""
+    """Update and normalise each particle's log weights of hypotheses by a bearing (Eq. (18))."""
     largest, total = scratch.largest, scratch.total
     for j in range(members):
         row, likelihood, posterior = rows[j], scratch.likelihood[j], scratch.posterior[j]

@@ -134,7 +134,7 @@ class FastSlamBelief(Belief):
         return self.landmark.tolist()
 
     def joint(self) -> JointGaussian:
-        """Return the joint Gaussian of pose and initialised landmarks over all particles."""
+        """Return the joint Gaussian of pose and initialised landmarks, by `joint_of`."""
         return joint_of(self)
 
     def edited(self, remove: Sequence[int], merge: Sequence[tuple[int, int]]) -> "FastSlamBelief":

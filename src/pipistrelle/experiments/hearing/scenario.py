@@ -201,7 +201,7 @@ MICROSECOND = 1e-6
 def calls_heard(
     scenario: Scenario, setup: ScenarioConfig, speed_of_sound: float
 ) -> list[tuple[float, int]]:
-    """List each call from an independent clock as (time of its direct arrival [s], caller).
+    """List calls of callers with separate clocks: (time of direct arrival [s], caller index).
 
     Arrivals before the vehicle's first call, which begins the first frame, or after the end of the
     path are excluded.

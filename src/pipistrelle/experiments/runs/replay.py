@@ -354,7 +354,7 @@ def _sums(log: Path) -> dict[str, str]:
 
 
 def _check_simulated(folder: Path, log: Path | None) -> None:
-    """Check a mission without a log: raise if it was not simulated, or if `log` is given."""
+    """Raise unless a mission without a log was simulated, or if the user names a log for it."""
     if "scenario" not in read_toml(folder / "config.toml"):
         raise refusal(
             f"{folder / SUMMARY}: log",

@@ -377,7 +377,7 @@ def _check_unvaried(
 
 
 def _beneath(path: Path, table: Mapping[str, Any], over: Layer) -> tuple[Layer, tuple[str, ...]]:
-    """Return the settings and estimators of the preset that a plan's file or `over` names."""
+    """Return settings and estimators of the preset that `over`, or else the plan's file, names."""
     config = table.get("config")
     places = (config if isinstance(config, dict) else {}, table)
     words = [Given(one["settings"], f"{path}: settings") for one in places if "settings" in one]
