@@ -72,7 +72,9 @@ def main() -> None:
         options.error(f"--output: {output} cannot be a file; name one in a folder that there is")
     readings = read_plan(find_plan(chosen.plan)).config.model_copy(update={"seed": SEED})
     with in_worlds(chosen.worlds, chosen.workers) as run:
-        config, seen = fit_levels(readings, run)
+        config = fit_levels(readings, run)
+        rows = run(partial(landmarks_seen, config, [*BEAMS]))
+        seen = {name: [row[name] for row in rows] for name in rows[0]}
         rays = fit_rays(config, run)
     text = tomli_w.dumps(summary(config, seen, rays))
     output.write_text(f"# Written by papers/bradley_abaid/calibration.py {chosen.plan}\n\n{text}")
@@ -130,8 +132,8 @@ def fit_levels(
     oracle: Oracle = label_detections,
     most_active: float = MOST_ACTIVE,
     step: int = 8,
-) -> tuple[Config, dict[str, list[int]]]:
-    """Fit both source levels to a tenth of a decibel; return them, and what is then seen.
+) -> Config:
+    """Fit both source levels to a tenth of a decibel; return the settings with them.
 
     `step` [0.1 dB] is the first step of the search from the levels of `config`.
 
@@ -170,7 +172,7 @@ def fit_levels(
             vehicle = nearest(active, most_active, vehicle, step)
         while active(vehicle) > most_active:
             vehicle -= 1
-    return at(vehicle, beacon), seen(vehicle, beacon, *BEAMS)
+    return at(vehicle, beacon)
 
 
 def nearest(function: Callable[[int], float], target: float, start: int, step: int = 8) -> int:

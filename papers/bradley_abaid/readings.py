@@ -242,7 +242,7 @@ def fitted(path: Path, run: Run) -> dict[str, Change]:
             continue
         near = next((f for name, f in fits.items() if f"/{off_axis}/" in name), {})
         begin = changed(settings(snapshots=snapshots, off_axis=off_axis), dict(near))
-        config, _ = fit_levels(begin, run)
+        config = fit_levels(begin, run)
         levels = {
             "emitter.level_db": config.emitter.level_db, "beacon.level_db": config.beacon.level_db,
         }  # fmt: skip

@@ -96,7 +96,7 @@ def main() -> None:
         for name, change in (EARS | AIR).items():
             keep(heard_anew(name, changed(base, change), run))
         for name, change in AIR.items():
-            config, _ = fit_levels(changed(base, change), run)
+            config = fit_levels(changed(base, change), run)
             keep(heard_anew(f"{name}, refitted", config, run))
     print(markdown(rows))
 
