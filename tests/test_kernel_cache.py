@@ -291,6 +291,15 @@ def test_a_folder_writable_by_others_is_not_used(tmp_path, what, below):
 
 
 @pytest.mark.skipif(os.name != "posix", reason="permissions are of another kind there")
+def test_a_subfolder_that_another_process_removes_meanwhile_is_no_danger(tmp_path, monkeypatch):
+    passing = tmp_path / "own" / "kernels" / "arrays_1"
+    passing.mkdir(parents=True)
+    monkeypatch.setattr(Path, "is_dir", lambda folder: folder.rmdir() is None)
+    assert kernel_folder._open_to_others(passing.parent) is None
+    assert not passing.exists()
+
+
+@pytest.mark.skipif(os.name != "posix", reason="permissions are of another kind there")
 def test_a_shared_folder_with_the_sticky_bit_is_used(tmp_path):
     shared = tmp_path / "shared"
     shared.mkdir()

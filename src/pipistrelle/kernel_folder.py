@@ -41,7 +41,7 @@ _said: set[str] = set()
 
 def say(line: str) -> None:
     """Print a message to standard error, each only once."""
-    if line not in _said:
+    if line not in _said and sys.stderr is not None:
         _said.add(line)
         with suppress(OSError, AttributeError):
             print(f"pipistrelle: {line}", file=sys.stderr)
@@ -109,7 +109,7 @@ def sources_key(plain: bool = False) -> str:
     digest = sha256(sys.version.encode() + b"plain" * plain)
     for source in sorted(Path(__file__).parent.rglob("*.py")):
         text = source.read_bytes()
-        if b"jit" in text:
+        if re.search(rb"jit\b", text):
             digest.update(source.name.encode() + _NO_CODE.sub(b"", text))
     return digest.hexdigest()[:16]
 
@@ -156,7 +156,10 @@ def _is_mine(folder: Path, *, writable: bool = False) -> bool:
     """Return whether a folder is this user's, no link, and closed to others unless `writable`."""
     if os.name != "posix":
         return True
-    state = folder.lstat()
+    try:
+        state = folder.lstat()
+    except FileNotFoundError:
+        return True  # another process has just removed it
     shut = writable or not state.st_mode & 0o022
     return stat.S_ISDIR(state.st_mode) and state.st_uid == os.getuid() and shut
 
