@@ -78,7 +78,7 @@ from pipistrelle.experiments.named_settings import Case
 from pipistrelle.experiments.runs.heard_world import drive_of, scans_of
 from pipistrelle.experiments.runs.trial import run_trial
 from pipistrelle.files import write_whole
-from pipistrelle.report.claims import EXCLUDED, FITTED, TABLE_II, WORLDS
+from pipistrelle.report.sentences import EXCLUDED, FITTED, TABLE_II, WORLDS
 
 Change = dict[str, Any]
 Levels = tuple[str, ...]

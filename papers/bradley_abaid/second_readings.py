@@ -83,7 +83,7 @@ from pipistrelle.experiments.runs.heard_world import drive_of, scans_of
 from pipistrelle.experiments.runs.trial import run_trial
 from pipistrelle.experiments.studies.plan import find_plan, read_plan
 from pipistrelle.files import write_whole
-from pipistrelle.report.claims import EXCLUDED, TABLE_II, WORLDS
+from pipistrelle.report.sentences import EXCLUDED, TABLE_II, WORLDS
 
 ANNULUS: Change = {"scenario.inner_radius": 3.0, "scenario.spacing": 0.5}
 LAYOUT: dict[str, Change] = {

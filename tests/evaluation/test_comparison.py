@@ -126,7 +126,7 @@ def test_the_order_of_a_family_does_not_matter(seed, m):
 def test_the_unit_of_the_sample_does_not_matter(seed, unit):
     rng = np.random.default_rng(seed)
     samples = drawn(rng, [0.0, 0.4, 2.0], 15)
-    for relation in ("above", "not above", "within"):
+    for relation in ("above", "within"):
         ours = judge(statements(samples, relation, 0.5))
         theirs = judge(statements(samples * unit, relation, 0.5 * unit))
         for one, other in zip(ours, theirs, strict=True):
@@ -196,31 +196,11 @@ def test_statements_of_nearness_are_confirmed_or_refuted():
     assert far.interval[0] >= 1.0
 
 
-def test_absence_is_claimed_only_where_presence_would_have_been_seen():
-    few, many = np.array([-1.0, 0.0, 1.0, 0.5]), np.linspace(-1.0, 1.0, 60)
-    assert [f.holds for f in judge(statements([few], "not above"))] == [None]
-    assert [f.holds for f in judge(statements([many], "not above"))] == [True]
-    assert [f.holds for f in judge(statements([many + 1.0], "not above"))] == [False]
-    # t(0.975 ** (1/1), 3) / 2 = 1.59 deviations could hide in four worlds.
-    assert stats.t.ppf(0.975, 3) / 2.0 > 1.0
-
-
-@pytest.mark.parametrize(("worlds", "family", "holds"), [(6, 1, None), (7, 1, True), (7, 2, None)])
-def test_absence_is_claimed_from_the_first_world_that_resolves_a_deviation(worlds, family, holds):
-    half_width = stats.t.ppf(1.0 - 0.025 / family, worlds - 1) / math.sqrt(worlds)
-    assert (half_width <= 1.0) == (holds is True)
-    samples = [np.linspace(-1.0, 1.0, worlds)] * family
-    assert {f.holds for f in judge(statements(samples, "not above"))} == {holds}
-
-
-@pytest.mark.parametrize(("worlds", "holds"), [(9, None), (10, True)])
-def test_a_statement_of_nearness_counts_twice_in_its_family(worlds, holds):
-    half_width = stats.t.ppf(1.0 - 0.025 / 3, worlds - 1) / math.sqrt(worlds)
-    assert (half_width <= 1.0) == (holds is True)
-    assert stats.t.ppf(1.0 - 0.025 / 2, worlds - 1) / math.sqrt(worlds) < 1.0
-    shape = np.linspace(-1.0, 1.0, worlds)
-    family = [*statements([shape], "not above"), *statements([shape], "within", 9.0)]
-    assert [finding.holds for finding in judge(family)] == [holds, True]
+def test_a_statement_of_nearness_counts_twice_in_its_family():
+    shape = np.linspace(-1.0, 1.0, 9)
+    first, _ = judge([*statements([shape]), *statements([shape], "within", 9.0)])
+    half_width = stats.t.ppf(1.0 - 0.025 / 3, 8) * shape.std(ddof=1) / 3.0
+    assert first.family == pytest.approx((-half_width, half_width))
 
 
 @pytest.mark.parametrize("confidence", [0.5, 0.8, 0.95, 0.99, 0.9999])
@@ -246,16 +226,8 @@ def test_undecided_statements_share_alpha_in_their_intervals(standing):
         assert finding.interval == pytest.approx((finding.mean - low, finding.mean + high))
 
 
-@pytest.mark.parametrize(
-    ("shift", "holds"), [(0.05, True), (-0.05, None), (1.0, False), (-1.0, False)]
-)
-def test_slightly_above_is_above_in_the_sample_and_not_significant(shift, holds):
-    sample = np.linspace(-1.0, 1.0, 60) + shift
-    assert judge(statements([sample], "slightly above"))[0].holds is holds
-
-
 @pytest.mark.parametrize("sample", [[], [1.0], [2.0, 2.0], [0.1 + 0.2] * 30])
-@pytest.mark.parametrize("relation", ["above", "not above", "slightly above", "within"])
+@pytest.mark.parametrize("relation", ["above", "within"])
 def test_a_sample_without_spread_is_undecided(sample, relation):
     (finding,) = judge(statements([np.array(sample)], relation, 0.5))
     assert finding.holds is None

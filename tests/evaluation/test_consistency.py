@@ -13,6 +13,7 @@ from pipistrelle.estimation.beliefs import Gaussian, Track, no_landmarks
 from pipistrelle.evaluation.consistency import (
     anees,
     anees_bounds,
+    anees_departure,
     diverged,
     nees,
     strayed_landmarks,
@@ -271,3 +272,11 @@ def test_a_map_without_landmarks_has_none_that_strayed():
     track = replace(track_past(POSTS), landmarks=no_landmarks())
     assert strayed_landmarks(track, heard_on(track, lambda _: POSTS), 0.999, 1e-3) == {}
     assert strayed_landmarks(track, [], 0.999, 1e-3) == {}
+
+
+@pytest.mark.parametrize(("factor", "expected"), [(1.0, 0.0), (np.e, 1.0), (1.0 / np.e, 1.0)])
+def test_departure_counts_over_and_under_confidence_equally(factor, expected):
+    for ideal in (3.0, 2.2):
+        assert anees_departure(np.full(10, factor * ideal), np.full(10, ideal)) == pytest.approx(
+            expected, abs=1e-12
+        )

@@ -10,7 +10,7 @@ import pytest
 
 from pipistrelle.config import Config
 from pipistrelle.experiments.studies.plan import find_plan, read_plan
-from pipistrelle.report.claims import TABLE_II
+from pipistrelle.report.sentences import TABLE_II
 
 SCRIPT = Path(__file__).parents[2] / "papers/bradley_abaid/calibration.py"
 FITTED = ("paper", "physics")

@@ -177,6 +177,13 @@ def narrowed(study, columns):
     )
 
 
+def turning(study, **scenario):
+    """The same study with another drive."""
+    setup = study.config.scenario.model_copy(update=scenario)
+    config = study.config.model_copy(update={"scenario": setup})
+    return replace(study, config=config, configs=(config,) * len(study.configs))
+
+
 def with_third(study, name):
     """The same study with a further filter, as FastSLAM but worse everywhere and often diverged."""
     third = {}

@@ -168,6 +168,8 @@ def test_names_of_values_are_read_out_on_a_grids_panels(browser, grid):
 
 def test_the_eight_verdicts_are_visible(opened):
     page, _ = opened
+    assert page.locator("#scoreboard").is_visible()
+    assert page.locator("[data-sentence]").count() == 26
     sections = page.locator("section[data-claim]")
     assert sections.count() == 8
     for i in range(8):

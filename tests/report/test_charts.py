@@ -14,9 +14,9 @@ from pipistrelle.report.charts import (
     level_charts,
     study_charts,
 )
-from pipistrelle.report.claims import TABLE_II, gains, lap_time
 from pipistrelle.report.effects import effects_of, measures_of
-from pipistrelle.report.study import COMMON, RULES, read_study, select
+from pipistrelle.report.sentences import TABLE_II
+from pipistrelle.report.study import COMMON, RULES, lap_time, read_study, select
 from report.invented import BEAMWIDTH, invent, narrowed, only
 from report.planted import LEVELS as GRID
 from report.planted import by_level, write_planted
@@ -359,14 +359,14 @@ def test_the_gain_is_charted_along_each_variable_a_line_for_each_combination_of_
     assert "a line for each value of beacon.level_db, that of beacon.level_db = 36.8" in (
         by_power.caption
     )
-    mean = [finding.mean for _, finding in gains(selection, "ekf", "position_rmse_m")]
+    active, fused = (study.trials["ekf", w].scores["position_rmse_m"] for w in ("active", "fused"))
+    mean = (active - fused).mean(axis=0)
     overall, *each = by_power.panels[0].series
-    assert [series.y.tolist() for series in each] == [[mean[0], mean[2]], [mean[1], mean[3]]]
+    for series, means in zip(each, (mean[::2], mean[1::2]), strict=True):
+        np.testing.assert_allclose(series.y, means, rtol=1e-9)
     assert all(series.low is None for series in each), "bars of so many would hide each other"
     assert overall.y == pytest.approx([(mean[0] + mean[1]) / 2.0, (mean[2] + mean[3]) / 2.0])
     assert np.all((overall.low < overall.y) & (overall.y < overall.high))
-    active, fused = (study.trials["ekf", w].scores["position_rmse_m"] for w in ("active", "fused"))
-    np.testing.assert_allclose(mean, (active - fused).mean(axis=0), rtol=1e-9)
 
 
 def test_effects_of_a_single_world_and_of_none_have_no_intervals(tmp_path):

@@ -1,4 +1,4 @@
-"""A figure and a claim of one's own, as the documentation writes them, without a file changed."""
+"""A figure and a sentence of one's own, as the documentation writes them."""
 
 import csv
 import json
@@ -12,8 +12,9 @@ import pytest
 
 from pipistrelle.report import page as module
 from pipistrelle.report.charts import CHARTS
-from pipistrelle.report.claims import CLAIMS, judge_claims
+from pipistrelle.report.claims import judge_sentences
 from pipistrelle.report.page import write_report
+from pipistrelle.report.sentences import SENTENCES
 from pipistrelle.report.study import HEADING, RULES, selections
 from report.drawing import draw_only
 from report.invented import BEAMWIDTH, changed, invent
@@ -42,26 +43,26 @@ def extended(guide, tmp_path_factory):
         write_report(
             study,
             folder,
-            claims=(*CLAIMS, guide["headings"]),
+            sentences=(*SENTENCES, guide["headings"]),
             charts=(*CHARTS, guide["world_charts"]),
         )
     return study, folder
 
 
 class Sections(HTMLParser):
-    """Collect the figures and the claims of a page."""
+    """Collect the figures and the sentences of a page."""
 
     def __init__(self, text):
         super().__init__()
-        self.figures, self.claims = [], []
+        self.figures, self.sentences = [], []
         self.feed(text)
 
     def handle_starttag(self, tag, attrs):
         given = dict(attrs)
         if tag == "figure":
             self.figures.append(given["id"])
-        if "data-claim" in given:
-            self.claims.append((given["data-claim"], given["data-verdict"]))
+        if "data-sentence" in given:
+            self.sentences.append((given["data-sentence"], given["data-verdict"]))
 
 
 def test_a_figure_given_to_the_report_is_on_the_page_and_in_three_files(extended):
@@ -76,27 +77,27 @@ def test_a_figure_given_to_the_report_is_on_the_page_and_in_three_files(extended
     assert found["world"] == pytest.approx(np.delete(score, 3), rel=1e-8)
 
 
-def test_a_claim_given_to_the_report_is_judged_and_words_count_it(extended):
+def test_a_sentence_given_to_the_report_is_judged_and_counted(extended):
     _, folder = extended
     text = (folder / "index.html").read_text(encoding="utf-8")
-    assert Sections(text).claims[-1] == ("9", "reproduced")
-    assert 'aria-label="The nine claims"' in text
+    assert Sections(text).sentences[-1] == ("27", "reproduced")
     summary = json.loads((folder / "summary.json").read_text())
-    assert summary["claims"][-1]["sentence"] == "With either filter, fused has the better heading."
-    assert summary["answer"][-1].startswith("Of the paper's nine claims, ")
+    assert summary["sentences"][-1]["words"] == "With either filter, fused has the better heading."
+    assert summary["scoreboard"]["sentences"] == 27
+    assert len(summary["claims"]) == 8
 
 
-def test_an_added_claim_can_be_refuted_without_changing_the_others(guide):
+def test_an_added_sentence_can_be_refuted_without_changing_the_others(guide):
     worse = changed(invent(60), ("ekf", "fused"), HEADING, lambda error: error + 0.02)
-    *others, mine = judge_claims(selections(worse), (*CLAIMS, guide["headings"]))
+    *others, mine = judge_sentences(selections(worse), (*SENTENCES, guide["headings"]))
     assert mine["verdict"] == "not-reproduced"
-    assert len(mine["parts"][0]["findings"]) == 2 * len(BEAMWIDTH)
-    assert others == judge_claims(selections(worse))
+    assert mine["comparisons"] == 2 * len(BEAMWIDTH)
+    assert others == judge_sentences(selections(worse))
 
 
-def test_an_added_claim_needs_no_other_change(guide, tmp_path, monkeypatch):
+def test_an_added_sentence_needs_no_other_change(guide, tmp_path, monkeypatch):
     monkeypatch.setattr(module, "_write_figure", lambda *_: None)
-    write_report(invent(2), tmp_path, claims=(guide["headings"],), charts=())
+    write_report(invent(2), tmp_path, sentences=(guide["headings"],), charts=())
     page = Sections((tmp_path / "index.html").read_text(encoding="utf-8"))
-    assert [number for number, _ in page.claims] == ["1"]
+    assert [number for number, _ in page.sentences] == ["27"]
     assert page.figures == ["piston", "example_map"]

@@ -19,8 +19,8 @@ from pipistrelle.config import InputError
 from pipistrelle.experiments.studies.plan import cases_of, read_plan
 from pipistrelle.experiments.studies.world import TABLES, done_worlds, with_sums, world_file
 from pipistrelle.files import LOG, REPORT, RESULTS, OwnFiles
-from pipistrelle.report.claims import TABLE_II
 from pipistrelle.report.page import write_report
+from pipistrelle.report.sentences import SENTENCES, TABLE_II
 from pipistrelle.report.study import RULES, read_study
 from pipistrelle.report.variables import setting_variable
 from report.drawing import draw_only
@@ -199,9 +199,13 @@ def test_the_eight_verdicts_are_on_the_page_and_in_the_summary(reported):
     assert [attrs["data-verdict"] for attrs in sections] == [
         claim["verdict"] for claim in summary["claims"]
     ]
-    for claim in summary["claims"]:
-        assert claim["verdict"] in ("reproduced", "not-reproduced", "open")
-        assert {"statistic", "interval", "p", "n", "by_exclusion"} <= claim.keys()
+    shown = [attrs for attrs in read(reported).of("div") if "data-sentence" in attrs]
+    assert {int(attrs["data-sentence"]): attrs["data-verdict"] for attrs in shown} == {
+        row["sentence"]: row["verdict"] for row in summary["sentences"]
+    }
+    assert len(shown) == len(SENTENCES) == summary["scoreboard"]["sentences"]
+    for one in (*summary["claims"], *summary["sentences"]):
+        assert one["verdict"] in ("reproduced", "not-reproduced", "open")
 
 
 def test_a_page_counts_its_worlds_and_warns_if_they_are_few_or_not_all(reported, tmp_path, undrawn):
@@ -309,10 +313,11 @@ def test_figures_and_table_ii_have_their_numbers_under_each_rule(reported):
     assert float(table[0]["full_std"]) > 0.0
 
 
-def test_the_command_prints_the_verdicts_and_the_page_last(reported, printed):
-    assert printed[0] == "partial: 6 of 115 worlds"
-    assert printed[1] == "failed: 1 trial; see the page"
-    assert [line[0] for line in printed[2:-1] if line[0] != " "] == list("12345678")
+def test_the_command_prints_the_answer_the_verdicts_and_the_page_last(reported, printed):
+    answer = json.loads((reported / "summary.json").read_text())["answer"]
+    first = ["partial: 6 of 115 worlds", "failed: 1 trial; see the page", *answer]
+    assert printed[: len(first)] == first
+    assert [line[0] for line in printed[len(first) : -1] if line[0] != " "] == list("12345678")
     assert printed[-1] == str(reported / "index.html")
 
 

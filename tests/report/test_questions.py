@@ -11,8 +11,8 @@ from pipistrelle.__main__ import main
 from pipistrelle.evaluation.comparison import INTERVALS
 from pipistrelle.experiments.studies.plan import read_plan
 from pipistrelle.experiments.studies.study import run_study
-from pipistrelle.report.claims import CLAIMS
 from pipistrelle.report.page import write_report
+from pipistrelle.report.sentences import SENTENCES
 from pipistrelle.report.variables import three_digits
 from reference.studies import TINY
 from report.drawing import draw_only
@@ -172,7 +172,8 @@ def test_every_kind_of_study_has_a_question_an_answer_and_figures(reported, kind
     answer, *_ = page.summary["answer"]
     assert answer.endswith(".")
     assert answer in page.header
-    assert page.summary["claims"] == page.summary["table_ii"] == []
+    assert page.summary["claims"] == page.summary["sentences"] == page.summary["table_ii"] == []
+    assert page.summary["scoreboard"] is None
     for absent in ("The paper’s claims", "Table II", "Not the paper's study", "None", "nan"):
         assert absent not in page.said("<header>", '<h2 id="config">'), absent
     assert "claims" not in page.ids
@@ -231,16 +232,19 @@ def test_without_the_papers_cases_its_claims_are_not_judged(tmp_path, variable):
         ekf = only(invent(3), [("ekf", way) for way in ("active", "fused", "passive")])
         write_report(ekf, tmp_path / "r")
     page = Page(tmp_path / "r")
-    assert page.summary["claims"] == []
+    assert page.summary["claims"] == page.summary["sentences"] == []
     assert "data-claim" not in page.text
+    assert "data-sentence" not in page.text
     assert "the beamwidth" in page.header
 
 
-def test_a_claim_of_ones_own_is_judged_whatever_a_study_holds(tmp_path):
-    write_report(narrowed(invent(30), [0, 11]), tmp_path, claims=CLAIMS[4:5])
+def test_sentences_given_to_the_report_are_judged_whatever_a_study_holds(tmp_path):
+    write_report(narrowed(invent(30), [0, 11]), tmp_path, sentences=SENTENCES[10:13])
     page = Page(tmp_path)
-    assert [claim["verdict"] for claim in page.summary["claims"]] == ["reproduced"]
-    assert '<section class="claim" id="claim-1"' in page.text
+    verdicts = [row["verdict"] for row in page.summary["sentences"]]
+    assert verdicts == ["reproduced", "open", "open"]
+    assert re.findall(r'data-claim="(\d)"', page.text) == ["4", "5", "6"]
+    assert page.summary["scoreboard"]["sentences"] == 3
     assert "The paper’s claims" not in page.text
     assert page.summary["question"] == "What does the beamwidth change?"
 
@@ -350,7 +354,7 @@ def test_a_short_run_of_the_papers_plan_is_partial_and_asked_the_papers_question
     open_ones = [i for i, line in enumerate(printed) if re.match(r"\d  open ", line)]
     assert open_ones
     for i in open_ones:
-        assert re.search(r"^ {19}\S.*\. Undecided: \d+ of \d+ statements\.$", printed[i + 1])
+        assert re.search(r"^ {19}Sentences that hold: \d of .*; open: \d.*\.$", printed[i + 1])
     page = Page(tmp_path / "s" / "report")
     assert page.summary["partial"] is True
     assert "2 of 115 worlds are done" in page.header

@@ -8,6 +8,8 @@ import polars as pl
 import pytest
 
 from pipistrelle.config import InputError
+from pipistrelle.estimation.motion import motion_step
+from pipistrelle.experiments.hearing.trajectories import motion_of
 from pipistrelle.experiments.studies.plan import cases_of, read_plan
 from pipistrelle.experiments.studies.world import TABLES, with_sums, world_file
 from pipistrelle.report.study import (
@@ -18,6 +20,7 @@ from pipistrelle.report.study import (
     combination_name,
     filter_titles,
     kept,
+    lap_time,
     lost_worlds,
     mean_std,
     read_study,
@@ -36,6 +39,7 @@ from report.invented import (
     invent,
     narrowed,
     only,
+    turning,
     with_third,
     write_store,
 )
@@ -401,3 +405,13 @@ def test_multiples_of_the_bound_are_of_root_mean_squares_over_unlike_worlds():
 def test_without_a_bound_there_are_no_multiples_of_it():
     study = changed(invent(2), ("ekf", "active"), "position_bound_m", lambda b: np.nan * b)
     assert times_the_bound(select(study, "none"), ("ekf", "active", 0)) is None
+
+
+def test_a_lap_takes_the_time_of_a_turn_of_the_motion_model():
+    study = invent(2)
+    config = study.config
+    controls = np.array([config.scenario.speed, config.scenario.steering])
+    pose = motion_step(motion_of(config.motion), np.zeros(3), controls, config.scenario.step)
+    assert lap_time(study) == pytest.approx(2 * np.pi / pose[2] * config.scenario.step, rel=1e-9)
+    assert lap_time(study) == pytest.approx(62.1, abs=0.05), "as the paper's drive: three laps"
+    assert lap_time(turning(study, steering=0.0)) == np.inf

@@ -47,7 +47,7 @@ from jaxtyping import Float
 if TYPE_CHECKING:
     import polars as pl
 
-Relation = Literal["above", "not above", "slightly above", "within"]
+Relation = Literal["above", "within"]
 INTERVALS = (
     "Intervals hold together, at 95 %, for all differences that are judged as one family; a "
     "difference of half an interval's width would have been shown in any case. Holm's correction "
@@ -64,15 +64,8 @@ class Statement:
     sample: Float[np.ndarray, " n"]
     """A number per world, in any unit."""
     relation: Relation = "above"
-    """"above": the mean is above the margin. "not above": it is not significantly above. "slightly
-    above": it is above in this sample, but not significantly. "within": it is between minus and
-    plus the margin."""
+    """"above": the mean is above the margin. "within": it is between minus and plus the margin."""
     margin: float = 0.0
-    sigma: float = math.nan
-    """Standard deviation of a case over worlds, in the sample's unit: a scale for the mean. NaN:
-    none."""
-    fitted: bool = False
-    """Whether settings were fitted to this number, so that it is weak evidence."""
     against: Float[np.ndarray, " m"] | None = None
     """Numbers of other worlds, whose mean is subtracted from the mean of ``sample``."""
 
@@ -237,9 +230,7 @@ def _by_key(
 def judge(statements: Sequence[Statement], confidence: float = 0.95) -> tuple[Finding, ...]:
     """Test statements together with Holm's correction; return the finding of each.
 
-    A statement of absence ("not above", "slightly above") holds only if the family could have
-    detected a mean of one standard deviation of the sample: half the width of its widest interval,
-    t / sqrt(n), is at most 1. A statement "within" counts twice, since it has two opposites.
+    A statement "within" counts twice, since it has two opposites.
 
     `confidence`: probability that all intervals hold their means. A sample of fewer than two
     numbers, or without spread, decides nothing and has an infinite interval.
@@ -267,8 +258,7 @@ def judge(statements: Sequence[Statement], confidence: float = 0.95) -> tuple[Fi
     for statement, own in zip(statements, rows, strict=True):
         moments = samples[own.start]
         share = tail / len(samples)
-        resolved = _half_width((moments[0], 0.0, 1.0), share) <= 1.0
-        holds, p = _verdict(statement, moments, p_low[own], p_high[own], tail, resolved)
+        holds, p = _verdict(statement.relation, p_low[own], p_high[own], tail)
         width, wider = _half_width(moments, tail), _half_width(moments, share)
         centre = moments[1] if math.isfinite(moments[1]) else 0.0
         findings.append(
@@ -394,31 +384,14 @@ def _lower_bounds(
 
 
 def _verdict(
-    statement: Statement,
-    moments: tuple[float, float, float],
-    p_low: Float[np.ndarray, " e"],
-    p_high: Float[np.ndarray, " e"],
-    tail: float,
-    resolved: bool,
+    relation: Relation, p_low: Float[np.ndarray, " e"], p_high: Float[np.ndarray, " e"], tail: float
 ) -> tuple[bool | None, float]:
-    """Return whether a statement holds, fails or is open (None), and its two-sided p value."""
-    _, mean, std = moments
+    """Decide a statement from the p values of its edges, the opposite's edges last."""
     above, below = p_low <= tail, p_high <= tail
-    p = min(1.0, 2.0 * float(min(p_low[0], p_high[0])))
-    match statement.relation:
-        case "above":
-            return (True if above[0] else (False if below[0] else None)), p
-        case "within":
-            if above[1] or below[1]:
-                return False, min(1.0, 2.0 * float(min(p_low[1], p_high[1])))
-            inside = bool(above[0] and below[0])
-            return (True if inside else None), min(1.0, 2.0 * float(max(p_low[0], p_high[0])))
-        case "not above":
-            absent = True
-            seen = above[0]
-        case "slightly above":
-            absent = mean > statement.margin
-            seen = above[0] or below[0]
-    if seen:
+    p = min(1.0, 2.0 * float(min(p_low[-1], p_high[-1])))
+    if relation == "above":
+        return (True if above[0] else (False if below[0] else None)), p
+    if above[1] or below[1]:
         return False, p
-    return (True if absent and resolved and std > 0.0 else None), p
+    inside = bool(above[0] and below[0])
+    return (True if inside else None), min(1.0, 2.0 * float(max(p_low[0], p_high[0])))

@@ -175,6 +175,21 @@ def anees_bounds_about(
     return np.where(mean > 0.0, low, 0.0), np.where(mean > 0.0, high, 0.0)
 
 
+def anees_departure(
+    anees: Float[np.ndarray, "*j k"], expected: Float[np.ndarray, " k"]
+) -> Float[np.ndarray, "*j"]:
+    r"""Return the distance of ANEES from a consistent filter's, over all frames.
+
+    .. math:: T = \frac{1}{K} \sum_k \ln^2(\bar\epsilon_k / E_k)
+
+    `expected`: E, below 3 if the start is exact (`evaluation.bound.nees_of_exact_start`).
+
+    Bradley & Abaid, Eq. (24) and Sec. V-B, compare with 3: over-confident above, under-confident
+    below.
+    """
+    return np.mean(np.square(np.log(anees / expected)), axis=-1)
+
+
 def diverged(nees: Float[np.ndarray, " k"], limit: float) -> bool:
     r"""Return whether a run has diverged: any NEES is above the limit or not finite.
 

@@ -27,8 +27,8 @@ from pipistrelle.figures.chart import (
     linear_axis,
     log_axis,
 )
-from pipistrelle.report import claims as paper
 from pipistrelle.report import effects as changes
+from pipistrelle.report import sentences as paper
 from pipistrelle.report.axes import (
     Line,
     axis_of,
@@ -53,8 +53,10 @@ from pipistrelle.report.study import (
     case_name,
     combination_name,
     filter_titles,
+    frame_time,
     has_numbers,
     kept,
+    lap_time,
     mean_std,
     own_cases,
     samples,
@@ -456,7 +458,10 @@ def _gain_chart(selection: Selection, variable: Variable) -> Chart:
 def _gains(selection: Selection, name: str, score: str, variable: Variable) -> list[Series]:
     """Return a filter's gains over a variable as data series: their mean, and each combination."""
     rows, x = along(selection.study, variable), places(variable)
-    judged = [finding for _, finding in paper.gains(selection, name, score)]
+    measure = changes.Measure(title="", score=score, unit="m")
+    pairs = [((name, "fused", i), (name, "active", i)) for i in range(rows.size)]
+    apart = changes.compare(selection, measure, [[pair] for pair in pairs])
+    judged = [one.finding for one in apart]
     each = [_judged(DIFFERENCE, "fused", x, [judged[i] for i in column]) for column in rows.T]
     if len(each) == 1:
         return each
@@ -464,9 +469,7 @@ def _gains(selection: Selection, name: str, score: str, variable: Variable) -> l
         named = combination_name(selection.study, int(rows[0, j]), [variable])
         look = {"name": named, "style": "dots", "low": None, "high": None}
         each[j] = replace(one, **look, strength=1.0 - 0.75 * j / (len(each) - 1))
-    measure = changes.Measure(title="", score=score, unit="m")
-    pairs = [[((name, "fused", i), (name, "active", i)) for i in row] for row in rows.tolist()]
-    means = changes.compare(selection, measure, pairs)
+    means = changes.compare(selection, measure, [[pairs[i] for i in row] for row in rows])
     return [_judged(f"mean, {DIFFERENCE}", "ink", x, [one.finding for one in means]), *each]
 
 
@@ -504,7 +507,7 @@ def _anees_chart(selection: Selection, name: str, title: str) -> Chart:
         for way, of_way in lines.items():
             of_way.insert(0, _ideal(study, way, runs))
     vertical = log_axis("ANEES", ends(s for of_way in lines.values() for s in of_way) or [1.0, 9.0])
-    lap = paper.lap_time(study) if alike else math.inf
+    lap = lap_time(study) if alike else math.inf
     panels = [
         Panel(
             title=way[1],
@@ -551,8 +554,8 @@ def _drives_alike(study: Study) -> bool:
     frames = next(iter(study.trials.values())).nees.shape[2]
     drives = {
         (
-            paper.lap_time(study, i),
-            *paper.frame_time(study, frames, i)[-1:].tolist(),
+            lap_time(study, i),
+            *frame_time(study, frames, i)[-1:].tolist(),
             config.scenario.steps,
         )
         for i, config in enumerate(study.configs)
@@ -567,7 +570,7 @@ def _ideal(study: Study, way: Way, runs: int) -> Series:
     return Series(
         name="a consistent filter",
         role="ink",
-        x=paper.frame_time(study, expected.shape[1]),
+        x=frame_time(study, expected.shape[1]),
         y=np.mean(expected, axis=0),
         low=np.min(low, axis=0),
         high=np.max(high, axis=0),
@@ -588,7 +591,7 @@ def _anees_lines(selection: Selection, way: Way) -> list[Series]:
                 Series(
                     name=case_name(study, way, i) or way[1],
                     role=way[1],
-                    x=paper.frame_time(study, nees.shape[2], i),
+                    x=frame_time(study, nees.shape[2], i),
                     y=anees(nees[counts, column]),
                     strength=1.0 - 0.75 * column / max(len(cases) - 1, 1),
                 )

@@ -2,7 +2,7 @@
 
 The page is one file without outside requests: style, script and drawings are inside. The template
 escapes every text. The same folder gives the same bytes. A study that holds the paper's cases is
-asked the paper's question and its claims are judged; other studies are asked for the effects of
+asked the paper's question and its sentences are judged; other studies are asked for the effects of
 their variables.
 """
 
@@ -12,7 +12,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from importlib.metadata import PackageNotFoundError, version
 from importlib.resources import files
-from math import inf, nan
+from math import inf
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -25,14 +25,21 @@ from pipistrelle.evaluation.scores import shown_in
 from pipistrelle.figures.chart import Chart, column_count, csv_rows, csv_text
 from pipistrelle.figures.style import page_colours
 from pipistrelle.files import REPORT, claim, drawn_files, upright
-from pipistrelle.report import claims as paper
 from pipistrelle.report import effects as changes
 from pipistrelle.report import tables
 from pipistrelle.report.charts import Figure, answers, study_charts
-from pipistrelle.report.claims import CLAIMS, FILTERS, WITHOUT, Claim, papers_cases, tally
+from pipistrelle.report.claims import (
+    WITHOUT,
+    YARDSTICKS,
+    findings,
+    judge_claims,
+    judge_sentences,
+    papers_answer,
+    scoreboard,
+)
 from pipistrelle.report.effects import HEADLINE, OTHERWISE, Effect, effects_of, measures_of
 from pipistrelle.report.models import model_charts
-from pipistrelle.report.sentences import judge_sentences
+from pipistrelle.report.sentences import FILTERS, SENTENCES, Sentence, papers_cases
 from pipistrelle.report.study import (
     ONLINE_POSITION,
     RULES,
@@ -44,7 +51,7 @@ from pipistrelle.report.study import (
     selections,
 )
 from pipistrelle.report.svg import legend, panel_svg, readings
-from pipistrelle.report.variables import UNITS, number_word, three_digits
+from pipistrelle.report.variables import UNITS, amount, number_word, three_digits
 from pipistrelle.settings import to_toml
 
 if TYPE_CHECKING:
@@ -70,20 +77,20 @@ class Answered:
     selections: Mapping[Rule, Selection]
     effects: Mapping[Rule, tuple[Effect, ...]]
     """Effects and selections under each rule."""
-    claims: list[dict[str, Any]]
-    """Judged, as `judge_claims` returns them."""
+    sentences: list[dict[str, Any]]
+    """Judged, as `judge_sentences` returns them."""
     answer: list[str]
     """A headline, then further sentences."""
     findings: list[dict[str, str]]
     """Table of the answer to the paper's question; empty for other questions."""
 
 
-def answered(study: Study, claims: Sequence[Claim] | None = None) -> Answered:
-    """Answer a study's question, from its effects and the judged claims."""
+def answered(study: Study, sentences: Sequence[Sentence] | None = None) -> Answered:
+    """Answer a study's question; `sentences` as in `write_report`."""
     papers, by_rule = papers_cases(study), selections(study)
     effects = {rule: effects_of(selection) for rule, selection in by_rule.items()}
-    asked = (CLAIMS if papers else ()) if claims is None else claims
-    judged = paper.judge_claims(by_rule, asked)
+    asked = (SENTENCES if papers else ()) if sentences is None else sentences
+    judged = judge_sentences(by_rule, asked)
     return Answered(
         study=study,
         papers=papers,
@@ -91,11 +98,11 @@ def answered(study: Study, claims: Sequence[Claim] | None = None) -> Answered:
         rule="world" if papers else HEADLINE,
         selections=by_rule,
         effects=effects,
-        claims=judged,
-        answer=paper.papers_answer(by_rule, judged)
+        sentences=judged,
+        answer=papers_answer(by_rule, judged)
         if papers
         else changes.answer(by_rule[HEADLINE], effects[HEADLINE]),
-        findings=paper.findings(by_rule) if papers else [],
+        findings=findings(by_rule) if papers else [],
     )
 
 
@@ -133,8 +140,9 @@ def summary(result: Answered) -> dict[str, Any]:
         "effect_tables": [] if result.papers else tables.effect_tables(selection, *effects),
         "effects": changes.record(result.effects, result.rule),
         "cases": tables.case_rows(selection),
-        "claims": [paper.record(claim) for claim in result.claims],
-        "sentences": judge_sentences(selection) if result.papers else [],
+        "scoreboard": scoreboard(result.sentences) if result.sentences else None,
+        "claims": judge_claims(result.sentences),
+        "sentences": result.sentences,
         "exclusion_rules": dict(RULES),
         "exclusions": exclusions,
         "trials_failed": sum(row["failed"] for row in exclusions),
@@ -148,21 +156,21 @@ def write_report(
     study: Study,
     folder: Path,
     *,
-    claims: Sequence[Claim] | None = None,
+    sentences: Sequence[Sentence] | None = None,
     charts: Sequence[Figure] | None = None,
     progress: Callable[[str], None] = lambda _: None,
 ) -> dict[str, Any]:
     """Write the report of a study: a page with question and answer, figures and a summary.
 
     `study`: as `read_study` gives it. `folder`: is made if missing; gets ``index.html``,
-    ``summary.json`` and ``figures``. `claims`: to be judged; by default the paper's if the study
+    ``summary.json`` and ``figures``. `sentences`: to be judged; by default the paper's if the study
     holds its cases. `charts`: functions that return the charts of a figure, with distinct names; by
     default as for `study_charts`. `progress`: is given the name of each figure before it is drawn.
     Returns: the content of ``summary.json``. Raises InputError: as `pipistrelle.files.claim`;
     only an earlier report is replaced.
     """
     own = claim(folder, REPORT, overwrite=True)
-    result = answered(study, claims)
+    result = answered(study, sentences)
     figures: dict[str, dict[Rule, Chart]] = {}
     for rule in sorted(RULES, key=lambda rule: rule != result.rule):  # the answer's is printed
         for chart in study_charts(result.selections[rule], charts):
@@ -202,7 +210,9 @@ def page(
         papers=result.papers,
         headline=result.rule,
         question=result.question,
-        claims=result.claims,
+        claims=numbers["claims"],
+        sentences=result.sentences,
+        yardsticks=YARDSTICKS,
         summary=numbers,
         few=MIN_WORLDS,
         intervals=INTERVALS,
@@ -224,7 +234,6 @@ def page(
         rules=RULES,
         without=WITHOUT,
         spoken=SPOKEN,
-        tally=tally,
         departures=tables.not_the_papers_line(numbers["not_the_papers"]) if result.papers else "",
         consistency=tables.by_strategy(numbers["consistency"]),
         config=to_toml(study.config),
@@ -239,7 +248,7 @@ def _template() -> "Template":
     environment = Environment(
         autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True
     )
-    environment.filters |= {"number": three_digits, "p": _p, "finding": _shown}
+    environment.filters |= {"number": three_digits, "p": _p, "finding": _shown, "amount": amount}
     text = (files("pipistrelle.report") / "page.html").read_text(encoding="utf-8")
     return environment.from_string(text)
 
@@ -316,23 +325,23 @@ def _p(p: float, sentence: bool = False) -> str:
     return ("= " if sentence else "") + (f"{p:.2g}" if p < 0.1 else f"{p:.2f}")
 
 
-def _shown(finding: Mapping[str, Any], unit: str) -> dict[str, str]:
-    """Format a claim's finding (mean, interval, margin) in its unit, angles in degrees."""
-    factor, sign = UNITS[unit]
-    end = f" {sign}" if sign not in ("", "°") else sign
-    within, edge = finding["relation"] == "within", finding["margin"]
-    edges = {edge, -edge} if within else {edge}
+def _shown(finding: Mapping[str, Any]) -> dict[str, str]:
+    """Format a finding of a sentence in its unit, angles in degrees."""
+    unit, margin, factor = finding["unit"], finding["margin"], UNITS[finding["unit"]][0]
+    edge = finding["least"] if margin is None else margin
+    edges = {edge} if margin is None else {edge, -edge}
     words = [
         f"{word} " * (bound in edges) + three_digits(far if bound is None else factor * bound)
         for word, bound, far in zip(
             ("above", "below"), finding["interval"], (-inf, inf), strict=True
         )
     ]
-    mean = nan if finding["mean"] is None else finding["mean"]
-    margin = three_digits(factor * edge) + (end if edge else "")
-    return {
-        "mean": three_digits(factor * mean) + end if finding["n"] else "none",
+    text = {
+        name: "" if finding[name] is None else amount(finding[name], unit)
+        for name in ("mean", "band", "papers_error", "standard_error")
+    }
+    bound = amount(edge, unit) if edge else "0"
+    return text | {
         "interval": " to ".join(words),
-        "margin": f"± {margin}" if within else margin,
-        "sigmas": three_digits(mean / finding["sigma"]) if finding["sigma"] else "",
+        "bound": f"> {bound}" if margin is None else f"± {bound}",
     }

@@ -1,251 +1,266 @@
-r"""The 26 sentences of the paper that state results, each judged in three ways.
+r"""The 26 sentences in which the paper states results, as comparisons that a study can make.
 
-Bradley & Abaid state results in Secs. V-A to V-D and Appendix A. Each sentence is a list of
-comparisons: a statistic over worlds that the sentence says is above 0, or within a margin of 0.
-The worlds are those that the paper's exclusion leaves.
+Bradley & Abaid state results in Secs. V-A to V-D and VI and in Appendix A. A sentence has parts. A
+part makes comparisons: statistics over worlds that the sentence says are above 0, or within a
+margin of 0. Each comparison has three yardsticks:
 
-- **By means**: the statistic has the stated sign or size.
-- **By bands**, the paper's yardstick for significance: the bands of one standard deviation over the
-  worlds, :math:`m_1 \pm \sigma_1` and :math:`m_2 \pm \sigma_2`, do not contradict the sentence.
-  What it calls larger is not smaller by more than :math:`\sigma_1 + \sigma_2`; what it calls not
-  significant has overlapping bands.
-- **By intervals**: the t interval of the statistic, corrected for all comparisons of the sentence
-  (`evaluation.comparison.judge`). It alone says how surely a mean is known.
+- **Means**: the statistic has the stated sign or size.
+- **Bands**, the paper's own yardstick for significance: the bands of one standard deviation over
+  the worlds, :math:`m_1 \pm \sigma_1` and :math:`m_2 \pm \sigma_2`, do not contradict the sentence.
+  The mean that it calls larger is not smaller by more than :math:`\sigma_1 + \sigma_2`; bands of
+  means without a significant difference overlap.
+- **Intervals**: the t interval of the statistic, corrected for all comparisons of the sentence
+  (`evaluation.comparison.judge`). Only intervals show how surely a mean is known.
 
 Standard deviations, maxima and other statistics of all worlds are jackknifed
-(`evaluation.comparison.pseudovalues`). The paper's own sampling error is that of its 107 or 100
-worlds, our standard deviation of the difference being the estimate of its own.
+(`evaluation.comparison.pseudovalues`). `SENTENCES` is the only list. `report.claims` judges it.
 """
 
 import math
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from functools import partial
 from itertools import product
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 from jaxtyping import Float
 
 from pipistrelle.config import STRATEGIES
-from pipistrelle.evaluation.comparison import Statement, judge, pooled_std, pseudovalues
-from pipistrelle.report.claims import (
-    CROSSING,
-    EXCLUDED,
-    FILTERS,
-    NARROW,
-    SEEN,
-    TABLE_II,
-    WORLDS,
-    cell_of,
-    curves,
-    departure,
-    lap_fit,
-    row_name,
-)
+from pipistrelle.estimation.catalogue import PAPERS, entry
+from pipistrelle.evaluation.comparison import Relation, Statement, pooled_std, pseudovalues
+from pipistrelle.evaluation.consistency import anees_departure
+from pipistrelle.evaluation.scores import SCORES
 from pipistrelle.report.study import (
     COMMON,
     HEADING,
     LANDMARKS,
+    NEES,
     POSITION,
+    Cell,
     Selection,
+    Study,
     Way,
     case_name,
+    frame_time,
+    kept,
+    lap_time,
+    mean_std,
     own_cases,
     samples,
 )
+from pipistrelle.report.variables import BEAM, BEAMWIDTHS, beam_name
 
 Worlds = Float[np.ndarray, " n"]
 ACTIVE, FUSED, PASSIVE = STRATEGIES
+FILTERS = {name: entry(name).title for name in PAPERS}
+"""The paper's filters, to which its claims apply."""
+SEEN = "landmarks_total"
+EXCLUDED = {"ekf": 8, "fastslam": 15}
+"""Worlds that the paper dropped, of `WORLDS` (Bradley & Abaid, Sec. V-A)."""
+WORLDS = 115
+NEAR = 0.25
+"""Beamwidths that differ by less are the same [deg]: the paper rounds radii to 0.1 mm."""
+CROSSING = 41.0
+"""Below the paper's 42 degrees, where it sees fused overtake active [deg]."""
+NARROW = 64.0
+"""Below the paper's 65 degrees, where its gap passes one sigma [deg]."""
+
+
+class Printed(NamedTuple):
+    """Row of Table II for a filter: mean and standard deviation of landmarks."""
+
+    filter: str
+    beamwidth: float
+    """[deg] Of fused sensing; 0 for passive."""
+    full: tuple[float, float]
+    """Fully initialised landmarks."""
+    total: tuple[float, float]
+    """Fully and partially initialised landmarks."""
+
+
+TABLE_II = (
+    Printed("ekf", 180.0, full=(37.7, 2.9), total=(43.7, 2.6)),
+    Printed("ekf", 33.2, full=(31.9, 3.3), total=(40.8, 3.2)),
+    Printed("ekf", 11.4, full=(30.0, 3.3), total=(40.1, 3.2)),
+    Printed("ekf", 0.0, full=(26.6, 3.3), total=(39.5, 3.4)),
+    Printed("fastslam", 180.0, full=(39.3, 2.8), total=(43.7, 2.4)),
+    Printed("fastslam", 33.2, full=(32.6, 3.3), total=(40.7, 3.1)),
+    Printed("fastslam", 11.4, full=(30.5, 3.2), total=(40.2, 3.1)),
+    Printed("fastslam", 0.0, full=(22.1, 4.9), total=(39.4, 3.3)),
+)
+"""Bradley & Abaid, Table II."""
+FITTED = {
+    ("ekf", "total", 180.0),
+    ("fastslam", "total", 180.0),
+    ("ekf", "total", 0.0),
+    ("fastslam", "total", 0.0),
+    ("ekf", "full", 0.0),
+}
+"""Means of Table II to which unreported settings were fitted: the levels to the totals at 180
+degrees and of passive sensing, the rays to passive EKF-SLAM's full landmarks. Active sensing at 180
+degrees was kept below the paper's passive count."""
+
+
+def papers_cases(study: Study) -> bool:
+    """Return whether a study holds the cases of the paper.
+
+    These are its two filters with all three strategies at its twelve beamwidths, and no other
+    variable; more filters and beamwidths are allowed.
+    """
+    ways = {(name, strategy) for name in FILTERS for strategy in STRATEGIES}
+    beams = [variable.name for variable in study.variables] == [BEAM]
+    near = [np.any(np.abs(study.beamwidth - width) < NEAR) for width in BEAMWIDTHS]
+    return beams and ways <= study.trials.keys() and all(near)
+
+
+def cell_of(study: Study, printed: Printed) -> Cell | None:
+    """Return the cell of a row of Table II; None if the study has no such case."""
+    strategy = "fused" if printed.beamwidth else "passive"
+    if (printed.filter, strategy) not in study.trials:
+        return None
+    if strategy == "passive":
+        return printed.filter, strategy, 0
+    near = np.flatnonzero(np.abs(study.beamwidth - printed.beamwidth) < NEAR)
+    return (printed.filter, strategy, int(near[0])) if len(near) else None
+
+
+def row_name(printed: Printed) -> str:
+    """Name a row as in Table II: by its beam, or as passive."""
+    return beam_name(printed.beamwidth) if printed.beamwidth else "passive (0°)"
+
+
+# Comparisons
 
 
 class Comparison(NamedTuple):
-    """A statistic over worlds, to be above 0 or within a margin of 0."""
+    """A statistic over worlds that exceeds a bound, or whose absolute value is within a margin."""
 
     label: str
+    unit: str
+    """As in `variables.UNITS`, perhaps with "per doubling" of the beamwidth."""
     sample: Worlds
     """A number per world, whose mean is the statistic."""
+    papers_error: float
+    """Standard error of the paper's statistic, in the same unit."""
     band: float = 0.0
     """Sum of the standard deviations over worlds of the two numbers compared; 0 if the statistic is
     no difference of two means."""
     margin: float | None = None
     """Bound of the absolute value; None: the statistic exceeds `least`."""
     least: float = 0.0
-    """Bound from below."""
+    fitted: bool = False
+    """Whether settings were fitted to this number, so that it is weak evidence."""
 
-    def by_means(self) -> bool:
-        """Return whether the mean has the stated sign or size."""
+    def surplus(self, band: float = 0.0) -> float:
+        """Return how far the mean is on the stated side of its bound, which a band moves away."""
         mean = float(np.mean(self.sample))
-        return mean > self.least if self.margin is None else abs(mean) <= self.margin
-
-    def by_bands(self) -> bool:
-        """Return whether bands of one standard deviation do not contradict the sentence."""
-        mean = float(np.mean(self.sample))
-        if self.margin is not None:
-            return abs(mean) <= max(self.margin, self.band)
-        return mean > (self.least or -self.band)
+        if self.margin is None:
+            return mean - (self.least or -band)
+        return max(self.margin, band) - abs(mean)
 
     def statement(self) -> Statement:
         """Return the comparison as a statement for `judge`."""
-        if self.margin is None:
-            return Statement(label=self.label, sample=self.sample, margin=self.least)
-        return Statement(
-            label=self.label, sample=self.sample, relation="within", margin=self.margin
-        )
+        relation: Relation = "above" if self.margin is None else "within"
+        edge = self.least if self.margin is None else self.margin
+        return Statement(label=self.label, sample=self.sample, relation=relation, margin=edge)
 
 
 Comparisons = Callable[[Selection], Iterable[Comparison]]
 """Makes comparisons, which must all hold."""
 
 
-class Most(NamedTuple):
-    """A part of a sentence that holds if more than half of its comparisons do."""
+class Part(NamedTuple):
+    """A part of a sentence, whose comparisons need not all hold."""
 
     make: Comparisons
-
-    def __call__(self, selection: Selection) -> Iterable[Comparison]:
-        """Make the comparisons."""
-        return self.make(selection)
+    need: Literal["all", "most", "implied"]
+    """"most": more than half must hold. "implied": the sentence does not say it in words, so that a
+    comparison that does not hold makes the sentence open and never refutes it."""
 
 
 class Sentence(NamedTuple):
     """A sentence of the paper, with the comparisons that it makes."""
 
     number: int
-    claim: int
-    """Claim to which it belongs."""
+    claim: int | None
+    """Number of the claim in `CLAIMS` to which it belongs, if any."""
     section: str
     words: str
-    parts: tuple[Comparisons, ...]
-    """Each makes some comparisons; all parts must hold."""
+    parts: tuple[Comparisons | Part, ...]
+    """All must hold."""
 
 
-def judge_sentences(selection: Selection) -> list[dict[str, Any]]:
-    """Judge every sentence by means, bands and intervals: rows of ``summary.json``.
+def _compared(
+    label: str, unit: str, sample: Worlds, *names: str, std: float | None = None, **limits: Any
+) -> Comparison:
+    """Return a comparison, with the error of the paper's statistic over the worlds that it kept.
 
-    `selection`: usually under the rule "world", the paper's. Each yardstick has the number of
-    comparisons that hold, and whether the sentence holds; None: undecided, or without cases.
+    `names`: filters, by default both; the worlds are those of the filter that lost more. `std`: of
+    the paper's numbers over worlds; by default that of the sample.
     """
-    return [_judged(sentence, selection) for sentence in SENTENCES]
+    count = WORLDS - max(EXCLUDED[name] for name in names or FILTERS)
+    error = (mean_std(sample)[1] if std is None else std) / math.sqrt(count)
+    return Comparison(label, unit, sample, error, **limits)
 
 
-def _judged(sentence: Sentence, selection: Selection) -> dict[str, Any]:
-    """Judge a sentence: its row of ``summary.json``."""
-    parts = [[one for one in make(selection) if one.sample.size > 1] for make in sentence.parts]
-    made = [one for part in parts for one in part]
-    findings = judge([one.statement() for one in made])
-    row: dict[str, Any] = {
-        "sentence": sentence.number,
-        "claim": sentence.claim,
-        "section": sentence.section,
-        "words": sentence.words,
-        "comparisons": len(made),
-        "papers_error": _papers_error(made),
-    }
-    yardsticks: dict[str, list[bool | None]] = {
-        "means": [one.by_means() for one in made],
-        "bands": [one.by_bands() for one in made],
-        "intervals": [finding.holds for finding in findings],
-    }
-    for name, verdicts in yardsticks.items():
-        left = iter(verdicts)
-        by_part = [
-            _holds([next(left) for _ in part], isinstance(make, Most))
-            for make, part in zip(sentence.parts, parts, strict=True)
-        ]
-        row[name] = verdicts.count(True)
-        row[f"by_{name}"] = False if False in by_part else (None if None in by_part else True)
-    return row | {"refuted": yardsticks["intervals"].count(False)}
+def _unit(score: str) -> str:
+    """Return the unit of a score."""
+    return SCORES[score].unit if score in SCORES else "m"
 
 
-def _holds(verdicts: Sequence[bool | None], most: bool) -> bool | None:
-    """Decide a part from its comparisons; without any it is undecided."""
-    need = len(verdicts) // 2 + 1 if most else len(verdicts)
-    if verdicts.count(False) > len(verdicts) - need:
-        return False
-    return True if verdicts and verdicts.count(True) >= need else None
-
-
-def _papers_error(made: Sequence[Comparison]) -> float | None:
-    """Return the median standard error of the paper's means, of its 107 worlds."""
-    spreads = [float(np.std(one.sample, ddof=1)) for one in made]
-    kept = WORLDS - EXCLUDED["ekf"]
-    return float(np.median(spreads)) / math.sqrt(kept) if spreads else None
-
-
-# Comparisons of two cases
-
-
-def _pairs(
-    selection: Selection,
+def larger(
     score: str,
-    first: Way,
-    second: Way,
+    *pairs: tuple[Way, Way],
+    near: bool = False,
+    sigmas: float = 0.0,
+    spread: bool = False,
     above: float = 0.0,
     below: float = math.inf,
-) -> Iterator[tuple[str, Worlds, Worlds]]:
-    """Yield label and scores of two ways at each beamwidth [deg] from `above` to below `below`."""
-    study = selection.study
-    if not {first, second} <= study.trials.keys():
-        return
-    numbers = sorted({*own_cases(study.trials[first]), *own_cases(study.trials[second])})
-    for i in map(int, numbers):
-        if above <= study.beamwidth[i] < below:
-            a, b = samples(selection, score, [(*first, i), (*second, i)])
-            beam = case_name(study, first, i) or case_name(study, second, i)
-            names = f"{FILTERS[first[0]]} {first[1]}, {FILTERS[second[0]]} {second[1]}"
-            yield f"{names}, {beam}".rstrip(", "), a, b
-
-
-def _spread(sample: Worlds) -> float:
-    """Return the standard deviation over worlds; 0 of a single world."""
-    return float(np.std(sample, ddof=1)) if len(sample) > 1 else 0.0
-
-
-def _larger(
-    score: str, *pairs: tuple[Way, Way], near: bool = False, by_sigma: bool = False, **beams: float
+    fitted_above: float = math.inf,
 ) -> Comparisons:
-    """Compare means: the first of each pair is larger, or larger by σ, or they differ by at most σ.
+    """Compare means at each beamwidth: the first of each pair is larger by more than `sigmas` σ.
 
-    σ is the pooled standard deviation over worlds.
+    `score`: one of `study.READ`, or `study.COMMON`. `pairs`: of filter and strategy; a pair that
+    the study lacks gives nothing, and cases that do not depend on the beamwidth count once. σ is
+    the pooled standard deviation over worlds. `near`: the means differ by at most σ instead.
+    `spread`: the standard deviations over worlds are compared instead. `above`, `below` [deg]: only
+    beamwidths from `above` on and below `below`. `fitted_above` [deg]: settings were fitted to
+    wider beams.
     """
 
     def made(selection: Selection) -> Iterator[Comparison]:
-        for pair in pairs:
-            for label, a, b in _pairs(selection, score, *pair, **beams):
-                if len(a) > 1:
-                    band, sigma = _spread(a) + _spread(b), pooled_std(a, b)
-                    margin, least = sigma if near else None, sigma if by_sigma else 0.0
-                    yield Comparison(label, a - b, band, margin, least)
+        study = selection.study
+        for first, second in pairs:
+            if not {first, second} <= study.trials.keys():
+                continue
+            cases = {way: own_cases(study.trials[way]) for way in (first, second)}
+            named = max(cases, key=lambda way: len(cases[way]))
+            for i in map(int, np.union1d(*cases.values())):
+                a, b = samples(selection, score, [(*first, i), (*second, i)])
+                if len(a) < 2 + spread or not above <= study.beamwidth[i] < below:
+                    continue
+                names = " − ".join(f"{FILTERS[name]} {way}" for name, way in (first, second))
+                label = f"{names}, {case_name(study, named, i)}".rstrip(", ")
+                if spread:
+                    sample = jackknifed(np.column_stack((a, b)), lambda _, std: std @ [1.0, -1.0])
+                    yield _compared(f"σ of {label}", _unit(score), sample, first[0], second[0])
+                    continue
+                sigma = pooled_std(a, b)
+                limits = {"margin": sigma} if near else {"least": sigmas * sigma}
+                limits["band"] = mean_std(a)[1] + mean_std(b)[1]
+                one = _compared(label, _unit(score), a - b, first[0], second[0], **limits)
+                yield one._replace(fitted=bool(study.beamwidth[i] > fitted_above))
 
     return made
 
 
-_near, _larger_by_sigma = partial(_larger, near=True), partial(_larger, by_sigma=True)
+_near, _more_spread = partial(larger, near=True), partial(larger, spread=True)
 
 
-def _more_spread(score: str, *pairs: tuple[Way, Way]) -> Comparisons:
-    """Compare standard deviations over worlds: the first of each pair has the larger."""
-
-    def made(selection: Selection) -> Iterator[Comparison]:
-        for pair in pairs:
-            for label, a, b in _pairs(selection, score, *pair):
-                if len(a) > 2:
-                    yield Comparison(f"σ, {label}", _stds(a, b) @ [1.0, -1.0])
-
-    return made
-
-
-def _stds(*columns: Worlds) -> Float[np.ndarray, "n k"]:
-    """Return jackknife pseudo-values of the standard deviations of k samples."""
-    return np.column_stack(
-        [_statistic(c[:, np.newaxis], lambda _, std: std[:, 0]) for c in columns]
-    )
-
-
-def _statistic(
+def jackknifed(
     worlds: Float[np.ndarray, "n k"], statistic: Callable[[np.ndarray, np.ndarray], np.ndarray]
 ) -> Worlds:
-    """Return pseudo-values of a statistic of the means of k numbers and of their squares."""
+    """Return pseudo-values of a statistic of the means and standard deviations of k numbers."""
     middle = worlds.mean(axis=0)
     moments = np.hstack((worlds - middle, np.square(worlds - middle)))
     k = worlds.shape[1]
@@ -257,77 +272,101 @@ def _statistic(
     return pseudovalues(moments, of)
 
 
-# Trends over the beamwidth
+Curves = Float[np.ndarray, "m w b"]
+"""Numbers of w ways at b beamwidths."""
 
 
-def _octaves(selection: Selection) -> Float[np.ndarray, " b"]:
-    """Return the weights that give a curve's slope per doubling of the beamwidth."""
-    octave = np.log2(selection.study.beamwidth)
-    octave = octave - octave.mean()
-    return octave / (octave @ octave)
-
-
-def _curve(selection: Selection, score: str, way: Way) -> Float[np.ndarray, "n b"] | None:
-    """Return a score at every beamwidth; None if the study lacks it or has a single one."""
-    beams = len(selection.study.beamwidth)
-    if way not in selection.study.trials or beams < 2:
-        return None
-    return np.array(samples(selection, score, [(*way, i) for i in range(beams)])).T
-
-
-def _grows(score: str, *ways: Way, sign: float = 1.0, spread: bool = False) -> Comparisons:
-    """Compare a score along the beamwidths: it, or its spread, grows with the beam (or shrinks)."""
-
-    def made(selection: Selection) -> Iterator[Comparison]:
-        for way in ways:
-            curve = _curve(selection, score, way)
-            if curve is None or len(curve) < 3:
-                continue
-            slope = sign * _octaves(selection)
-            sample = curve @ slope
-            if spread:
-                sample = _statistic(curve, lambda _, std, slope=slope: std @ slope)
-            yield Comparison(f"{FILTERS[way[0]]}, {way[1]}", sample)
-
-    return made
-
-
-def _distance_grows(
-    score: str, first: str, second: str, *, names: Sequence[str] = (*FILTERS,), share: bool = False
+def trend(
+    score: str,
+    what: str,
+    *groups: tuple[Way, ...],
+    curve: Callable[[Curves, Curves], Float[np.ndarray, "m b"]] = lambda mean, _: mean[:, 0],
+    unit: str | None = None,
 ) -> Comparisons:
-    """Compare two strategies along the beamwidths: their difference grows with the beam.
+    r"""Compare a curve over the beamwidth: it grows, by b per doubling.
 
-    `share`: the difference of means divided by the sum of the standard deviations.
+    .. math:: y \approx a + b \log_2(\mathrm{HPBW})
+
+    `what`: name of y. `groups`: the ways of a curve; each group gives a comparison. `curve`: makes
+    y from means and standard deviations; by default the mean of the first way. `unit`: of y, if not
+    the score's.
     """
 
     def made(selection: Selection) -> Iterator[Comparison]:
-        for name in names:
-            study = selection.study
-            if not {(name, first), (name, second)} <= study.trials.keys():
-                continue
-            beams = len(study.beamwidth)
-            if beams < 2:
-                continue
-            cells = [(name, way, i) for way in (first, second) for i in range(beams)]
-            both = np.array(samples(selection, score, cells)).T
-            if len(both) < 3:
-                continue
-            slope = _octaves(selection)
-            yield Comparison(
-                FILTERS[name], _statistic(both, partial(_gap, slope=slope, share=share))
-            )
+        study = selection.study
+        octave, beams = np.log2(study.beamwidth), len(study.beamwidth)
+        octave = octave - octave.mean()
+
+        def slope(mean: np.ndarray, std: np.ndarray) -> np.ndarray:
+            mean, std = (one.reshape(-1, len(groups[0]), beams) for one in (mean, std))
+            return curve(mean, std) @ octave / (octave @ octave)
+
+        for ways in groups if beams > 1 else ():
+            if {*ways} <= study.trials.keys():
+                cells = [(*way, i) for way in ways for i in range(beams)]
+                worlds = np.array(samples(selection, score, cells)).T
+                per = f"{_unit(score) if unit is None else unit} per doubling".strip()
+                if len(worlds) > 2:
+                    (name, _), *_ = ways
+                    sample = jackknifed(worlds, slope)
+                    yield _compared(f"{FILTERS[name]}: {what}", per, sample, name)
 
     return made
 
 
-def _gap(mean: np.ndarray, std: np.ndarray, *, slope: np.ndarray, share: bool) -> np.ndarray:
-    """Return the slope of the distance of two curves' means, or of its share of their bands."""
-    beams = slope.size
-    gap = np.abs(mean[:, :beams] - mean[:, beams:])
-    return (gap / (std[:, :beams] + std[:, beams:]) if share else gap) @ slope
+def _distance(mean: Curves, _: Curves) -> Float[np.ndarray, "m b"]:
+    """Return the distance of the means of two ways."""
+    return np.abs(mean[:, 0] - mean[:, 1])
 
 
 # Consistency and counts
+
+
+def curves(selection: Selection, ways: Sequence[Way]) -> list[Float[np.ndarray, "m b k"]] | None:
+    """Return the NEES over time in the worlds where all cases of some ways count."""
+    trials = selection.study.trials
+    if not set(ways) <= trials.keys():
+        return None
+    nees = [trials[way].nees for way in ways]
+    cells = [(*way, i) for way, one in zip(ways, nees, strict=True) for i in range(one.shape[1])]
+    finite = [np.isfinite(one).all(axis=(1, 2)) for one in nees]
+    return [one[kept(selection, cells) & np.all(finite, axis=0)] for one in nees]
+
+
+def departure(
+    nees: Float[np.ndarray, "m b k"], expected: Float[np.ndarray, "b k"]
+) -> Float[np.ndarray, " m"]:
+    """Return jackknife pseudo-values of `anees_departure`, averaged over the beamwidths.
+
+    `expected`: ANEES of a consistent filter.
+    """
+    by_beam = [
+        pseudovalues(nees[:, i], partial(anees_departure, expected=ideal))
+        for i, ideal in enumerate(expected)
+    ]
+    return np.mean(by_beam, axis=0)
+
+
+def lap_fit(study: Study) -> tuple[Float[np.ndarray, " k"], Float[np.ndarray, " k"]] | None:
+    r"""Return the weights that give the rise and the swing of a curve over time.
+
+    Least squares of
+
+    .. math:: \epsilon(\tau) = a + b \tau + c \, (1 - \cos 2\pi\tau) / 2 + d \sin 2\pi\tau
+
+    with tau the time in laps: b is the rise per lap, c the swing, low at the start of each lap
+    and high half-way. None for a drive of less than two laps.
+
+    Bradley & Abaid, Sec. V-B.
+    """
+    frames = next(iter(study.trials.values())).nees.shape[2]
+    tau = frame_time(study, frames) / lap_time(study)
+    if frames == 0 or tau[-1] < 2.0:
+        return None
+    turn = 2.0 * np.pi * tau
+    design = np.column_stack([np.ones(frames), tau, (1.0 - np.cos(turn)) / 2.0, np.sin(turn)])
+    _, rise, swing, _ = np.linalg.pinv(design)
+    return rise, swing
 
 
 def _lost_as_many(name: str) -> Comparisons:
@@ -336,8 +375,11 @@ def _lost_as_many(name: str) -> Comparisons:
     def made(selection: Selection) -> Iterator[Comparison]:
         if name in selection.lost:
             lost, share = selection.lost[name], EXCLUDED[name] / WORLDS
-            error = math.sqrt(WORLDS * share * (1.0 - share) * (1.0 + WORLDS / len(lost)))
-            yield Comparison(FILTERS[name], WORLDS * (lost - share), band=error, margin=error)
+            theirs = math.sqrt(WORLDS * share * (1.0 - share))
+            error = theirs * math.sqrt(1.0 + WORLDS / len(lost))
+            label = f"{FILTERS[name]}: worlds lost, of {WORLDS}, − {EXCLUDED[name]}"
+            sample = WORLDS * (lost - share)
+            yield Comparison(label, "", sample, theirs, band=error, margin=error)
 
     return made
 
@@ -348,7 +390,7 @@ def _less_consistent(selection: Selection) -> Iterator[Comparison]:
         pair = curves(selection, [("fastslam", strategy), ("ekf", strategy)])
         if pair is not None:
             fast, ekf = (one.mean(axis=(1, 2)) for one in pair)
-            yield Comparison(strategy, fast - ekf)
+            yield _compared(f"{strategy}: mean NEES, FastSLAM 2.0 − EKF", "", fast - ekf)
 
 
 def _swings_and_rises(selection: Selection) -> Iterator[Comparison]:
@@ -358,8 +400,8 @@ def _swings_and_rises(selection: Selection) -> Iterator[Comparison]:
         single = curves(selection, [(name, strategy)]) if fit is not None else None
         if single is not None and fit is not None:
             mean = single[0].mean(axis=1)
-            yield Comparison(f"{FILTERS[name]}, {strategy}: rise", mean @ fit[0])
-            yield Comparison(f"{FILTERS[name]}, {strategy}: swing", mean @ fit[1])
+            for what, weights in zip(("rise per lap", "swing"), fit, strict=True):
+                yield _compared(f"{FILTERS[name]}, {strategy}: {what}", "", mean @ weights, name)
 
 
 def _active_longer_consistent(selection: Selection) -> Iterator[Comparison]:
@@ -370,14 +412,7 @@ def _active_longer_consistent(selection: Selection) -> Iterator[Comparison]:
         if pair is not None and len(pair[0]) > 1:
             ideal = [selection.study.trials[way].consistent[0] for way in ways]
             gap = departure(pair[0], ideal[0]) - departure(pair[1], ideal[1])
-            yield Comparison(f"passive, {strategy}", gap)
-
-
-def _consistent_when_narrow(selection: Selection) -> Iterator[Comparison]:
-    """Compare EKF's fused mean NEES along the beamwidths: it grows with the beam."""
-    single = curves(selection, [("ekf", FUSED)])
-    if single is not None and single[0].shape[1] > 1:
-        yield Comparison("EKF, fused", single[0].mean(axis=2) @ _octaves(selection))
+            yield _compared(f"EKF: mean ln²(ANEES/E), passive − {strategy}", "", gap, "ekf")
 
 
 def _fused_anees_largest(selection: Selection) -> Iterator[Comparison]:
@@ -391,7 +426,8 @@ def _fused_anees_largest(selection: Selection) -> Iterator[Comparison]:
             def excess(mean: np.ndarray, first: int = first) -> np.ndarray:
                 return mean[:, :first].max(axis=1) - mean[:, first:].max(axis=1)
 
-            yield Comparison(f"fused, {strategy}", pseudovalues(np.hstack(flat), excess))
+            label = f"FastSLAM 2.0: largest ANEES, fused − {strategy}"
+            yield _compared(label, "", pseudovalues(np.hstack(flat), excess), "fastslam")
 
 
 def _as_printed(selection: Selection) -> Iterator[Comparison]:
@@ -400,8 +436,10 @@ def _as_printed(selection: Selection) -> Iterator[Comparison]:
         if (cell := cell_of(selection.study, row)) is not None:
             printed, sigma = getattr(row, kind)
             (count,) = samples(selection, f"landmarks_{kind}", [cell])
-            label = f"{FILTERS[row.filter]}, {row_name(row)}, {kind}"
-            yield Comparison(label, count - printed, band=sigma + _spread(count), margin=sigma)
+            label = f"{FILTERS[row.filter]}, {row_name(row)}: {kind} − {printed}"
+            limits = {"std": sigma, "margin": sigma, "band": sigma + mean_std(count)[1]}
+            one = _compared(label, "landmarks", count - printed, row.filter, **limits)
+            yield one._replace(fitted=(row.filter, kind, row.beamwidth) in FITTED)
 
 
 def _spread_as_printed(selection: Selection) -> Iterator[Comparison]:
@@ -410,37 +448,22 @@ def _spread_as_printed(selection: Selection) -> Iterator[Comparison]:
         if (cell := cell_of(selection.study, row)) is not None:
             (count,) = samples(selection, SEEN, [cell])
             if len(count) > 2:
-                sample = _stds(count)[:, 0] - row.total[1]
-                label = f"σ, {FILTERS[row.filter]}, {row_name(row)}"
-                yield Comparison(label, sample, margin=row.total[1] / 3.0)
-
-
-def _lead_grows(selection: Selection) -> Iterator[Comparison]:
-    """Compare the lead of fused over active sensing in landmarks: it shrinks with the beam."""
-    for name, title in FILTERS.items():
-        fused, active = (_curve(selection, LANDMARKS, (name, way)) for way in (FUSED, ACTIVE))
-        if fused is not None and active is not None:
-            beams = range(len(selection.study.beamwidth))
-            cells = [(name, way, i) for way in (ACTIVE, FUSED) for i in beams]
-            both = np.array(samples(selection, LANDMARKS, cells)).T
-            lead = both[:, : len(beams)] - both[:, len(beams) :]
-            yield Comparison(title, lead @ _octaves(selection))
+                sigma = row.total[1]
+                sample = jackknifed(count[:, np.newaxis], lambda _, std: std[:, 0]) - sigma
+                label = f"{FILTERS[row.filter]}, {row_name(row)}: σ − {sigma}"
+                yield _compared(label, "landmarks", sample, row.filter, margin=sigma / 3.0)
 
 
 # The sentences
 
 
-def _both(first: str, second: str) -> tuple[tuple[Way, Way], ...]:
+def both(first: str, second: str) -> tuple[tuple[Way, Way], ...]:
     """Pair two strategies with each of the paper's filters."""
     return tuple(((name, first), (name, second)) for name in FILTERS)
 
 
-def _other_filter(first: str = "fastslam", second: str = "ekf") -> tuple[tuple[Way, Way], ...]:
-    """Pair the two filters with each strategy."""
-    return tuple(((first, way), (second, way)) for way in STRATEGIES)
-
-
-_WORST = (*_both(PASSIVE, ACTIVE), *_both(PASSIVE, FUSED))
+_OTHER_FILTER = tuple((("fastslam", way), ("ekf", way)) for way in STRATEGIES)
+_WORST = (*both(PASSIVE, ACTIVE), *both(PASSIVE, FUSED))
 _EKF_GAIN = (("ekf", ACTIVE), ("ekf", FUSED))
 _EKF_LOSS = _EKF_GAIN[::-1]
 _FAST_LOSS = (("fastslam", FUSED), ("fastslam", ACTIVE))
@@ -448,65 +471,85 @@ _LARGEST = tuple(
     (("fastslam", PASSIVE), way) for way in product(FILTERS, STRATEGIES)
     if way != ("fastslam", PASSIVE)
 )  # fmt: skip
-_OF_BOTH = {way: tuple((name, way) for name in FILTERS) for way in STRATEGIES}
-_TABLE: tuple[tuple[int, str, str, tuple[Comparisons, ...]], ...] = (
-    (2, "V-A", "EKF-SLAM: 8 of the 115 worlds are excluded.", (_lost_as_many("ekf"),)),
-    (2, "V-A", "FastSLAM 2.0: 15 of the 115 worlds are excluded.", (_lost_as_many("fastslam"),)),
+_OF_BOTH = {way: tuple(((name, way),) for name in FILTERS) for way in STRATEGIES}
+CLAIMS = {
+    1: "Landmarks number and vary as in Table II, within its σ.",
+    2: "EKF-SLAM is more consistent than FastSLAM 2.0; ANEES swings with the laps and rises.",
+    3: "EKF-SLAM has the lower errors of the vehicle everywhere; passive sensing has the highest "
+       "position RMSE.",
+    4: "With EKF-SLAM, fused beats active in position below about 42°, on average but not "
+       "significantly, and in heading at every beamwidth.",
+    5: "With FastSLAM 2.0, fused never beats active in position.",
+    6: "Fused tends to passive as the beam narrows.",
+    7: "In map RMSE, fused never beats active, is mostly within about one σ, and follows passive.",
+    8: "Passive sees more landmarks than active at every beamwidth, by at least one σ below 65°.",
+}  # fmt: skip
+"""The paper's claims by number: each is a group of sentences."""
+_TABLE: tuple[tuple[int | None, str, str, tuple[Comparisons | Part, ...]], ...] = (
+    (None, "V-A", "EKF-SLAM: 8 of the 115 worlds are excluded.", (_lost_as_many("ekf"),)),
+    (None, "V-A", "FastSLAM 2.0: 15 of the 115 worlds are excluded.",
+     (_lost_as_many("fastslam"),)),
     (2, "V-B", "EKF-SLAM is much more consistent than FastSLAM 2.0.", (_less_consistent,)),
     (2, "V-B", "The ANEES is periodic, low near the start, and its maxima rise.",
      (_swings_and_rises,)),
-    (2, "V-B", "EKF-SLAM: active sensing stays near the ideal for longer than passive sensing, and "
-     "so does fused sensing.", (_active_longer_consistent,)),
-    (2, "V-B", "EKF-SLAM: fused sensing is more consistent as the beam narrows.",
-     (_consistent_when_narrow,)),
-    (2, "V-B", "FastSLAM 2.0: the ANEES of fused sensing extends far past that of the others.",
+    (None, "V-B", "EKF-SLAM: active sensing stays near the ideal for longer than passive sensing, "
+     "and so does fused sensing.", (_active_longer_consistent,)),
+    (None, "V-B", "EKF-SLAM: fused sensing is more consistent as the beam narrows.",
+     (trend(NEES, "fused, mean NEES", (("ekf", FUSED),)),)),
+    (None, "V-B", "FastSLAM 2.0: the ANEES of fused sensing extends far past that of the others.",
      (_fused_anees_largest,)),
     (3, "V-C", "Passive sensing has the greatest mean position RMSE.",
-     (_larger(POSITION, *_WORST),)),
+     (larger(POSITION, *_WORST),)),
     (3, "V-C", "Passive sensing has the greatest σ of the position RMSE; fused and passive vary "
      "more than active.",
-     (_more_spread(POSITION, *_WORST), _more_spread(POSITION, *_both(FUSED, ACTIVE)))),
+     (_more_spread(POSITION, *_WORST), _more_spread(POSITION, *both(FUSED, ACTIVE)))),
     (3, "V-C", "EKF-SLAM has lower mean position RMSE and variance than FastSLAM 2.0 in all "
      "combinations.",
-     (_larger(POSITION, *_other_filter()), _more_spread(POSITION, *_other_filter()))),
+     (larger(POSITION, *_OTHER_FILTER), _more_spread(POSITION, *_OTHER_FILTER))),
     (6, "V-C", "As the beam narrows, fused sensing approaches passive sensing in position.",
-     (_distance_grows(POSITION, FUSED, PASSIVE),)),
+     (trend(POSITION, "|fused − passive|", *both(FUSED, PASSIVE), curve=_distance),)),
     (4, "V-C", "EKF-SLAM: below about 42°, fused sensing improves on active sensing on average, "
      "never significantly.",
-     (_larger(POSITION, _EKF_GAIN, below=CROSSING), _larger(POSITION, _EKF_LOSS, above=CROSSING),
+     (larger(POSITION, _EKF_GAIN, below=CROSSING), larger(POSITION, _EKF_LOSS, above=CROSSING),
       _near(POSITION, _EKF_GAIN))),
     (5, "V-C", "FastSLAM 2.0: fused sensing never improves on active sensing, which is not "
-     "significantly better.", (_larger(POSITION, _FAST_LOSS), _near(POSITION, _FAST_LOSS))),
+     "significantly better.", (larger(POSITION, _FAST_LOSS), _near(POSITION, _FAST_LOSS))),
     (7, "V-D", "Map: fused sensing never outperforms active sensing on average, and is mostly "
      "within about one σ.",
-     (_larger(COMMON, *_both(FUSED, ACTIVE)), Most(_near(COMMON, *_both(FUSED, ACTIVE))))),
+     (larger(COMMON, *both(FUSED, ACTIVE)), Part(_near(COMMON, *both(FUSED, ACTIVE)), "most"))),
     (7, "V-D", "Map: as the beam narrows, fused sensing follows passive sensing, at a lower error.",
-     (_larger(COMMON, *_both(PASSIVE, FUSED)), _distance_grows(COMMON, FUSED, PASSIVE))),
+     (larger(COMMON, *both(PASSIVE, FUSED)),
+      trend(COMMON, "|fused − passive|", *both(FUSED, PASSIVE), curve=_distance))),
     (1, "V-D", "Table II: 16 mean numbers of landmarks.", (_as_printed,)),
     (1, "V-D", "Table II: the σ of the seen landmarks.", (_spread_as_printed,)),
-    (8, "V-D", "Active sensing initialises fewer landmarks as the beam narrows.",
-     (_grows(LANDMARKS, *_OF_BOTH[ACTIVE]),)),
-    (8, "V-D", "EKF-SLAM: passive sensing initialises more landmarks than active sensing.",
-     (_larger(LANDMARKS, (("ekf", PASSIVE), ("ekf", ACTIVE))),)),
-    (8, "V-D", "FastSLAM 2.0: passive sensing has the largest σ of initialised landmarks of all.",
-     (_more_spread(LANDMARKS, *_LARGEST),)),
+    (None, "V-D", "Active sensing initialises fewer landmarks as the beam narrows.",
+     (trend(LANDMARKS, "active", *_OF_BOTH[ACTIVE]),)),
+    (None, "V-D", "EKF-SLAM: passive sensing initialises more landmarks than active sensing.",
+     (larger(LANDMARKS, (("ekf", PASSIVE), ("ekf", ACTIVE))),)),
+    (None, "V-D", "FastSLAM 2.0: passive sensing has the largest σ of initialised landmarks of "
+     "all.", (_more_spread(LANDMARKS, *_LARGEST),)),
     (8, "V-D", "Passive sensing sees more landmarks than active sensing, by at least one σ below "
      "65°.",
-     (_larger(SEEN, *_both(PASSIVE, ACTIVE)),
-      _larger_by_sigma(SEEN, *_both(PASSIVE, ACTIVE), below=NARROW))),
-    (1, "V-D", "Fused sensing initialises fewer landmarks as the beam narrows, and its lead over "
-     "active sensing grows.",
-     (_grows(LANDMARKS, *_OF_BOTH[FUSED]), _lead_grows)),
-    (1, "V-D", "Fused sensing: the σ of the landmarks grows as the beam narrows.",
-     (_grows(LANDMARKS, *_OF_BOTH[FUSED], sign=-1.0, spread=True),
-      _grows(SEEN, *_OF_BOTH[FUSED], sign=-1.0, spread=True))),
+     (larger(SEEN, *both(PASSIVE, ACTIVE), fitted_above=179.0),
+      larger(SEEN, *both(PASSIVE, ACTIVE), sigmas=1.0, below=NARROW),
+      Part(larger(SEEN, *both(ACTIVE, PASSIVE), sigmas=-1.0, above=NARROW), "implied"))),
+    (None, "V-D", "Fused sensing initialises fewer landmarks as the beam narrows, and its lead "
+     "over active sensing grows.",
+     (trend(LANDMARKS, "fused", *_OF_BOTH[FUSED]),
+      trend(LANDMARKS, "active − fused", *both(ACTIVE, FUSED),
+            curve=lambda mean, _: mean[:, 0] - mean[:, 1]))),
+    (None, "V-D", "Fused sensing: the σ of the landmarks grows as the beam narrows.",
+     tuple(trend(score, f"fused, −σ of the {kind}", *_OF_BOTH[FUSED],
+                 curve=lambda _, std: -std[:, 0])
+           for score, kind in ((LANDMARKS, "initialised"), (SEEN, "seen")))),
     (3, "App. A", "EKF-SLAM has the more accurate heading everywhere.",
-     (_larger(HEADING, *_other_filter()),)),
+     (larger(HEADING, *_OTHER_FILTER),)),
     (4, "App. A", "EKF-SLAM: fused sensing has the more accurate heading at every beamwidth.",
-     (_larger(HEADING, _EKF_GAIN),)),
+     (larger(HEADING, _EKF_GAIN),)),
     (7, "VI", "EKF-SLAM, map: the bands of fused and active sensing overlap more as the beam "
      "narrows.",
-     (_distance_grows(COMMON, FUSED, ACTIVE, names=("ekf",), share=True),)),
+     (trend(COMMON, "|fused − active| over σ + σ", (("ekf", FUSED), ("ekf", ACTIVE)), unit="",
+            curve=lambda mean, std: _distance(mean, std) / std.sum(axis=1)),)),
 )  # fmt: skip
 SENTENCES = tuple(Sentence(number, *row) for number, row in enumerate(_TABLE, start=1))
 """The sentences, in the paper's order."""

@@ -9,7 +9,7 @@ from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import product
-from math import degrees, isclose
+from math import degrees, inf, isclose, pi, sin
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -247,6 +247,24 @@ def samples(
     columns = np.array([values(selection.study, score, cell) for cell in cells])
     both = kept(selection, cells) & np.all(np.isfinite(columns), axis=0)
     return list(columns[:, both])
+
+
+def frame_time(study: Study, frames: int, number: int = 0) -> Float[np.ndarray, " k"]:
+    """Return the times of the frames of a combination [s]."""
+    scenario = study.configs[number].scenario
+    return np.arange(1, frames + 1) * (scenario.steps_per_frame * scenario.step)
+
+
+def lap_time(study: Study, number: int = 0) -> float:
+    r"""Return the time of a lap without noise at a combination [s]; infinite for a straight drive.
+
+    .. math:: 2 \pi B / (V |\sin\gamma|)
+
+    Bradley & Abaid, Eq. (5).
+    """
+    config = study.configs[number]
+    rate = config.scenario.speed * abs(sin(config.scenario.steering)) / config.motion.wheelbase
+    return 2.0 * pi / rate if rate > 0.0 else inf
 
 
 def rmse_of(

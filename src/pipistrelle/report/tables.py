@@ -7,11 +7,11 @@ import numpy as np
 
 from pipistrelle.config import Config
 from pipistrelle.estimation.catalogue import CATALOGUE
-from pipistrelle.evaluation.consistency import anees, anees_bounds_about
+from pipistrelle.evaluation.consistency import anees, anees_bounds_about, anees_departure
 from pipistrelle.evaluation.scores import shown_in
 from pipistrelle.experiments.studies.plan import RADIUS, find_plan, read_plan
-from pipistrelle.report import claims as paper
 from pipistrelle.report import effects as changes
+from pipistrelle.report import sentences as paper
 from pipistrelle.report.study import (
     POSITION,
     Selection,
@@ -341,7 +341,7 @@ def consistency_rows(selection: Selection) -> list[dict[str, Any]]:
                     "bounds": [float(np.mean(low)), float(np.mean(high))],
                     "inside": float(np.mean((mean >= low) & (mean <= high))),
                     "above": float(np.mean(mean > high)),
-                    "departure": float(paper.anees_departure(mean, expected)),
+                    "departure": float(anees_departure(mean, expected)),
                 }
             )
     return rows

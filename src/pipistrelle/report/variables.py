@@ -18,6 +18,10 @@ BEAM = "beamwidth"
 BEAMWIDTHS = (11.4, 14.2, 17.6, 21.8, 26.8, 33.2, 41.6, 51.4, 64.8, 83.0, 108.6, 180.0)
 """Bradley & Abaid, Appendix B [deg]."""
 UNITS = {"rad": (180.0 / math.pi, "°"), "m": (1.0, "m"), "landmarks": (1.0, ""), "": (1.0, "")}
+UNITS |= {
+    f"{unit} per doubling".strip(): (factor, f"{sign} per doubling".strip())
+    for unit, (factor, sign) in UNITS.items()
+}
 """Factor and sign with which a number of a unit is shown."""
 NUMBERS = (
     "none", "one", "two", "three", "four", "five", "six", "seven", "eight", "nine", "ten",

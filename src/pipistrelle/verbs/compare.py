@@ -27,6 +27,7 @@ def report(
 ) -> None:
     """Write a study's report: a page that answers its question and judges the paper's claims."""
     from pipistrelle.evaluation.comparison import INTERVALS
+    from pipistrelle.report.claims import YARDSTICKS
     from pipistrelle.report.page import MIN_WORLDS, write_report
     from pipistrelle.report.study import read_study
     from pipistrelle.report.tables import not_the_papers_line
@@ -41,9 +42,9 @@ def report(
             put(f"partial: {summary['worlds_done']} of {summary['worlds_planned']} worlds")
         if count := summary["trials_failed"]:
             put(f"failed: {count} trial{'' if count == 1 else 's'}; see the page")
+        for sentence in summary["answer"]:
+            put(sentence)
         if not summary["claims"]:
-            for sentence in summary["answer"]:
-                put(sentence)
             for table in summary["effect_tables"]:
                 put("\n" + _effects(table))
             put(f"\n*: shown. {INTERVALS}")
@@ -53,12 +54,11 @@ def report(
         elif line := not_the_papers_line(summary["not_the_papers"]):
             put(line)
         for claim in summary["claims"]:
-            put(f"{claim['claim']}  {claim['verdict'].replace('-', ' '):<15} {claim['sentence']}")
-            if claim["verdict"] == "open":
-                parts = claim["by_exclusion"]["world"]["parts"]
-                holds = [finding["holds"] for part in parts for finding in part["findings"]]
-                undecided = f"{holds.count(None)} of {len(holds)} statements"
-                put(f"{'':<18} {claim['rule']} Undecided: {undecided}.")
+            verdict, count = claim["verdict"].replace("-", " "), len(claim["sentences"])
+            put(f"{claim['claim']}  {verdict:<15} {claim['sentence']}")
+            held = ", ".join(f"{claim[name]} of {count} by {name}" for name in YARDSTICKS)
+            numbers = ", ".join(map(str, claim["decided_by"]))
+            put(f"{'':<18} Sentences that hold: {held}; {verdict}: {numbers}.")
     put(target / "index.html")
 
 
