@@ -12,7 +12,7 @@ from pipistrelle.experiments.hearing.scenario import world_of
 from pipistrelle.experiments.studies.plan import cases_of, find_plan, read_plan
 from pipistrelle.experiments.studies.study import open_store
 from pipistrelle.experiments.studies.world import TABLES, with_sums, world_file, world_schemas
-from pipistrelle.report.study import COMMON, READ, Study, Trials
+from pipistrelle.report.study import COMMON, NEES, READ, Study, Trials
 from pipistrelle.report.variables import beam_variable
 
 RADII = (
@@ -145,6 +145,58 @@ def changed(study, way, score, change):
     trials = study.trials[way]
     scores = trials.scores | {score: change(trials.scores[score])}
     return replace(study, trials=study.trials | {way: replace(trials, scores=scores)})
+
+
+def plant(score, strategy, change, names=FILTERS):
+    """Change a score of a strategy by a function."""
+
+    def planted(study):
+        for name in names:
+            study = changed(study, (name, strategy), score, change)
+        return study
+
+    return planted
+
+
+def add(score, strategy, more, names=FILTERS):
+    """Add to a score of a strategy."""
+    return plant(score, strategy, lambda numbers: numbers + more, names)
+
+
+def spread(score, strategy, by, names=FILTERS):
+    """Multiply the deviations of a score from its means over the worlds."""
+    return plant(score, strategy, lambda s: s.mean(axis=0) + by * (s - s.mean(axis=0)), names)
+
+
+def nees(name, strategy, factor=1.0, step=1):
+    """Multiply the NEES of a way, or reverse it in time."""
+
+    def planted(study):
+        trials = study.trials[name, strategy]
+        curve = factor * trials.nees[:, :, ::step]
+        trials = replace(trials, nees=curve, scores=trials.scores | {NEES: curve.mean(axis=2)})
+        return replace(study, trials=study.trials | {(name, strategy): trials})
+
+    return planted
+
+
+def losing(name, count):
+    """Let a filter diverge in so many worlds."""
+
+    def planted(study):
+        trials = study.trials[name, "active"]
+        lost = (np.arange(len(study.worlds)) < count)[:, np.newaxis]
+        trials = replace(trials, diverged=trials.diverged | lost)
+        return replace(study, trials=study.trials | {(name, "active"): trials})
+
+    return planted
+
+
+def with_all(study, plants):
+    """The same study with several changes."""
+    for one in plants:
+        study = one(study)
+    return study
 
 
 def only(study, ways):

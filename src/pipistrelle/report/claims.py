@@ -14,7 +14,7 @@ import numpy as np
 
 from pipistrelle.evaluation.comparison import Finding, judge
 from pipistrelle.report.effects import Measure, compare, direction, json_finding
-from pipistrelle.report.sentences import CLAIMS, SENTENCES, Part, Sentence
+from pipistrelle.report.sentences import CLAIMS, SENTENCES, Comparison, Part, Sentence
 from pipistrelle.report.study import (
     COMMON,
     LANDMARKS,
@@ -83,16 +83,14 @@ def judge_claims(sentences: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
     those of the claim's verdict.
     """
     claims = []
-    for number, words in CLAIMS.items():
+    for number in sorted({row["claim"] for row in sentences} - {None}):
         own = [row for row in sentences if row["claim"] == number]
-        if not own:
-            continue
         verdict = next(v for v in VERDICTS.values() if any(row["verdict"] == v for row in own))
         decided_by = [row["sentence"] for row in own if row["verdict"] == verdict]
         counts = {name: sum(row[f"by_{name}"] is True for row in own) for name in YARDSTICKS}
         claims.append(
-            {"claim": number, "sentence": words, "verdict": verdict, "decided_by": decided_by}
-            | {"sentences": [row["sentence"] for row in own], **counts}
+            {"claim": number, "sentence": CLAIMS[number], "verdict": verdict}
+            | {"sentences": [row["sentence"] for row in own], "decided_by": decided_by, **counts}
         )
     return claims
 
@@ -105,65 +103,72 @@ def scoreboard(sentences: Sequence[dict[str, Any]]) -> dict[str, Any]:
     median over all comparisons of the paper's standard error over the study's.
     """
     judged = [row for row in sentences if row["comparisons"]]
-    ratios = [
-        one["papers_error"] / one["standard_error"]
-        for row in judged
-        for one in row["by_exclusion"]["world"]["findings"]
-        if one["standard_error"] is not None
-    ]
+    findings = [one for row in judged for one in row["by_exclusion"]["world"]["findings"]]
+    ratios = [f["papers_error"] / f["standard_error"] for f in findings if f["standard_error"]]
     holds = {name: [VERDICTS[row[f"by_{name}"]] for row in judged] for name in YARDSTICKS}
     holds["verdict"] = [row["verdict"] for row in judged]
-    return {
-        "sentences": len(sentences),
-        "not_judged": len(sentences) - len(judged),
-        "errors": float(np.median(ratios)) if ratios else None,
-    } | {
-        name: {verdict: words.count(verdict) for verdict in VERDICTS.values()}
-        for name, words in holds.items()
-    }
+    board: dict[str, Any] = {"sentences": len(sentences)}
+    board["not_judged"] = len(sentences) - len(judged)
+    board["errors"] = float(np.median(ratios)) if ratios else None
+    for name, words in holds.items():
+        board[name] = {verdict: words.count(verdict) for verdict in VERDICTS.values()}
+    return board
 
 
 def _judged(sentence: Sentence, selection: Selection) -> dict[str, Any]:
-    """Judge a sentence under a rule of exclusion, its comparisons as a family."""
+    """Judge a sentence under a rule of exclusion.
+
+    Its comparisons are a family, and the implied ones another, which counts only by intervals.
+    """
     parts = [part if isinstance(part, Part) else Part(part, "all") for part in sentence.parts]
     made = [(i, one) for i, part in enumerate(parts) for one in part.make(selection)]
     made = [(i, one) for i, one in made if len(one.sample) > 1]
     findings: list[dict[str, Any]] = []
-    for (i, one), finding in zip(made, judge([c.statement() for _, c in made]), strict=True):
-        error, spread = finding.std / math.sqrt(finding.n), finding.std > 0.0
-        by = zip(
-            YARDSTICKS,
-            (one.surplus() > 0.0, one.surplus(one.band) > 0.0, finding.holds),
-            strict=True,
-        )
-        findings.append(
-            {"label": one.label, "part": i, "unit": one.unit, **json_finding(finding)}
-            | {name: getattr(one, name) for name in ("least", "margin", "band", "fitted")}
-            | {"papers_error": one.papers_error, "standard_error": error if spread else None}
-            | {"surplus": one.surplus() / error if spread else None}
-            | {k: None if parts[i].need == "implied" and not holds else holds for k, holds in by}
-        )
-    judged: dict[str, Any] = {"comparisons": len(findings)}
+    for implied in (False, True):
+        family = [(i, one) for i, one in made if (parts[i].need == "implied") is implied]
+        tests = judge([one.statement() for _, one in family])
+        for (i, one), finding in zip(family, tests, strict=True):
+            findings.append(_plain(i, one, finding) | {"implied": implied})
+    said = [finding for finding in findings if not finding["implied"]]
+    judged: dict[str, Any] = {"comparisons": len(said)}
     for name in YARDSTICKS:
-        verdicts = [[f[name] for f in findings if f["part"] == i] for i in range(len(parts))]
-        judged["parts"] = [_holds(v, part.need) for v, part in zip(verdicts, parts, strict=True)]
-        judged |= {name: sum(v.count(True) for v in verdicts), f"by_{name}": _all(judged["parts"])}
-    judged["refuted"] = sum(one["intervals"] is False for one in findings)
-    order = {holds: place for place, holds in enumerate(VERDICTS)}
-    ranks = [
-        (order[judged["parts"][f["part"]]], -math.inf if f["surplus"] is None else f["surplus"])
-        for f in findings
-    ]
+        judged["parts"] = [
+            _holds([f[name] for f in findings if f["part"] == i], part.need)
+            for i, part in enumerate(parts)
+            if name == "intervals" or part.need != "implied"
+        ]
+        judged[name] = sum(one[name] is True for one in said)
+        judged[f"by_{name}"] = _all(judged["parts"])
+    judged["refuted"] = sum(one["intervals"] is False for one in said)
+    order = [*VERDICTS].index
+    ranks = [(order(judged["parts"][f["part"]]), f["surplus"] or -math.inf) for f in findings]
     decisive = ranks.index(min(ranks)) if ranks else None
     return judged | {"decisive": decisive, "findings": findings}
+
+
+def _plain(part: int, one: Comparison, finding: Finding) -> dict[str, Any]:
+    """Return a judged comparison as in ``summary.json``."""
+    error = finding.std / math.sqrt(finding.n) if finding.std > 0.0 else None
+    holds = (one.surplus() > 0.0, one.surplus(one.band) > 0.0, finding.holds)
+    names = ("unit", "least", "margin", "band", "fitted", "papers_error")
+    return {
+        "label": one.label,
+        "part": part,
+        **{name: getattr(one, name) for name in names},
+        **json_finding(finding),
+        "standard_error": error,
+        "surplus": one.surplus() / error if error else None,
+        **dict(zip(YARDSTICKS, holds, strict=True)),
+    }
 
 
 def _holds(verdicts: Sequence[bool | None], need: str) -> bool | None:
     """Decide a part from its comparisons; without any it is undecided."""
     enough = len(verdicts) // 2 + 1 if need == "most" else len(verdicts)
-    if verdicts.count(False) > len(verdicts) - enough:
-        return False
-    return True if verdicts and verdicts.count(True) >= enough else None
+    if verdicts and verdicts.count(True) >= enough:
+        return True
+    refuted = verdicts and verdicts.count(False) > len(verdicts) - enough
+    return False if refuted and need != "implied" else None
 
 
 def _all(parts: Sequence[bool | None]) -> bool | None:
@@ -232,7 +237,7 @@ def papers_answer(
 
 
 def _sentences_line(board: dict[str, Any]) -> str:
-    """Count the sentences that hold, and those that are refuted."""
+    """Count the sentences that hold and the refuted sentences."""
     means, bands, _, shown = (board[name]["reproduced"] for name in (*YARDSTICKS, "verdict"))
     refuted, left = board["verdict"]["not-reproduced"], board["not_judged"]
     return (
@@ -247,14 +252,13 @@ def _claims_line(claims: Sequence[dict[str, Any]]) -> str:
     """Name the claims of each verdict."""
     words = []
     for verdict in reversed(VERDICTS.values()):
+        spoken = verdict.replace("-", " ")
         numbers = [str(claim["claim"]) for claim in claims if claim["verdict"] == verdict]
         if len(numbers) == len(claims):
-            return f"All {number_word(len(claims))} claims are {verdict.replace('-', ' ')}."
+            return f"All {number_word(len(claims))} claims are {spoken}."
         if numbers:
-            whose = (
-                f"claim {numbers[0]} is" if len(numbers) == 1 else f"claims {listed(numbers)} are"
-            )
-            words.append(f"{whose} {verdict.replace('-', ' ')}")
+            claim, verb = ("claim", "is") if len(numbers) == 1 else ("claims", "are")
+            words.append(f"{claim} {listed(numbers)} {verb} {spoken}")
     return f"{'; '.join(words).capitalize()}."
 
 
@@ -264,9 +268,8 @@ def _headline(selection: Selection) -> str:
     for name, title in filter_titles(selection.study).items():
         if not {(name, "fused"), (name, "active")} <= selection.study.trials.keys():
             continue
-        (placed,), (error,) = (
-            _fused_minus_active(selection, name, score) for score in (LANDMARKS, COMMON)
-        )
+        (placed,) = _fused_minus_active(selection, name, LANDMARKS)
+        (error,) = _fused_minus_active(selection, name, COMMON)
         if placed.n < 2 or error.n < 2:
             left = "a single world is left" if min(placed.n, error.n) else "no world is left"
             answers.setdefault(f"not decided, {left}", []).append(title)

@@ -1,4 +1,4 @@
-r"""The 26 sentences in which the paper states results, as comparisons that a study can make.
+r"""The 26 sentences that state results of the paper, as comparisons that a study can make.
 
 Bradley & Abaid state results in Secs. V-A to V-D and VI and in Appendix A. A sentence has parts. A
 part makes comparisons: statistics over worlds that the sentence says are above 0, or within a
@@ -133,7 +133,7 @@ def row_name(printed: Printed) -> str:
 
 
 class Comparison(NamedTuple):
-    """A statistic over worlds that exceeds a bound, or whose absolute value is within a margin."""
+    """A statistic over worlds that exceeds a bound, or is within a margin of 0."""
 
     label: str
     unit: str
@@ -170,12 +170,12 @@ Comparisons = Callable[[Selection], Iterable[Comparison]]
 
 
 class Part(NamedTuple):
-    """A part of a sentence, whose comparisons need not all hold."""
+    """A part of a sentence, with the share of comparisons that it needs."""
 
     make: Comparisons
     need: Literal["all", "most", "implied"]
-    """"most": more than half must hold. "implied": the sentence does not say it in words, so that a
-    comparison that does not hold makes the sentence open and never refutes it."""
+    """"most": more than half must hold. "implied": the words do not contain it. It may leave the
+    sentence open by intervals, never refutes it, and does not count by means and bands."""
 
 
 class Sentence(NamedTuple):
@@ -369,7 +369,7 @@ def lap_fit(study: Study) -> tuple[Float[np.ndarray, " k"], Float[np.ndarray, " 
     return rise, swing
 
 
-def _lost_as_many(name: str) -> Comparisons:
+def _lost(name: str) -> Comparisons:
     """Compare the number of lost worlds with the paper's, by the binomial error of both."""
 
     def made(selection: Selection) -> Iterator[Comparison]:
@@ -377,9 +377,8 @@ def _lost_as_many(name: str) -> Comparisons:
             lost, share = selection.lost[name], EXCLUDED[name] / WORLDS
             theirs = math.sqrt(WORLDS * share * (1.0 - share))
             error = theirs * math.sqrt(1.0 + WORLDS / len(lost))
-            label = f"{FILTERS[name]}: worlds lost, of {WORLDS}, − {EXCLUDED[name]}"
-            sample = WORLDS * (lost - share)
-            yield Comparison(label, "", sample, theirs, band=error, margin=error)
+            label = f"{FILTERS[name]}: worlds lost of {WORLDS} − {EXCLUDED[name]}"
+            yield Comparison(label, "", WORLDS * (lost - share), theirs, error, margin=error)
 
     return made
 
@@ -486,9 +485,8 @@ CLAIMS = {
 }  # fmt: skip
 """The paper's claims by number: each is a group of sentences."""
 _TABLE: tuple[tuple[int | None, str, str, tuple[Comparisons | Part, ...]], ...] = (
-    (None, "V-A", "EKF-SLAM: 8 of the 115 worlds are excluded.", (_lost_as_many("ekf"),)),
-    (None, "V-A", "FastSLAM 2.0: 15 of the 115 worlds are excluded.",
-     (_lost_as_many("fastslam"),)),
+    (None, "V-A", "EKF-SLAM: 8 of the 115 worlds are excluded.", (_lost("ekf"),)),
+    (None, "V-A", "FastSLAM 2.0: 15 of the 115 worlds are excluded.", (_lost("fastslam"),)),
     (2, "V-B", "EKF-SLAM is much more consistent than FastSLAM 2.0.", (_less_consistent,)),
     (2, "V-B", "The ANEES is periodic, low near the start, and its maxima rise.",
      (_swings_and_rises,)),
