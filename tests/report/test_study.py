@@ -9,7 +9,7 @@ import pytest
 
 from pipistrelle.config import InputError
 from pipistrelle.estimation.motion import motion_step
-from pipistrelle.experiments.hearing.trajectories import motion_of
+from pipistrelle.experiments.hearing.trajectories import true_motion
 from pipistrelle.experiments.studies.plan import cases_of, read_plan
 from pipistrelle.experiments.studies.world import TABLES, with_sums, world_file
 from pipistrelle.report.study import (
@@ -411,7 +411,7 @@ def test_a_lap_takes_the_time_of_a_turn_of_the_motion_model():
     study = invent(2)
     config = study.config
     controls = np.array([config.scenario.speed, config.scenario.steering])
-    pose = motion_step(motion_of(config.motion), np.zeros(3), controls, config.scenario.step)
+    pose = motion_step(true_motion(config.motion), np.zeros(3), controls, config.scenario.step)
     assert lap_time(study) == pytest.approx(2 * np.pi / pose[2] * config.scenario.step, rel=1e-9)
     assert lap_time(study) == pytest.approx(62.1, abs=0.05), "as the paper's drive: three laps"
     assert lap_time(turning(study, steering=0.0)) == np.inf
