@@ -95,3 +95,12 @@ def undrawn(monkeypatch):
     from reference.pictures import leave_out_picture
 
     leave_out_picture(monkeypatch)
+
+
+@pytest.fixture
+def real():
+    """The folder of the real MRCLAM set 6, where it is at hand."""
+    place = os.environ.get("PIPISTRELLE_DATA")
+    if not place or not (Path(place) / "mrclam" / "MRCLAM_Dataset6").is_dir():
+        pytest.skip("PIPISTRELLE_DATA names no folder that holds mrclam/MRCLAM_Dataset6")
+    return Path(place) / "mrclam" / "MRCLAM_Dataset6"

@@ -204,3 +204,12 @@ def followed(slam, mission, start=START):
         belief, poses = slam.predict(belief, controls, dt)
         belief = slam.update(belief, scan)
         yield belief, poses
+
+
+def beside(slam, slow, mission, start=START):
+    """Yield belief and poses of a filter frame by frame, and the poses of its slow reference."""
+    slow.start(start.mean, start.covariance)
+    for frame, (belief, poses) in enumerate(followed(slam, mission, start)):
+        own = slow.predict(mission.controls[frame], mission.dt[frame])
+        slow.update(mission.scans[frame])
+        yield belief, poses, own

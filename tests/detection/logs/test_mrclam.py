@@ -1,6 +1,5 @@
 """MRCLAM sets: a made-up one by hand-counted facts, the real one where it is at hand."""
 
-import os
 import shutil
 from pathlib import Path
 
@@ -16,14 +15,6 @@ MADE_UP = Path(__file__).parents[2] / "data" / "mrclam_made_up"
 @pytest.fixture
 def folder(tmp_path):
     return Path(shutil.copytree(MADE_UP, tmp_path / "set"))
-
-
-@pytest.fixture
-def real():
-    place = os.environ.get("PIPISTRELLE_DATA")
-    if not place or not (Path(place) / "mrclam" / "MRCLAM_Dataset6").is_dir():
-        pytest.skip("PIPISTRELLE_DATA names no folder that holds mrclam/MRCLAM_Dataset6")
-    return Path(place) / "mrclam" / "MRCLAM_Dataset6"
 
 
 def edited(path, old, new):

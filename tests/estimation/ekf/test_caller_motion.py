@@ -20,6 +20,7 @@ from reference.missions import (
     START,
     STEADY,
     SURE,
+    beside,
     draw_mission,
     followed,
     paper_filter,
@@ -81,11 +82,8 @@ def test_a_run_with_a_caller_that_moves_equals_the_slow_reference(
     slam = paper_filter(kind, range_std=0.2, bearing_std=0.15)
     slow = reference(BICYCLE, 0.2, 0.15, slam.rays, 1.0)
     slow.excess_path_variance = 0.05**2
-    slow.start(START.mean, START.covariance)
     placed = 0
-    for frame, (belief, _) in enumerate(followed(slam, mission)):
-        slow.predict(mission.controls[frame], mission.dt[frame])
-        slow.update(mission.scans[frame])
+    for belief, *_ in beside(slam, slow, mission):
         np.testing.assert_array_equal(belief.landmark, slow.landmark)
         np.testing.assert_allclose(belief.weight, slow.weight, rtol=0, atol=1e-5)
         points, expected = ~is_velocity(belief.landmark), slow.mean[3:].reshape(-1, 2)

@@ -29,6 +29,7 @@ from reference.missions import (
     STEPS_PER_FRAME,
     SURE,
     active_mission,
+    beside,
     draw_mission,
     followed,
     nees_of,
@@ -71,10 +72,7 @@ def assert_equal_to_reference(slam, mission, start=START):
     """Every frame of the two filters agrees to 1e-9; returns the last belief."""
     twin = SlowInvariantEkfSlam if isinstance(slam, InvariantEkfSlam) else SlowEkfSlam
     slow = twin(slam.motion, slam.range_std, slam.bearing_std, slam.rays, slam.gate)
-    slow.start(start.mean, start.covariance)
-    for frame, (belief, poses) in enumerate(followed(slam, mission, start)):
-        means, covariances = slow.predict(mission.controls[frame], mission.dt[frame])
-        slow.update(mission.scans[frame])
+    for belief, poses, (means, covariances) in beside(slam, slow, mission, start):
         linear, landmarks, size = slow.linear(), belief.landmarks(), len(slow.landmark)
         mapped, rows = linear[3:, 3:].reshape(size, 2, size, 2), np.arange(size)
         pairs = [
@@ -175,42 +173,32 @@ def test_a_drive_by_poses_equals_the_slow_reference(stated, kind, frames):
     assert_equal_to_reference(paper_filter(kind, motion=motion), mission)
 
 
-@pytest.mark.slow
-def test_reference_is_the_same_in_josephs_form():
-    mission = paper_mission("fused", frames=8)
-    short, joseph = (
-        SlowEkfSlam(BICYCLE, 0.2, 0.15, ray_config(), joseph=form).start(
-            START.mean, START.covariance
-        )
-        for form in (False, True)
+def assert_equal_references(mission, **changed):
+    """Two forms of the slow filter agree to 1e-9 in every frame; return their last states."""
+    one, other = (
+        SlowEkfSlam(BICYCLE, 0.2, 0.15, ray_config(), **form).start(START.mean, START.covariance)
+        for form in ({}, changed)
     )
     for controls, dt, scan in zip(mission.controls, mission.dt, mission.scans, strict=True):
-        for slow in (short, joseph):
+        for slow in (one, other):
             slow.predict(controls, dt)
             slow.update(scan)
         for field in FIELDS:
             np.testing.assert_allclose(
-                getattr(joseph, field), getattr(short, field), rtol=0, atol=1e-9
+                getattr(other, field), getattr(one, field), rtol=0, atol=1e-9
             )
+    return one, other
+
+
+@pytest.mark.slow
+def test_reference_is_the_same_in_josephs_form():
+    assert_equal_references(paper_mission("fused", frames=8), joseph=True)
 
 
 @pytest.mark.slow
 def test_correspondence_carried_in_the_state_changes_nothing():
     mission = paper_mission("fused", frames=100)
-    without, carried = (
-        SlowEkfSlam(BICYCLE, 0.2, 0.15, ray_config(), carry_correspondence=carry).start(
-            START.mean, START.covariance
-        )
-        for carry in (False, True)
-    )
-    for controls, dt, scan in zip(mission.controls, mission.dt, mission.scans, strict=True):
-        for slow in (without, carried):
-            slow.predict(controls, dt)
-            slow.update(scan)
-        for field in FIELDS:
-            np.testing.assert_allclose(
-                getattr(carried, field), getattr(without, field), rtol=0, atol=1e-9
-            )
+    without, carried = assert_equal_references(mission, carry_correspondence=True)
     assert carried.X.size == without.X.size + np.unique(carried.landmark).size
 
 

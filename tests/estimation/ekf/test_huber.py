@@ -16,6 +16,7 @@ from reference.invariant_ekf import SlowInvariantEkfSlam
 from reference.missions import (
     BICYCLE,
     START,
+    beside,
     followed,
     paper_filter,
     paper_mission,
@@ -39,10 +40,7 @@ def check_reference(kind, reference, strategy, rays, bearing_std, *, gate=1.0, *
     mission = paper_mission(strategy, outliers=0.05, **known, **changes)
     slam = paper_filter(kind, rays=rays, gate=gate, robust=True, **known)
     slow = reference(BICYCLE, 0.05, bearing_std, rays, gate, robust=True)
-    slow.start(START.mean, START.covariance)
-    for frame, (belief, _) in enumerate(followed(slam, mission)):
-        slow.predict(mission.controls[frame], mission.dt[frame])
-        slow.update(mission.scans[frame])
+    for belief, *_ in beside(slam, slow, mission):
         spread = slow.linear()[:3, :3]
         np.testing.assert_array_equal(belief.landmark, slow.landmark)
         np.testing.assert_allclose(belief.weight, slow.weight, rtol=0, atol=1e-9)

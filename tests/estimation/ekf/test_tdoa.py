@@ -20,9 +20,9 @@ from pipistrelle.geometry import range_and_bearing
 from reference.missions import (
     BICYCLE,
     CIRCLE,
-    START,
     STEADY,
     SURE,
+    beside,
     draw_mission,
     followed,
     nees_of,
@@ -98,10 +98,7 @@ def check_reference(kind, reference, strategy, callers, frames, *, gate=1.0, rob
     slam = paper_filter(kind, rays=ray_config(**rays), gate=gate, robust=robust, **known)
     slow = reference(BICYCLE, 0.2, 0.15, slam.rays, gate, robust=robust)
     slow.excess_path_variance = 0.05**2
-    slow.start(START.mean, START.covariance)
-    for frame, (belief, _) in enumerate(followed(slam, mission)):
-        slow.predict(mission.controls[frame], mission.dt[frame])
-        slow.update(mission.scans[frame])
+    for belief, *_ in beside(slam, slow, mission):
         spread = slow.linear()[:3, :3]
         np.testing.assert_array_equal(belief.landmark, slow.landmark)
         np.testing.assert_allclose(belief.weight, slow.weight, rtol=0, atol=1e-5)

@@ -1,6 +1,5 @@
 """Recorded logs on trial: the truth beside them, and what each strategy may hear."""
 
-import os
 import shutil
 from dataclasses import replace
 from pathlib import Path
@@ -37,14 +36,6 @@ def folder(tmp_path):
 @pytest.fixture
 def made_up(tmp_path):
     return Path(shutil.copytree(MADE_UP, tmp_path / "set"))
-
-
-@pytest.fixture
-def real():
-    place = os.environ.get("PIPISTRELLE_DATA")
-    if not place or not (Path(place) / "mrclam" / "MRCLAM_Dataset6").is_dir():
-        pytest.skip("PIPISTRELLE_DATA names no folder that holds mrclam/MRCLAM_Dataset6")
-    return Path(place) / "mrclam" / "MRCLAM_Dataset6"
 
 
 def refused(call, *parts):
