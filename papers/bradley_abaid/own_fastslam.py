@@ -452,19 +452,23 @@ def move(columns, controls, dt, stds, wheelbase):
     """Predict all poses and covariances through a control step of a bicycle (Eqs. 5 and 10)."""
     pose, P = columns[0], columns[1]
     v, g = controls
+    ahead, turn, qv, qg = v * dt, v * dt / wheelbase, stds[0] ** 2, stds[1] ** 2
+    u, w = dt / wheelbase * math.sin(g), turn * math.cos(g)
     for p in range(len(pose)):
         c, s = math.cos(pose[p, 2] + g), math.sin(pose[p, 2] + g)
-        dx, dy, along = v * dt * c, v * dt * s, v * dt / wheelbase
-        F, U = np.eye(3), np.zeros((3, 2))
-        F[0, 2], F[1, 2] = -dy, dx
-        U[0, 0], U[1, 0], U[2, 0] = dt * c, dt * s, dt / wheelbase * math.sin(g)
-        U[0, 1], U[1, 1], U[2, 1] = -dy, dx, along * math.cos(g)
-        U[:, 0] *= stds[0]
-        U[:, 1] *= stds[1]
-        P[p] = F @ P[p] @ F.T + U @ U.T
+        dx, dy, C = ahead * c, ahead * s, P[p]
+        xh, yh, hh = C[0, 2], C[1, 2], C[2, 2]
+        a, b, vx, vy = xh - dy * hh, yh + dx * hh, dt * c, dt * s
+        C[0, 0] += -dy * (xh + a) + qv * vx * vx + qg * dy * dy
+        C[0, 1] += dx * xh - dy * yh - dx * dy * hh + qv * vx * vy - qg * dy * dx
+        C[1, 1] += dx * (yh + b) + qv * vy * vy + qg * dx * dx
+        C[0, 2] = a + qv * vx * u - qg * dy * w
+        C[1, 2] = b + qv * vy * u + qg * dx * w
+        C[2, 2] += qv * u * u + qg * w * w
+        C[1, 0], C[2, 0], C[2, 1] = C[0, 1], C[0, 2], C[1, 2]
         pose[p, 0] += dx
         pose[p, 1] += dy
-        pose[p, 2] = wrap_angle(pose[p, 2] + along * math.sin(g))
+        pose[p, 2] = wrap_angle(pose[p, 2] + turn * math.sin(g))
 
 
 PLAIN = Details()

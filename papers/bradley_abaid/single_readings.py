@@ -1,7 +1,8 @@
 """Readings of the paper one at a time: what each detail of the filters and of the sound changes.
 
     python papers/bradley_abaid/single_readings.py FOLDER [--worlds 60] [--workers 2]
-        [--layout disc] [--labels "0.1 rad"] [--cap capped] [--front-end paper] [--fits FILE]
+        [--layout disc] [--labels "0.1 rad"] [--cap capped] [--front-end paper]
+        [--fits FILE] [--table]
 
 The base is a combination of the first four factors of `second_readings`, by default the plan
 `paper`; of another, levels and tau are fitted first, or taken from FILE, the fits of
@@ -21,7 +22,7 @@ they have not. Where a reading changes what is heard, levels and tau are fitted 
 says which), to the counts that the base has in the same worlds; elsewhere they are the base's.
 
 The worlds have seed 1000; the study's have 2022. What is done is kept in FOLDER, a file for each
-world and group of readings, so that a run that is cut off goes on. The table is
+world and reading, so that a run that is cut off goes on; --table sums up what is done. The table is
 ``single_readings.csv`` beside this file for 60 worlds of the default base, else in FOLDER. Of its
 columns, ``full``, ``total``: means of Table II and their sigma over the worlds; ``gain``, ``turn``:
 error of active sensing less that of fused in position [m] and heading [rad]; ``anees``: the
@@ -33,9 +34,9 @@ in the same worlds. All are of the worlds that the reading's filter does not los
 
 import argparse
 import json
-import math
+import sys
 from collections.abc import Callable, Iterator, Mapping
-from functools import partial
+from functools import lru_cache, partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -47,8 +48,10 @@ from own_fastslam import AFTER, BEFORE, HEAVIEST, NONE, SHARED, WHOLE, Details, 
 from own_hearing import HEARD, fit_again, hear, tau_for
 from own_tracks import READINGS, follow, track_of, whole
 from readings import BEAMS, CASES, Change, fit_tau, keep, read_kept, write_table
+from readings import WHOLE as WORLDS
 from second_readings import CAP, DEFAULTS, FACTORS, ORACLES, settings
 from second_readings import HEARD as FACTORS_HEARD
+from single_table import BASE, SAME, table_of
 
 from pipistrelle.arithmetic.random_stream import stream_key
 from pipistrelle.config import Config
@@ -64,7 +67,6 @@ from pipistrelle.experiments.studies.plan import find_plan, read_plan
 from pipistrelle.files import write_whole
 from pipistrelle.report.claims import EXCLUDED
 
-BASE = "base"
 FITTED = "likelihoods not normalised, tau fitted again"
 EKF: dict[str, dict[str, Any]] = {
     "one update a scan": {"batch": True},
@@ -103,8 +105,6 @@ SETTINGS: dict[str, Change] = {
     "rays restart at resampling": {"fastslam.resampled_rays": "restart"},
 }
 """Settings of the package, for both filters."""
-NEAR = {"passive": ("passive", 0)} | {f"fused {b}": ("fused", b) for b in (180, 33, 11)}
-"""Table II's cases."""
 
 
 class Base(NamedTuple):
@@ -125,34 +125,37 @@ def main() -> None:
     plain = name == "/".join(DEFAULTS[factor] for factor in FACTORS_HEARD)
     folder = chosen.folder / f"{name.replace('/', ', ')}, {chosen.worlds}"
     folder.mkdir(parents=True, exist_ok=True)
-    with in_worlds(chosen.worlds, chosen.workers) as run:
-        base = _fitted(folder / "fits.json", chosen, name, run)
-        paths = run(partial(world_done, folder, base))
-    trials = pl.concat((read_kept(path) for found in paths for path in found), how="vertical")
-    table = pl.DataFrame([row_of(reading, trials) for reading in _order(trials)])
-    whole_run = plain and chosen.worlds == 60
+    if not chosen.table:
+        with in_worlds(chosen.worlds, chosen.workers) as run:
+            base = _fitted(folder / "fits.json", chosen, name, run)
+            run(partial(world_done, folder, base))
+    done = sorted(folder.glob("*.parquet"))
+    if not done:
+        sys.exit(f"{folder}: nothing is done yet; run without --table")
+    trials = pl.concat(read_kept(path) for path in done)
+    estimates = [f"estimate: {reading}" for reading in READINGS]
+    order = [BASE, SAME, *SETTINGS, *EKF, *FASTSLAM, *estimates, *HEARD]
+    table = table_of(trials, order)
+    finished = plain and (table["worlds"] == WORLDS).all()
     output = Path(__file__).with_name("single_readings.csv")
-    write_table(table, output if whole_run else folder / output.name)
+    write_table(table, output if finished else folder / output.name)
 
 
 def _asked() -> argparse.Namespace:
     """Read the command line."""
     options = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     options.add_argument("folder", type=Path, help="where what is done is kept; again: go on")
-    options.add_argument("--worlds", type=at_least(2), default=60, help="how many [%(default)s]")
+    options.add_argument(
+        "--worlds", type=at_least(2), default=WORLDS, help="how many [%(default)s]"
+    )
     options.add_argument("--workers", type=at_least(1), default=2, help="processes [%(default)s]")
     for factor in FACTORS_HEARD:
         options.add_argument(
             f"--{factor.replace('_', '-')}", choices=[*FACTORS[factor]], default=DEFAULTS[factor]
         )
+    options.add_argument("--table", action="store_true", help="only the table of what is done")
     options.add_argument("--fits", type=Path, help="fits of second_readings, for its levels")
     return options.parse_args()
-
-
-def _order(trials: pl.DataFrame) -> list[str]:
-    """List the readings that were run, the base first."""
-    names = trials["reading"].unique(maintain_order=True).to_list()
-    return [BASE, *(name for name in names if name != BASE)]
 
 
 # Fits
@@ -235,8 +238,13 @@ _HEARD: dict[Any, Any] = {}
 def world_done(folder: Path, base: Base, world: int) -> list[Path]:
     """Run every group of readings in a world, unless its file exists; return the files."""
     groups: dict[str, Callable[[], Iterator[dict[str, Any]]]] = {
-        "filters": partial(_filters, base, world),
-        **{name: partial(_package, name, base, world) for name in (BASE, *SETTINGS, *HEARD)},
+        **{name: partial(_package, name, base, world) for name in (BASE, *SETTINGS)},
+        **{f"own ekf, {name}": partial(_own, "ekf", name, base, world) for name in EKF},
+        **{
+            f"own fastslam, {name}": partial(_own, "fastslam", name, base, world)
+            for name in (BASE, *FASTSLAM)
+        },
+        **{name: partial(_package, name, base, world) for name in HEARD},
     }
     paths = []
     for name, trials in groups.items():
@@ -246,50 +254,58 @@ def world_done(folder: Path, base: Base, world: int) -> list[Path]:
     return paths
 
 
+@lru_cache(maxsize=1)
+def _heard(name: str, settings: str, oracle: Oracle, world: int) -> tuple[Drive, Any]:
+    """Listen in a world; the settings come as text, to be a key."""
+    config = Config.model_validate_json(settings)
+    scenario, heard = hear(name, config, [*BEAMS.values()], world, oracle)
+    return drive_of(scenario, config), heard
+
+
+def _cases_of(
+    name: str, base: Base, world: int, config: Config, *, active: bool
+) -> Iterator[tuple[Drive, str, int, Any]]:
+    """Yield drive, strategy, beam and scans of every case, heard with a change."""
+    changes = changed(base.config, base.fits.get(name, {}))
+    heard_as = name if name in HEARD else ""
+    drive, heard = _heard(heard_as, changes.model_dump_json(), base.oracle, world)
+    for way, beam in CASES:
+        if active or way != "active":
+            yield drive, way, beam, scans_of(heard[[*BEAMS].index(beam or 11)], way, config)
+
+
 def _package(name: str, base: Base, world: int) -> Iterator[dict[str, Any]]:
     """Map a world by the package's filters, with a change of settings or of what is heard."""
     config = changed(base.config, base.fits.get(name, SETTINGS.get(name, {})))
-    scenario, heard = hear(name, config, [*BEAMS.values()], world, base.oracle)
-    drive = drive_of(scenario, config)
     for slam in EXCLUDED:
         rows = []
-        for way, beam in CASES:
-            if name in SETTINGS and way == "active":
-                continue
-            scans = scans_of(heard[[*BEAMS].index(beam or 11)], way, config)
+        active = name not in SETTINGS
+        for drive, way, beam, scans in _cases_of(name, base, world, config, active=active):
             case = Case(strategy=way, filter=slam, iteration=world)
             trial = run_trial(case, drive, scans, config)
-            nees = track_nees(trial.track.pose, scenario.path)[1:]
+            nees = track_nees(trial.track.pose, drive.truth.path)[1:]
             rows.append(({"strategy": way, "beam": beam} | _numbers(trial.scores), nees))
         yield from _labelled(name, slam, world, rows)
 
 
-def _filters(base: Base, world: int) -> Iterator[dict[str, Any]]:
-    """Map a world by the filters of these scripts, with each detail changed."""
-    config, slams = base.config, {"ekf": EKF, "fastslam": {BASE: Details(), **FASTSLAM}}
-    scenario, heard = hear("", config, [*BEAMS.values()], world, base.oracle)
-    drive = drive_of(scenario, config)
-    for slam, readings in slams.items():
-        for name, details in readings.items():
-            own = config
-            if name in base.taus:
-                own = changed(config, {"rays.prune": base.taus[name]})
-            rows: dict[str, list[Any]] = {}
-            for way, beam in CASES:
-                if way == "active" and not _concerns_active(slam, name):
-                    continue
-                scans = scans_of(heard[[*BEAMS].index(beam or 11)], way, own)
-                rng = np.random.default_rng(stream_key(own.seed, world, slam))
-                made = (
-                    OwnEkf(own, drive.motion, **details)
-                    if slam == "ekf"
-                    else OwnFastSlam(own, drive.motion, details)
-                )
-                for reading, numbers, nees in _read(slam, name, made, drive, scans, rng):
-                    row = {"strategy": way, "beam": beam} | numbers
-                    rows.setdefault(reading, []).append((row, nees))
-            for reading, of_reading in rows.items():
-                yield from _labelled(reading, slam, world, of_reading)
+def _own(slam: str, name: str, base: Base, world: int) -> Iterator[dict[str, Any]]:
+    """Map a world by a filter of these scripts, with a detail changed."""
+    config, rows = base.config, dict[str, list[Any]]()
+    if name in base.taus:
+        config = changed(config, {"rays.prune": base.taus[name]})
+    active = _concerns_active(slam, name)
+    for drive, way, beam, scans in _cases_of("", base, world, config, active=active):
+        rng = np.random.default_rng(stream_key(config.seed, world, slam))
+        made = (
+            OwnEkf(config, drive.motion, **EKF[name])
+            if slam == "ekf"
+            else OwnFastSlam(config, drive.motion, FASTSLAM.get(name, Details()))
+        )
+        for reading, numbers, nees in _read(name, slam, made, drive, scans, rng):
+            row = {"strategy": way, "beam": beam} | numbers
+            rows.setdefault(reading, []).append((row, nees))
+    for reading, of_reading in rows.items():
+        yield from _labelled(reading, slam, world, of_reading)
 
 
 def _concerns_active(slam: str, name: str) -> bool:
@@ -301,7 +317,7 @@ def _concerns_active(slam: str, name: str) -> bool:
 
 
 def _read(
-    slam: str, name: str, made: Any, drive: Drive, scans: Any, rng: np.random.Generator
+    name: str, slam: str, made: Any, drive: Drive, scans: Any, rng: np.random.Generator
 ) -> Iterator[tuple[str, dict[str, Any], np.ndarray]]:
     """Yield the scores of a filter, and for the base those of every reading of its particles."""
     done, limit = follow(made, drive, scans, rng), entry(slam).nees_limit
@@ -315,7 +331,7 @@ def _read(
     if name != BASE:
         yield name, numbers, nees
         return
-    yield "own filter, nothing changed", numbers, nees
+    yield SAME, numbers, nees
     for reading, (estimate, when) in READINGS.items():
         yield f"estimate: {reading}", *scored(estimate(getattr(done, when)))
     for reading, full in made.placed().items():
@@ -341,82 +357,6 @@ def _labelled(name: str, slam: str, world: int, rows: list[Any]) -> Iterator[dic
             "reading": name, "filter": slam, "world": world, **row, "average": average,
             "frames": kept,
         }  # fmt: skip
-
-
-# The table
-
-
-def row_of(reading: str, trials: pl.DataFrame) -> dict[str, Any]:
-    """Sum a reading up: its own trials, and the base's where it changes nothing."""
-    row: dict[str, Any] = {"reading": reading}
-    for slam in EXCLUDED:
-        mine = _cases(reading, slam, trials)
-        if not mine and reading != BASE:
-            continue
-        base = _cases(BASE, slam, trials)
-        row |= {f"{key}_{slam}": value for key, value in _summary(base | mine, base, slam).items()}
-    return row
-
-
-Cases = dict[tuple[str, int], pl.DataFrame]
-
-
-def _cases(reading: str, slam: str, trials: pl.DataFrame) -> Cases:
-    """Return the trials of a reading by strategy and beam, sorted by world."""
-    chosen = trials.filter(pl.col("reading") == reading, pl.col("filter") == slam)
-    return {
-        (str(way), int(beam)): part.sort("world")
-        for (way, beam), part in chosen.group_by("strategy", "beam")
-    }
-
-
-def _summary(mine: Cases, base: Cases, slam: str) -> dict[str, float]:
-    """Return the columns of a filter."""
-    lost = {
-        rule: np.any([part[column].to_numpy() for part in mine.values()], axis=0)
-        for rule, column in (("union", "diverged"), ("average", "average"))
-    }
-    kept = ~lost["average"] if not lost["average"].all() else np.ones(len(lost["average"]), bool)
-    found: dict[str, float] = {rule: int(worlds.sum()) for rule, worlds in lost.items()}
-    for name, case in NEAR.items():
-        for score_of in ("full", "total"):
-            values = mine[case][score_of].to_numpy()[kept]
-            found[f"{score_of}_{name}"] = float(values.mean())
-            found[f"{score_of}_{name}_sigma"] = float(values.std(ddof=1)) if kept.sum() > 1 else 0.0
-    for title, column in (("gain", "position"), ("turn", "heading")):
-        for beam in (180, 33, 11):
-            gain, old = _gain(mine, column, beam), _gain(base, column, beam)
-            found |= _mean(f"{title}_{beam}", gain[kept])
-            found |= _mean(f"d_{title}_{beam}", gain - old)
-    for way in ("active", "fused", "passive"):
-        cases = [case for case in mine if case[0] == way]
-        series = [np.array(mine[case]["frames"].to_list())[kept].mean(axis=0) for case in cases]
-        found[f"anees_{way}"] = float(np.max(series))
-        level, old = (_log_nees(part, cases) for part in (mine, base))
-        found[f"nees_{way}"] = float(10 ** level.mean())
-        found |= _mean(f"d_nees_{way}", level - old)
-        error = np.mean([mine[case]["position"].to_numpy()[kept] for case in cases], axis=0)
-        found[f"position_{way}"] = float(error.mean())
-    full = mine["passive", 0]["full"].to_numpy()
-    return found | _mean("d_full_passive", full - base["passive", 0]["full"].to_numpy())
-
-
-def _gain(cases: Cases, column: str, beam: int) -> np.ndarray:
-    """Return the error of active sensing less that of fused, by world."""
-    active, fused = (cases[way, beam][column].to_numpy() for way in ("active", "fused"))
-    return active - fused
-
-
-def _log_nees(cases: Cases, of: list[tuple[str, int]]) -> np.ndarray:
-    """Return log10 of the NEES averaged over time and beams, by world."""
-    mean = np.mean([cases[case]["nees"].to_numpy() for case in of], axis=0)
-    return np.log10(np.minimum(mean, 1e12))
-
-
-def _mean(name: str, values: np.ndarray) -> dict[str, float]:
-    """Return a mean over worlds and its standard error."""
-    error = float(values.std(ddof=1)) / math.sqrt(len(values)) if len(values) > 1 else math.nan
-    return {name: float(values.mean()), f"{name}_se": error}
 
 
 if __name__ == "__main__":

@@ -117,17 +117,3 @@ def test_echoes_travel_to_where_the_vehicle_has_got_to(own):
     way = sum(np.hypot(*(target - end[..., :2]).T) for end in ends)
     np.testing.assert_allclose(343.0 * moving.delay[mine], way[mine], atol=1e-6)
     assert 1e-5 < np.abs(moving.delay - still.delay).max() < 1e-3
-
-
-def test_beams_a_degree_apart_give_whole_degrees(own):
-    found = []
-
-    def find(*given, **lags):
-        found.append(own.own_hearing.found(*given, degrees=True, late=0.0, **lags))
-        return found[-1]
-
-    short = SETTINGS.model_copy(update={"scenario": ScenarioConfig(steps=4)})
-    listen(world_of(short), short, (RADIUS,), find=find)
-    angles = np.degrees(found[0].angle)
-    assert angles.size > 3
-    np.testing.assert_allclose(angles, np.round(angles), atol=1e-9)
