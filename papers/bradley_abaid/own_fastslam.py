@@ -60,6 +60,8 @@ class Details(NamedTuple):
     """Whether the aggregated likelihoods of a ray are normalised after each bearing."""
     carried: bool = False
     """Whether each hypothesis has a correspondence, measured with a standard deviation of 1."""
+    restart: bool = False
+    """Whether the hypotheses of a ray become alike again when particles are resampled."""
 
 
 class Numbers(NamedTuple):
@@ -552,6 +554,9 @@ class OwnFastSlam:
         chosen = np.minimum(chosen, np.flatnonzero(self.weight)[-1])
         self.state = State(*(np.ascontiguousarray(part[chosen]) for part in self.state))
         self.weight, self.resampled = np.full(count, 1.0 / count), self.resampled + 1
+        if self.details.restart:
+            alike = -np.log(np.maximum(self.state.count, 1))
+            self.state.log_weight[:] = alike[..., np.newaxis]
         return chosen
 
     def _remember(self, refined: np.ndarray) -> None:

@@ -25,11 +25,13 @@ The worlds have seed 1000; the study's have 2022. What is done is kept in FOLDER
 world and reading, so that a run that is cut off goes on; --table sums up what is done. The table is
 ``single_readings.csv`` beside this file for 60 worlds of the default base, else in FOLDER. Of its
 columns, ``full``, ``total``: means of Table II and their sigma over the worlds; ``gain``, ``turn``:
-error of active sensing less that of fused in position [m] and heading [rad]; ``anees``: the
-largest over time and beams of the NEES averaged over worlds; ``union``, ``average``: worlds lost,
-by any case or by the NEES averaged over the beams of a strategy; ``d_...``: change against the base
-in the same worlds. All are of the worlds that the reading's filter does not lose by the average
-(all, if it loses all), but changes are of all worlds, those of the NEES as log10.
+error of active sensing less that of fused in position [m] and heading [rad]; ``anees``: the largest
+over time and beams of the NEES averaged over worlds; ``union``, ``average``: worlds lost, by any
+case or by the NEES averaged over the beams of a strategy; ``never``: at how many of the four beams
+fused sensing is not ahead in position; ``worst``: in how many of the eight active and fused cases
+the error is below that of passive sensing (the paper has 4 and 8 for FastSLAM); ``d_...``: change
+against the base in the same worlds. All are of the worlds that the reading's filter does not lose
+by the average (all, if it loses all), but changes are of all worlds, those of the NEES as log10.
 """
 
 import argparse
@@ -89,6 +91,11 @@ FASTSLAM = {
     "heaviest hypothesis weighs": Details(weight=HEAVIEST),
     "rays do not weigh": Details(weight=NONE),
     "rays neither propose nor weigh": Details(NONE, NONE),
+    "rays do not weigh, and restart at resampling": Details(weight=NONE, restart=True),
+    "rays neither propose nor weigh, and restart at resampling": Details(NONE, NONE, restart=True),
+    "rays do not weigh, likelihoods not normalised": Details(weight=NONE, normalised=False),
+    "weights at the sample, rays do not weigh": SAMPLED._replace(weight=NONE),
+    "resampled before the sample, rays do not weigh": Details(weight=NONE, early=True),
     "resampled before the sample": Details(early=True),
     "resampled before the sample, hypotheses as landmarks": Details(weight=SHARED, early=True),
     "a range moves the heaviest, alone, before the proposal": Details(ranged=BEFORE),

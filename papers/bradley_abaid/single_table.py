@@ -76,6 +76,10 @@ def _summary(mine: Cases, base: Cases, slam: str) -> dict[str, float]:
         found |= _mean(f"d_nees_{way}", level - old)
         error = np.mean([mine[case]["position"].to_numpy()[kept] for case in cases], axis=0)
         found[f"position_{way}"] = float(error.mean())
+    errors = {case: float(part["position"].to_numpy()[kept].mean()) for case, part in mine.items()}
+    beams = [beam for way, beam in mine if way == "fused"]
+    found["never"] = sum(errors["fused", beam] >= errors["active", beam] for beam in beams)
+    found["worst"] = sum(errors["passive", 0] > error for error in errors.values())
     full = mine["passive", 0]["full"].to_numpy()
     return found | _mean("d_full_passive", full - base["passive", 0]["full"].to_numpy())
 

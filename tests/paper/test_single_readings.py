@@ -74,12 +74,14 @@ def test_one_update_of_a_single_measurement_is_the_usual_one(own, heard):
 
 
 @pytest.mark.slow  # compiles
-@pytest.mark.parametrize("weights", ["marginal", "sampled"])
+@pytest.mark.parametrize(
+    ("weights", "rays"), [("marginal", "kept"), ("sampled", "kept"), ("marginal", "restart")]
+)
 @pytest.mark.parametrize("strategy", ["active", "fused", "passive"])
-def test_fastslam_with_nothing_changed_is_the_packages(own, heard, strategy, weights):
-    swarm = SETTINGS.fastslam.model_copy(update={"weights": weights})
+def test_fastslam_with_nothing_changed_is_the_packages(own, heard, strategy, weights, rays):
+    swarm = SETTINGS.fastslam.model_copy(update={"weights": weights, "resampled_rays": rays})
     config = SETTINGS.model_copy(update={"fastslam": swarm})
-    details = own.own_fastslam.Details(at_sample=weights == "sampled")
+    details = own.own_fastslam.Details(at_sample=weights == "sampled", restart=rays == "restart")
     slam = own.own_fastslam.OwnFastSlam(config, DRIVE.motion, details)
     assert_is_the_packages(own, slam, heard, strategy, "fastslam")
     assert slam.resampled > 0
