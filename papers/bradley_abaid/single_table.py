@@ -25,31 +25,32 @@ def table_of(trials: pl.DataFrame, order: Sequence[str]) -> pl.DataFrame:
 
 def row_of(reading: str, trials: pl.DataFrame) -> dict[str, Any]:
     """Sum a reading up: its own trials, and the base's where it changes nothing."""
-    worlds = trials.filter(pl.col("reading") == reading)["world"].unique()
-    trials = trials.filter(pl.col("world").is_in(worlds.implode()))
-    row: dict[str, Any] = {"reading": reading, "worlds": len(worlds)}
+    row: dict[str, Any] = {"reading": reading, "worlds": 0}
     for slam in EXCLUDED:
-        mine = _cases(reading, slam, trials)
-        if not mine and reading != BASE:
-            continue
-        base = _cases(BASE, slam, trials)
-        row |= {f"{key}_{slam}": value for key, value in _summary(base | mine, base, slam).items()}
+        of_filter = trials.filter(pl.col("filter") == slam)
+        worlds = of_filter.filter(pl.col("reading") == reading)["world"].unique()
+        same = of_filter.filter(pl.col("world").is_in(worlds.implode()))
+        if mine := _cases(reading, same):
+            base = _cases(BASE, same)
+            row["worlds"] = min(row["worlds"] or len(worlds), len(worlds))
+            found = _summary(base | mine, base)
+            row |= {f"{key}_{slam}": value for key, value in found.items()}
     return row
 
 
 Cases = dict[tuple[str, int], pl.DataFrame]
 
 
-def _cases(reading: str, slam: str, trials: pl.DataFrame) -> Cases:
-    """Return the trials of a reading by strategy and beam, sorted by world."""
-    chosen = trials.filter(pl.col("reading") == reading, pl.col("filter") == slam)
+def _cases(reading: str, trials: pl.DataFrame) -> Cases:
+    """Return a filter's trials of a reading by strategy and beam, sorted by world."""
+    chosen = trials.filter(pl.col("reading") == reading)
     return {
         (str(way), int(beam)): part.sort("world")
         for (way, beam), part in chosen.group_by("strategy", "beam")
     }
 
 
-def _summary(mine: Cases, base: Cases, slam: str) -> dict[str, float]:
+def _summary(mine: Cases, base: Cases) -> dict[str, float]:
     """Return the columns of a filter."""
     lost = {
         rule: np.any([part[column].to_numpy() for part in mine.values()], axis=0)
