@@ -198,7 +198,7 @@ def fit_again(name: str, base: Config, run: Run, oracle: Oracle, placed: Any) ->
 
 
 def tau_for(aim: float, counts: Any) -> float:
-    """Return the tau, of the series 1, 2, 5, whose mean count is nearest to an aim."""
+    """Return the tau, of the series 1, 2, 5 up to 0.05, whose mean count is nearest to an aim."""
     means: dict[int, float] = {}
 
     def mean(i: int) -> float:
