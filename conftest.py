@@ -104,3 +104,19 @@ def real():
     if not place or not (Path(place) / "mrclam" / "MRCLAM_Dataset6").is_dir():
         pytest.skip("PIPISTRELLE_DATA names no folder that holds mrclam/MRCLAM_Dataset6")
     return Path(place) / "mrclam" / "MRCLAM_Dataset6"
+
+
+@pytest.fixture
+def ran(monkeypatch):
+    """The worlds that are run, in order."""
+    from pipistrelle.experiments.studies import study
+
+    worlds = []
+    run_world = study.run_world
+
+    def noted(plan, iteration):
+        worlds.append(iteration)
+        return run_world(plan, iteration)
+
+    monkeypatch.setattr(study, "run_world", noted)
+    return worlds

@@ -67,7 +67,7 @@ from pipistrelle.experiments.runs.heard_world import drive_of, scans_of
 from pipistrelle.experiments.runs.trial import run_trial
 from pipistrelle.experiments.studies.plan import find_plan, read_plan
 from pipistrelle.files import write_whole
-from pipistrelle.report.claims import EXCLUDED
+from pipistrelle.report.sentences import EXCLUDED
 
 FITTED = "likelihoods not normalised, tau fitted again"
 EKF: dict[str, dict[str, Any]] = {
@@ -189,7 +189,7 @@ def _fitted(path: Path, chosen: argparse.Namespace, name: str, run: Run) -> Base
             plan = read_plan(find_plan("paper")).config
             levels = plan.emitter.level_db, plan.beacon.level_db, plan.rays.prune
         else:
-            found, _ = fit_levels(config, run, oracle=oracle, most_active=CAP[chosen.cap])
+            found = fit_levels(config, run, oracle=oracle, most_active=CAP[chosen.cap])
             tau = fit_tau(found, run, oracle=oracle)
             levels = found.emitter.level_db, found.beacon.level_db, tau
         return dict(zip(("emitter.level_db", "beacon.level_db", "rays.prune"), levels, strict=True))

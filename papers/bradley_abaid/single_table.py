@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import polars as pl
 
-from pipistrelle.report.claims import EXCLUDED
+from pipistrelle.report.sentences import EXCLUDED
 
 BASE = "base"
 SAME = "own filter, nothing changed"

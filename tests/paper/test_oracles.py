@@ -1,8 +1,5 @@
 """Known association without a gate: by the arrival that caused a peak, by the nearest bearing."""
 
-import sys
-from pathlib import Path
-
 import numpy as np
 import pytest
 
@@ -12,6 +9,7 @@ from pipistrelle.config import Config
 from pipistrelle.detection.snapshots import Detections
 from pipistrelle.experiments.hearing.listening import listen
 from pipistrelle.experiments.hearing.scenario import world_of
+from reference.papers import papers_module
 
 LAYOUT = square_of_four(Config().receiver)
 PULSE = 2.8e-3
@@ -19,12 +17,7 @@ PULSE = 2.8e-3
 
 @pytest.fixture(scope="module")
 def oracles():
-    sys.path.insert(0, str(Path(__file__).parents[2] / "papers/bradley_abaid"))
-    try:
-        import oracles
-    finally:
-        sys.path.pop(0)
-    return oracles
+    return papers_module("oracles")
 
 
 def arrivals(delay, bearing, level_db, landmark=(7, 9)):

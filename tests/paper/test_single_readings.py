@@ -1,8 +1,5 @@
 """The filters and changes of `single_readings` are the package's with nothing changed."""
 
-import sys
-from importlib import import_module
-from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
@@ -15,6 +12,7 @@ from pipistrelle.experiments.hearing.scenario import world_of
 from pipistrelle.experiments.named_settings import Case
 from pipistrelle.experiments.runs.heard_world import drive_of, scans_of
 from pipistrelle.experiments.runs.trial import run_trial
+from reference.papers import papers_module
 
 RADIUS = 0.0088
 SETTINGS = Config(
@@ -29,11 +27,7 @@ DRIVE = drive_of(WORLD, SETTINGS)
 @pytest.fixture(scope="module")
 def own():
     names = ("own_ekf", "own_fastslam", "own_hearing", "own_tracks", "single_readings")
-    sys.path.insert(0, str(Path(__file__).parents[2] / "papers/bradley_abaid"))
-    try:
-        return SimpleNamespace(**{name: import_module(name) for name in names})
-    finally:
-        sys.path.pop(0)
+    return SimpleNamespace(**{name: papers_module(name) for name in names})
 
 
 @pytest.fixture(scope="module")

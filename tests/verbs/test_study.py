@@ -70,18 +70,11 @@ def test_a_study_prints_progress_results_and_folder(obey):
     )
 
 
-def test_the_same_command_again_goes_on_and_repeats_nothing(obey, monkeypatch):
+def test_the_same_command_again_goes_on_and_repeats_nothing(obey, ran):
     obey("small.toml", "--iterations", "2", "-o", "one")
-    worlds = []
-    run_world = study.run_world
-
-    def noted(plan, iteration):
-        worlds.append(iteration)
-        return run_world(plan, iteration)
-
-    monkeypatch.setattr(study, "run_world", noted)
+    ran.clear()
     assert obey("small.toml", "-o", "one")[1].startswith("3 worlds, 30 trials")
-    assert worlds == [2]
+    assert ran == [2]
 
 
 def test_a_quiet_study_prints_only_its_folder(obey):

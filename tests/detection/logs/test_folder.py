@@ -16,6 +16,7 @@ from pipistrelle.detection.logs.recording import Log
 from pipistrelle.detection.logs.vehicle import vehicle_of
 from pipistrelle.detection.scans import Scan, with_columns
 from reference.missions import scan_with
+from reference.refused import FORM, refusal_of
 
 DATA = Path(__file__).parents[2] / "data"
 UNICYCLE = """\
@@ -69,14 +70,7 @@ def same(first, second):
 
 
 def refused(folder, *parts):
-    with pytest.raises(InputError) as error:
-        read_log(folder)
-    message = str(error.value)
-    assert "\n" not in message
-    assert re.search(r": found .+, expected .+; .+", message)
-    for part in parts:
-        assert part in message
-    return message
+    return refusal_of(lambda: read_log(folder), *parts, form=rf"^[^\n]*{FORM}$")
 
 
 # What is read

@@ -10,6 +10,7 @@ import soundfile
 
 from pipistrelle.config import InputError
 from pipistrelle.detection.sounds.sound_file import open_sound, read_description
+from reference.refused import refusal_of
 from reference.sounds import write_beside
 
 KINDS = [
@@ -47,9 +48,7 @@ def samples_of(folder):
 
 
 def refused(folder):
-    with pytest.raises(InputError) as error:
-        samples_of(folder)
-    return str(error.value)
+    return refusal_of(lambda: samples_of(folder))
 
 
 @pytest.mark.parametrize("frames", [5000, 5001])

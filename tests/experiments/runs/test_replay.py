@@ -22,6 +22,7 @@ from pipistrelle.geometry import range_and_bearing
 from pipistrelle.scripting.arguments import with_log
 from pipistrelle.settings import from_flags
 from reference.missions import scan_with
+from reference.refused import refusal_of
 
 DATA = Path(__file__).parents[2] / "data"
 MADE_UP = DATA / "mrclam_made_up"
@@ -36,13 +37,6 @@ def folder(tmp_path):
 @pytest.fixture
 def made_up(tmp_path):
     return Path(shutil.copytree(MADE_UP, tmp_path / "set"))
-
-
-def refused(call, *parts):
-    with pytest.raises(InputError) as error:
-        call()
-    for part in parts:
-        assert part in str(error.value)
 
 
 # The truth
@@ -124,15 +118,15 @@ def test_unknown_truth_is_not_written(tmp_path):
 )
 def test_a_wrong_truth_is_refused(folder, name, text, parts):
     (folder / name).write_text(text)
-    refused(lambda: load(folder), *parts)
+    refusal_of(lambda: load(folder), *parts)
 
 
 # Whose log
 
 
 def test_a_folder_that_is_not_there_is_refused(tmp_path):
-    refused(lambda: load(tmp_path / "gone"), "gone", "no such folder")
-    refused(lambda: load(tmp_path), "log.toml", "no such file")
+    refusal_of(lambda: load(tmp_path / "gone"), "gone", "no such folder")
+    refusal_of(lambda: load(tmp_path), "log.toml", "no such file")
 
 
 @pytest.mark.parametrize(
@@ -147,7 +141,7 @@ def test_an_unreadable_recording_is_refused_with_its_kind(tmp_path, names, what,
     for name in names:
         (tmp_path / name).parent.mkdir(exist_ok=True)
         (tmp_path / name).touch()
-    refused(lambda: load(tmp_path / names[0].split("/")[0]), what, "a log folder or a MRC", fix)
+    refusal_of(lambda: load(tmp_path / names[0].split("/")[0]), what, "a log folder or a MRC", fix)
 
 
 def test_a_log_in_the_folder_of_a_recording_is_read(folder):
@@ -156,14 +150,14 @@ def test_a_log_in_the_folder_of_a_recording_is_read(folder):
 
 
 def test_a_robot_is_named_for_a_mrclam_set_and_only_there(folder):
-    refused(lambda: load(MADE_UP), "--robot", "found no robot", "(1)")
-    refused(lambda: load(MADE_UP, 4), "--robot", "found robot 4", "(1)")
-    refused(lambda: load(folder, 1), "robot 1", "--robot")
+    refusal_of(lambda: load(MADE_UP), "--robot", "found no robot", "(1)")
+    refusal_of(lambda: load(MADE_UP, 4), "--robot", "found robot 4", "(1)")
+    refusal_of(lambda: load(folder, 1), "robot 1", "--robot")
 
 
 def test_a_robot_is_found_by_the_text_of_its_number():
     assert load(MADE_UP, "1")[0].name == load(MADE_UP, 1)[0].name
-    refused(lambda: load(MADE_UP, "one"), "--robot", "found robot one", "(1)")
+    refusal_of(lambda: load(MADE_UP, "one"), "--robot", "found robot one", "(1)")
 
 
 # A format from elsewhere
@@ -199,8 +193,8 @@ def test_a_users_truth_may_set_the_initial_pose_of_the_log(folder):
     log, truth = load(folder, 7, **known)
     assert (log.initial_pose, log.name) == ((1.0, 2.0, 3.0), "7")
     assert truth is NO_TRUTH
-    refused(lambda: load(folder, **known), "found no robot", "(7)")
-    refused(
+    refusal_of(lambda: load(folder, **known), "found no robot", "(7)")
+    refusal_of(
         lambda: load(folder / "gone", **known),
         "a tape or a log folder or a MRCLAM set or a ROS bag;",
     )
@@ -217,8 +211,8 @@ def test_a_robot_goes_by_its_name_where_its_format_has_names(folder):
     log, truth = load(folder, "bee", readers=[herd])
     assert log.name == "bee"
     assert truth.path is not None
-    refused(lambda: load(folder, "cat", readers=[herd]), "found robot cat", "(ant, bee)")
-    refused(lambda: load(folder, 1, readers=[herd]), "found robot 1", "(ant, bee)")
+    refusal_of(lambda: load(folder, "cat", readers=[herd]), "found robot cat", "(ant, bee)")
+    refusal_of(lambda: load(folder, 1, readers=[herd]), "found robot 1", "(ant, bee)")
 
 
 # MRCLAM
@@ -248,7 +242,7 @@ def test_a_mrclam_track_starts_no_earlier_than_the_truth(made_up):
 @pytest.mark.parametrize("name", ["Robot1_Groundtruth.dat", "Landmark_Groundtruth.dat"])
 def test_a_mrclam_set_is_whole(made_up, name):
     (made_up / name).unlink()
-    refused(lambda: load(made_up, 1), name, "no such file")
+    refusal_of(lambda: load(made_up, 1), name, "no such file")
 
 
 @pytest.mark.parametrize("robot", range(1, 6))

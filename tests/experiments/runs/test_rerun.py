@@ -11,10 +11,10 @@ import numpy as np
 import pytest
 
 from pipistrelle.__main__ import main
-from pipistrelle.config import InputError
 from pipistrelle.experiments.runs.replay import rerun
 from reference.command_line import SHORT
 from reference.pictures import without_picture
+from reference.refused import refusal_of
 
 OWN = Path(__file__).parents[2] / "data"
 
@@ -49,9 +49,7 @@ def folders(made, tmp_path, monkeypatch):
 
 
 def refused(folder, **options):
-    with pytest.raises(InputError) as refusal:
-        rerun(Path(folder), **options)
-    return str(refusal.value)
+    return refusal_of(lambda: rerun(Path(folder), **options))
 
 
 @pytest.mark.parametrize("name", ["run", "slam", "robot"])

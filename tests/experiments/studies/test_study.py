@@ -20,20 +20,6 @@ from reference.studies import SMALL, as_rows, assert_same, contents, leftovers, 
 
 
 @pytest.fixture
-def ran(monkeypatch):
-    """The worlds that are run, in order."""
-    worlds = []
-    run_world = study.run_world
-
-    def noted(plan, iteration):
-        worlds.append(iteration)
-        return run_world(plan, iteration)
-
-    monkeypatch.setattr(study, "run_world", noted)
-    return worlds
-
-
-@pytest.fixture
 def moody(monkeypatch):
     """Make passive FastSLAM fail in world 1, until this is called."""
     run_trial = world.run_trial
