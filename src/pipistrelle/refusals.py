@@ -70,8 +70,11 @@ def table_refusal(
     faults, rank = error.errors(include_url=False), {name: n for n, name in enumerate(first)}
     unknown = {"extra_forbidden": len(rank)}
     fault = min(
-        faults, key=lambda f: rank.get(str(f["loc"][0]), unknown.get(f["type"], len(rank) + 1))
+        faults,
+        key=lambda f: rank.get(str([*f["loc"], ""][0]), unknown.get(f["type"], len(rank) + 1)),
     )
+    if not fault["loc"]:
+        return refusal(where, "keys that do not go together", expectation(fault), "correct them")
     *within, last = fault["loc"]
     key, known, field = "", model.model_fields, None
     tables: list[Any] = [model]

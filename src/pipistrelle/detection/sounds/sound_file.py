@@ -33,7 +33,7 @@ from pipistrelle.config import (
     Section,
 )
 from pipistrelle.files import read_text
-from pipistrelle.refusals import expectation, meant, refusal, shown
+from pipistrelle.refusals import refusal, table_refusal
 from pipistrelle.settings import parse_toml
 
 ARRAY_FILE = "array.csv"
@@ -200,20 +200,7 @@ def read_description(folder: Path) -> Description:
     try:
         return Description.model_validate(raw)
     except ValidationError as error:
-        fault = min(error.errors(include_url=False), key=lambda f: f["loc"][:1] != ("format",))
-    loc = fault["loc"]
-    key = ".".join(str(part + 1) if isinstance(part, int) else part for part in loc)
-    if fault["type"] == "missing":
-        raise refusal(path, f"no key {key!r}", "it", f"add {key!r}")
-    if fault["type"] == "extra_forbidden":
-        known = {"call": OwnCall, "callers": OtherCaller}.get(str(loc[0]), Description)
-        fields = known.model_fields if len(loc) > 1 else Description.model_fields
-        near = meant(str(loc[-1]), fields)
-        fix = f"did you mean {near!r}?" if near else "remove it"
-        raise refusal(path, f"the unknown key {key!r}", f"one of {', '.join(fields)}", fix)
-    where = f"{path}, key {key!r}" if key else str(path)
-    found = shown(fault["input"]) if key else "keys that do not go together"
-    raise refusal(where, found, expectation(fault), "correct the value")
+        raise table_refusal(path, error, Description, "format") from None
 
 
 if TYPE_CHECKING:
