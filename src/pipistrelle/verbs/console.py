@@ -156,13 +156,12 @@ def listening(estimates: Iterable[tuple[str, str, Mapping[str, Any]]]) -> Iterat
     found = {(strategy, name): scores for strategy, name, scores in estimates}
     several = len({name for _, name in found}) > 1
     for (strategy, name), fused in found.items():
-        active = found.get(("active", name))
-        if strategy != "fused" or active is None:
+        active = found.get(("active", name), {})
+        placed = [scores.get("landmarks_full") for scores in (fused, active)]
+        if strategy != "fused" or None in placed:
             continue
-        placed = (f"{scores['landmarks_full']:.0f}" for scores in (fused, active))
-        line = (
-            f"Listening{f', {short_name(name)}' * several}: {' landmarks instead of '.join(placed)}"
-        )
+        counts = " landmarks instead of ".join(f"{count:.0f}" for count in placed)
+        line = f"Listening{f', {short_name(name)}' * several}: {counts}"
         said = []
         for score, title in ALIGNED.items():
             ends = (scores.get(score) for scores in (fused, active))
