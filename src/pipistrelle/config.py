@@ -678,6 +678,8 @@ class FastSlamConfig(Section):
     weights: Literal["marginal", "sampled"] = "marginal"
     """Weight of a particle: `marginal`, the likelihood before sampling, or `sampled`, prior x
     likelihood / proposal at the sample."""
+    weighed_by: Literal["all", "initialised"] = "all"
+    """Landmarks whose measurements weigh particles: `all`, or the fully `initialised` alone."""
     estimate: Literal["mixture", "heaviest", "separate"] = "separate"
     """Estimate of pose and map: `mixture`, the moments of all particles, `heaviest`, the heaviest
     particle, or `separate`, the pose of all and the map of the heaviest."""

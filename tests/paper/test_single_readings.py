@@ -69,13 +69,21 @@ def test_one_update_of_a_single_measurement_is_the_usual_one(own, heard):
 
 @pytest.mark.slow  # compiles
 @pytest.mark.parametrize(
-    ("weights", "rays"), [("marginal", "kept"), ("sampled", "kept"), ("marginal", "restart")]
-)
+    ("weights", "rays", "by"),
+    [
+        ("marginal", "kept", "all"), ("sampled", "kept", "all"), ("marginal", "restart", "all"),
+        ("marginal", "restart", "initialised"),
+    ],
+)  # fmt: skip
 @pytest.mark.parametrize("strategy", ["active", "fused", "passive"])
-def test_fastslam_with_nothing_changed_is_the_packages(own, heard, strategy, weights, rays):
-    swarm = SETTINGS.fastslam.model_copy(update={"weights": weights, "resampled_rays": rays})
-    config = SETTINGS.model_copy(update={"fastslam": swarm})
-    details = own.own_fastslam.Details(at_sample=weights == "sampled", restart=rays == "restart")
+def test_fastslam_with_nothing_changed_is_the_packages(own, heard, strategy, weights, rays, by):
+    change = {"weights": weights, "resampled_rays": rays, "weighed_by": by}
+    config = SETTINGS.model_copy(update={"fastslam": SETTINGS.fastslam.model_copy(update=change)})
+    details = own.own_fastslam.Details(
+        weight=own.own_fastslam.NONE if by == "initialised" else own.own_fastslam.MIXTURE,
+        at_sample=weights == "sampled",
+        restart=rays == "restart",
+    )
     slam = own.own_fastslam.OwnFastSlam(config, DRIVE.motion, details)
     assert_is_the_packages(own, slam, heard, strategy, "fastslam")
     assert slam.resampled > 0

@@ -241,6 +241,8 @@ class SlowFastSlam:
             if self.too_near(p.pose, members[0]):
                 return 0.0
             return float(log_normal(*self.expected(p, members[0], distance, bearing)[:2]))
+        if self.settings.weighed_by == "initialised":
+            return 0.0
         distance = math.nan if self.by_bearing(distance) else distance
         logs = self.log_likelihoods(p, members, bearing, distance)
         return log_sum([logarithm(m.weight) + log for m, log in zip(members, logs, strict=True)])

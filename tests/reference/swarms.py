@@ -115,6 +115,7 @@ def swarm_filter(
     resample_below=0.75,
     weights="marginal",
     resampled_rays="kept",
+    weighed_by="all",
     **changes,
 ):
     """Return a filter with the paper's settings, except for the changes."""
@@ -124,6 +125,7 @@ def swarm_filter(
         resample_below=resample_below,
         weights=weights,
         resampled_rays=resampled_rays,
+        weighed_by=weighed_by,
     )
     slam = AssumingFastSlam(motion=BICYCLE, rays=ray_config(), settings=swarm)
     return replace(slam, **changes)

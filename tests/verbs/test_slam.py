@@ -201,7 +201,11 @@ def test_slam_takes_the_settings_of_fastslam_from_flags_and_files_and_keeps_them
     kept = tomllib.loads(Path("2/config.toml").read_text())
     assert list(kept) == ["seed", "listening", "association", "filter", "prior", "rays", "fastslam"]
     swarm = {"particles": 9, "resample_below": 0.5, "mixture": "exact", "weights": "marginal"}
-    assert kept["fastslam"] == swarm | {"resampled_rays": "kept", "estimate": "mixture"}
+    assert kept["fastslam"] == swarm | {
+        "resampled_rays": "kept",
+        "weighed_by": "all",
+        "estimate": "mixture",
+    }
     words = ("--filter", "both", "--config", "2/config.toml", "--quiet")
     obey("slam", log, *words, "-o", "again")
     np.testing.assert_array_equal(track("2", "fused_fastslam"), track("again", "fused_fastslam"))

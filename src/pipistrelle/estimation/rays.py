@@ -131,6 +131,7 @@ class UpdateParams(NamedTuple):
     """Update of hypotheses by a bearing: FEDERATED, AS_PRINTED (federated, other reading of the
     likelihood), EXACT (Gaussian mixture) or FITTED (federated, with ``spacing = "auto"``)."""
     robust: bool  # whether Huber's rule is used (`estimation.ekf.gaussian`)
+    rays_weigh: bool  # whether bearing-only landmarks weigh particles (`estimation.fastslam`)
 
 
 @lru_cache(maxsize=16)
@@ -147,7 +148,12 @@ def gate_bounds(gate: float) -> tuple[float, float]:
 
 @lru_cache(maxsize=16)
 def update_params(
-    rays: RayConfig, gate: float, *, robust: bool = False, exact: bool = False
+    rays: RayConfig,
+    gate: float,
+    *,
+    robust: bool = False,
+    exact: bool = False,
+    rays_weigh: bool = True,
 ) -> UpdateParams:
     """Return parameters of gates and bearing-only landmarks; ``exact``: full mixture update."""
     passive_bound, active_bound = gate_bounds(gate)
@@ -166,6 +172,7 @@ def update_params(
         ranged=RANGED[rays.ranged],
         sharing=EXACT if exact else _SHARING[rays.spacing, rays.likelihood],
         robust=robust,
+        rays_weigh=rays_weigh,
     )
 
 

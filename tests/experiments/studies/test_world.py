@@ -217,7 +217,7 @@ OTHERS = {
     "rays.spacing": "auto", "rays.ranged": "moved", "rays.merge": 2.0,
     "fastslam.particles": 30, "fastslam.resample_below": 1.0, "fastslam.mixture": "exact",
     "fastslam.weights": "sampled", "fastslam.resampled_rays": "restart",
-    "fastslam.estimate": "mixture",
+    "fastslam.weighed_by": "initialised", "fastslam.estimate": "mixture",
 }  # fmt: skip
 """Another value of every setting, far enough from its default to be heard or believed."""
 FEW = ("air.spreading", "water.spreading", "target.shape", "emitter.radius", "beacon.level_db",

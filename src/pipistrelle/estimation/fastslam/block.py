@@ -484,10 +484,21 @@ def _share(members: Whole, params: UpdateParams, turn: Lanes, scratch: Scratch) 
 
 
 @no_alloc
-def _add(log_likelihood: Lanes, numbers: Whole, turn: Lanes, log_weight: Lanes) -> None:
-    """Add a measurement's log likelihood to the log weights of particles where ``turn`` is set."""
+def _add(
+    log_likelihood: Lanes,
+    numbers: Whole,
+    count: Counts,
+    params: UpdateParams,
+    turn: Lanes,
+    log_weight: Lanes,
+) -> None:
+    """Add a measurement's log likelihood to the log weights of particles where ``turn`` is set.
+
+    A ray's is left out if rays do not weigh.
+    """
     for i in range(LANES):
-        log_weight[i] += log_likelihood[i] - numbers * HALF_LOG_TAU if turn[i] > 0.0 else 0.0
+        weighs = turn[i] > 0.0 and (params.rays_weigh or count[i] == 1)
+        log_weight[i] += log_likelihood[i] - numbers * HALF_LOG_TAU if weighs else 0.0
 
 
 @no_alloc
@@ -515,6 +526,7 @@ def weigh_by_bearing(
     rows: Members,
     count: Counts,
     row: Row,
+    params: UpdateParams,
     turn: Lanes,
     scratch: Scratch,
     log_weight: Lanes,
@@ -522,10 +534,10 @@ def weigh_by_bearing(
     """Weigh particles by a bearing's mixture likelihood over a landmark's hypotheses."""
     _expect_ray(pose, rows, count, row, False, scratch)
     if most_members(count) == 1:
-        _add(scratch.likelihood[0], 1, turn, log_weight)
+        _add(scratch.likelihood[0], 1, count, params, turn, log_weight)
         return
     _weigh(rows, most_members(count), scratch)
-    _add(scratch.total, 1, turn, log_weight)
+    _add(scratch.total, 1, count, params, turn, log_weight)
 
 
 @no_alloc
@@ -541,7 +553,7 @@ def refine_by_ray(
 ) -> None:
     """Update particles' poses by a bearing to a landmark, and weigh them by its likelihood."""
     members = most_members(count)
-    weigh_by_bearing(pose, rows, count, row, turn, scratch, log_weight)
+    weigh_by_bearing(pose, rows, count, row, params, turn, scratch, log_weight)
     if members == 1:
         refine_by_bearing(pose, rows[0], row, turn)
         return
@@ -562,6 +574,7 @@ def weigh_by_active(
     rows: Members,
     row: Row,
     count: Counts,
+    params: UpdateParams,
     turn: Lanes,
     scratch: Scratch,
     log_weight: Lanes,
@@ -571,7 +584,7 @@ def weigh_by_active(
     for j in range(members):
         expect_active(pose, rows[j], row, count, j, scratch.likelihood[j])
     _weigh(rows, members, scratch)
-    _add(scratch.total, 2, turn, log_weight)
+    _add(scratch.total, 2, count, params, turn, log_weight)
 
 
 @no_alloc

@@ -27,7 +27,8 @@ The update by a frame has five steps; frames without measurements only extend th
       :label: eq-14
 
    A particle's weight is multiplied by each marginal likelihood :math:`N(\nu_i; 0, S_i)`, for a
-   partially initialised landmark by the mixture :math:`\sum_j \Lambda_j N(\nu_j; 0, S_j)`.
+   partially initialised landmark by the mixture :math:`\sum_j \Lambda_j N(\nu_j; 0, S_j)`;
+   with ``weighed_by = "initialised"`` these do not weigh.
 2. **Sample** the pose from this refined Gaussian:
 
    .. math:: \hat x_k^{[j]} \sim p(x_k \mid \hat x_{k-1}^{[j]}, u_k, z_k)
@@ -251,7 +252,12 @@ class FastSlam:
             raise InputError("update: found no generator, expected one: FastSLAM draws poses by it")
         particles, sampled = self.settings.particles, self.settings.weights == "sampled"
         normal, uniform = rng.standard_normal((particles, 3)), rng.random(particles)
-        params = update_params(self.rays, self.gate, exact=self.settings.mixture == "exact")
+        params = update_params(
+            self.rays,
+            self.gate,
+            exact=self.settings.mixture == "exact",
+            rays_weigh=self.settings.weighed_by == "all",
+        )
         inside, gated = self._inside(belief, scan, params)
         most = int(belief.log_weight.argmax())
         off = innovations_of(_arrays(belief), scan_columns(inside), most)

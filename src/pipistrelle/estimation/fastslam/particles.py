@@ -190,7 +190,7 @@ def _refine(
             if params.ranged != ANEW:
                 refine_by_ray(pose, rows, count, row, params, scratch.ray, scratch, gained)
             else:
-                weigh_by_active(pose, rows, row, count, scratch.ray, scratch, gained)
+                weigh_by_active(pose, rows, row, count, params, scratch.ray, scratch, gained)
         refine_by_active(pose, rows[0], row, count, gained)
 
 
@@ -213,14 +213,13 @@ def _weigh_at_sample(
         rows, count = block.member[block.first[n] : block.first[n + 1]], block.count[n]
         row, pose, gained = row_of(columns, m), block.pose, block.gained
         if math.isnan(row.range):
-            whole = scratch.whole
-            weigh_by_bearing(pose, rows, count, row, whole, scratch, gained)
+            weigh_by_bearing(pose, rows, count, row, params, scratch.whole, scratch, gained)
             continue
         part_lanes(count, scratch)
         by_range = scratch.alone if params.ranged != ANEW else scratch.whole
-        weigh_by_active(pose, rows, row, count, by_range, scratch, gained)
+        weigh_by_active(pose, rows, row, count, params, by_range, scratch, gained)
         if params.ranged != ANEW and most_members(count) > 1:
-            weigh_by_bearing(pose, rows, count, row, scratch.ray, scratch, gained)
+            weigh_by_bearing(pose, rows, count, row, params, scratch.ray, scratch, gained)
 
 
 @no_alloc
