@@ -2,24 +2,28 @@
 
     python papers/bradley_abaid/second_readings.py FOLDER [--worlds 60] [--workers 2]
 
-Five more choices, and one of `readings`, in all combinations:
+Six more choices, and one of `readings`, in combinations:
 
     layout      disc: uniform over 25 m, landmarks 3 m apart ("a minimum spacing of at least 3 m");
                 annulus: 3 to 25 m "from the center of the map", landmarks 0.5 m apart, uniform in
                 distance (`r = 3 + 22 * rand`), or uniform over the area
     labels      known association by gates of 0.1, 0.2, 0.3 or 0.5 rad and a quarter of a call; by
                 the arrival that caused the peak; by the nearest true bearing
-    cap         active sensing at 180 degrees sees at most 36.5 landmarks (our choice), or no limit
+    cap         active sensing at 180 degrees sees at most 36.5 landmarks (our choice; with gates of
+                0.1 and 0.3 rad and the paper's front end), or no limit
     front end   paper: the strongest peak of a run, 10 log p; physics: every maximum, 20 log p
     ranged      a range for a partial landmark places it anew; is not used until bearings have
                 placed it; moves the heaviest member
+    weighed     FastSLAM's particles are weighed by all landmarks; by those initialised alone, so
+                that a ray refines the proposal and does not weigh; so, and rays restart at
+                resampling (each with the first two ways of a range)
     exclusions  a world is lost if any of a filter's cases diverges; or if the mean NEES over the
                 beamwidths of a strategy does ("ANEES is also used to determine if an iteration of
                 a filter has diverged")
 
-Levels and tau are fitted again for each, as in `readings` (the levels of the gates of 0.2 and 0.5
-rad are those of 0.3 rad). The *misfit* is the root of the mean square of four parts, none of which
-anything is fitted to:
+Levels and tau are fitted again for each in the first 60 worlds, as in `readings` (the levels of the
+gates of 0.2 and 0.5 rad are those of 0.3 rad). The next 60 worlds judge. The *misfit* is the root
+of the mean square of four parts, none of which anything is fitted to:
 
     landmarks    Table II's other means, ours less the paper's in the paper's sigma (RMS)
     spread       sigma over the worlds of the seen landmarks in Table II, log of ours over the
@@ -30,10 +34,10 @@ anything is fitted to:
 
 The rule, written before the run: of the readings whose misfit is within one standard error (of the
 paired difference) of the least, the one with the fewest departures from the plan `paper` as it was
-(disc, gate of 0.1 rad, capped, paper, bearing, union) is the plan `paper`; of equals, the one of
-the least misfit. No sentence's verdict is looked at. *Features* stand beside it, as in `readings`,
-with one more: the heading, at how many of the four beamwidths fused sensing with EKF-SLAM is ahead
-(Appendix A: at all).
+(disc, gate of 0.1 rad, capped, paper, bearing, all, union) is the plan `paper`; of equals, the one
+of the least misfit. No sentence's verdict is looked at. *Features* stand beside it, as in
+`readings`, with one more: the heading, at how many of the four beamwidths fused sensing with
+EKF-SLAM is ahead (Appendix A: at all).
 
 The worlds have seed 1000; the study's have 2022. What is done is kept in FOLDER;
 ``second_readings.csv`` beside this file is the table. With other than 60 worlds it goes into
@@ -43,7 +47,7 @@ FOLDER.
 import json
 import math
 import sys
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from functools import partial
 from itertools import product
 from pathlib import Path
@@ -71,13 +75,14 @@ from readings import (
     write_table,
 )
 
-from pipistrelle.config import Config
+from pipistrelle.config import STRATEGIES, Config, Strategy
+from pipistrelle.detection.front_end import FrameMeasurements
 from pipistrelle.estimation.catalogue import entry
 from pipistrelle.evaluation.accuracy import rmse
 from pipistrelle.evaluation.consistency import diverged, track_nees
 from pipistrelle.experiments.hearing.listening import listen
 from pipistrelle.experiments.hearing.oracle import label_detections
-from pipistrelle.experiments.hearing.scenario import world_of
+from pipistrelle.experiments.hearing.scenario import Scenario, world_of
 from pipistrelle.experiments.named_settings import Case
 from pipistrelle.experiments.runs.heard_world import drive_of, scans_of
 from pipistrelle.experiments.runs.trial import run_trial
@@ -111,16 +116,31 @@ FRONT_END: dict[str, Change] = {
     },
 }  # fmt: skip
 RANGED = ("bearing", "anew", "moved")
+WEIGHED: dict[str, Change] = {
+    "all": {},
+    "initialised": {"fastslam.weighed_by": "initialised"},
+    "initialised, restart": {
+        "fastslam.weighed_by": "initialised", "fastslam.resampled_rays": "restart",
+    },
+}  # fmt: skip
 EXCLUSIONS = ("union", "average")
 FACTORS = {
     "layout": LAYOUT, "labels": LABELS, "cap": CAP, "front_end": FRONT_END, "ranged": RANGED,
-    "exclusions": EXCLUSIONS,
+    "weighed": WEIGHED, "exclusions": EXCLUSIONS,
 }  # fmt: skip
 DEFAULTS = {name: next(iter(levels)) for name, levels in FACTORS.items()}
 """The plan `paper` as it was."""
 OUTPUT = Path(__file__).with_name("second_readings.csv")
 HEARD = ("layout", "labels", "cap", "front_end")
 """Factors that change what is heard."""
+ALL_HEARD = [
+    (layout, labels, cap, front_end)
+    for cap, layout, front_end, labels in product(reversed(CAP), LAYOUT, FRONT_END, LABELS)
+    if cap == "uncapped" or (labels in ("0.1 rad", "0.3 rad") and front_end == "paper")
+]
+"""Their combinations that are tried."""
+MAPPED = [way for way in product(RANGED, WEIGHED) if way[0] != "moved" or way[1] == "all"]
+"""Combinations of ranged and weighed that are tried."""
 
 
 def main() -> None:
@@ -128,12 +148,13 @@ def main() -> None:
     chosen = asked(__doc__)
     with in_worlds(chosen.worlds, chosen.workers) as run:
         fits = fitted(chosen.folder / f"second_fits_{chosen.worlds}.json", run)
-        paths = run(partial(world_done, chosen.folder / f"second_worlds_{chosen.worlds}", fits))
+        folder = chosen.folder / f"second_worlds_{chosen.worlds}"
+        paths = run(partial(world_done, folder, fits, chosen.worlds))
     trials = pl.concat(read_kept(path) for path in paths)
-    readings = {
-        levels: SecondReading(trials, dict(zip(FACTORS, levels, strict=True)))
-        for levels in product(*FACTORS.values())
-    }
+    readings = {}
+    for heard, mapped, exclusions in product(ALL_HEARD, MAPPED, EXCLUSIONS):
+        levels = (*heard, *mapped, exclusions)
+        readings[levels] = SecondReading(trials, dict(zip(FACTORS, levels, strict=True)))
     values = drawn(list(readings.values()))
     table = misfits(readings, values, {key: fits["/".join(key[:4])] for key in readings}, DEFAULTS)
     write_table(table, published(OUTPUT, chosen), "rays.prune")
@@ -158,7 +179,7 @@ def fitted(path: Path, run: Run) -> dict[str, Change]:
         fits: dict[str, Change] = json.loads(path.read_text()) if path.exists() else {}
     except ValueError:
         sys.exit(f"{path}: no fits that can be read; remove it, and they are made anew")
-    for cap, layout, front_end, labels in product(reversed(CAP), LAYOUT, FRONT_END, LABELS):
+    for layout, labels, cap, front_end in ALL_HEARD:
         name = "/".join((layout, labels, cap, front_end))
         if name in fits:
             continue
@@ -184,17 +205,17 @@ def fitted(path: Path, run: Run) -> dict[str, Change]:
 # Trials
 
 
-def world_done(folder: Path, fits: Mapping[str, Change], world: int) -> Path:
-    """Run all combinations in a world, unless its file exists; return the file."""
-    path = folder / f"world_{world}.parquet"
+def world_done(folder: Path, fits: Mapping[str, Change], before: int, number: int) -> Path:
+    """Run all combinations in the world behind some others, unless its file exists; return it."""
+    path = folder / f"world_{before + number}.parquet"
     folder.mkdir(exist_ok=True)
-    return path if path.exists() else keep(pl.DataFrame(list(trials_in(fits, world))), path)
+    return path if path.exists() else keep(pl.DataFrame(trials_in(fits, before + number)), path)
 
 
-def trials_in(fits: Mapping[str, Change], world: int) -> Iterator[dict[str, Any]]:
+def trials_in(fits: Mapping[str, Change], world: int) -> list[dict[str, Any]]:
     """Map a world under each combination that changes what is heard, in every case."""
-    for levels in product(*(FACTORS[name] for name in HEARD)):
-        chosen = dict(zip(HEARD, levels, strict=True))
+    rows = []
+    for levels in ALL_HEARD:
         layout, labels, cap, front_end = levels
         fit = fits["/".join(levels)]
         if cap == "capped" and fit == fits["/".join((layout, labels, "uncapped", front_end))]:
@@ -202,35 +223,49 @@ def trials_in(fits: Mapping[str, Change], world: int) -> Iterator[dict[str, Any]
         config = changed(settings(layout, labels, front_end), fit)
         scenario = world_of(config, world)
         oracle = ORACLES.get(labels, label_detections)
-        heard = listen(scenario, config, list(BEAMS.values()), iteration=world, oracle=oracle)
-        for name, ranged in product(EXCLUDED, RANGED):
-            ways = changed(config, {"rays.ranged": ranged})
-            rows, nees = [], []
-            for strategy, beam in CASES:
-                if strategy != "fused" and ranged != RANGED[0]:
-                    continue
-                scans = scans_of(heard[[*BEAMS].index(beam or 11)], strategy, ways)
+        frames = listen(scenario, config, list(BEAMS.values()), iteration=world, oracle=oracle)
+        heard = dict(zip(BEAMS, frames, strict=True))
+        for name, strategy in product(EXCLUDED, STRATEGIES):
+            for ranged, weighed in ways_of(name, strategy):
+                change = {} if ranged == ALL_DRAWN else {"rays.ranged": ranged}
+                ways = changed(config, change | WEIGHED.get(weighed, {}))
                 case = Case(strategy=strategy, filter=name, iteration=world)
-                trial = run_trial(case, drive_of(scenario, ways), scans, ways)
-                nees.append(track_nees(trial.track.pose, scenario.path)[1:])
-                rows.append(
-                    {
-                        **chosen, "filter": name, "strategy": strategy, "beam": beam,
-                        "ranged": ranged if strategy == "fused" else ALL_DRAWN, "world": world,
-                        "full": trial.scores.landmarks_full, "total": trial.scores.landmarks_total,
-                        "diverged": trial.scores.diverged, "nees": trial.scores.nees_mean,
-                        "position": trial.scores.position_rmse_m,
-                        "heading": trial.scores.heading_rmse_rad,
-                    }
-                )  # fmt: skip
-            for row in rows:
-                of_strategy = [
-                    epsilon
-                    for other, epsilon in zip(rows, nees, strict=True)
-                    if other["strategy"] == row["strategy"]
-                ]
-                average = np.mean(of_strategy, axis=0)
-                yield row | {"average_diverged": diverged(average, entry(name).nees_limit)}
+                mapped = list(mapped_at_each_beam(scenario, heard, case, ways))
+                average = np.mean([row.pop("track_nees") for row in mapped], axis=0)
+                about = {
+                    **dict(zip(HEARD, levels, strict=True)), "filter": name, "ranged": ranged,
+                    "weighed": weighed,
+                    "average_diverged": diverged(average, entry(name).nees_limit),
+                }  # fmt: skip
+                rows += [about | row for row in mapped]
+    return rows
+
+
+def ways_of(name: str, strategy: Strategy) -> Iterator[tuple[str, str]]:
+    """List levels of ranged and weighed, where these make a difference to a filter's map."""
+    for ranged, weighed in MAPPED:
+        by_range, swarm = strategy == "fused", name == "fastslam" and strategy != "active"
+        if (by_range or ranged == RANGED[0]) and (swarm or weighed == "all"):
+            yield ranged if by_range else ALL_DRAWN, weighed if swarm else ALL_DRAWN
+
+
+def mapped_at_each_beam(
+    scenario: Scenario,
+    heard: Mapping[int, Sequence[FrameMeasurements]],
+    case: Case,
+    config: Config,
+) -> Iterator[dict[str, Any]]:
+    """Map a world in a case at each beamwidth; give its scores and its NEES over time."""
+    for beam in (beam for strategy, beam in CASES if strategy == case.strategy):
+        scans = scans_of(heard[beam or 11], case.strategy, config)
+        trial = run_trial(case, drive_of(scenario, config), scans, config)
+        yield {
+            "strategy": case.strategy, "beam": beam, "world": case.iteration,
+            "full": trial.scores.landmarks_full, "total": trial.scores.landmarks_total,
+            "diverged": trial.scores.diverged, "nees": trial.scores.nees_mean,
+            "position": trial.scores.position_rmse_m, "heading": trial.scores.heading_rmse_rad,
+            "track_nees": track_nees(trial.track.pose, scenario.path)[1:],
+        }  # fmt: skip
 
 
 # The misfit
@@ -243,7 +278,7 @@ class SecondReading(Reading):
 
     def __init__(self, trials: pl.DataFrame, levels: Mapping[str, str]) -> None:
         lost = "diverged" if levels["exclusions"] == "union" else "average_diverged"
-        heard = {name: levels[name] for name in (*HEARD, "ranged")}
+        heard = {name: levels[name] for name in (*HEARD, "ranged", "weighed")}
         if levels["cap"] == "capped":
             keys = [pl.col(name) == levels[name] for name in HEARD]
             if trials.filter(*keys).is_empty():  # the limit does not bind
