@@ -483,10 +483,10 @@ def all_readings(trials: pl.DataFrame) -> dict[Levels, Reading]:
     }
 
 
-def drawn(readings: Sequence[Reading]) -> np.ndarray:
+def drawn(readings: Sequence[Reading], count: int = DRAWS) -> np.ndarray:
     """Misfits of readings of the same worlds (draws, readings): of all, then by bootstrap."""
     rng, worlds = np.random.default_rng(12), readings[0].worlds
-    draws = [np.arange(worlds), *rng.integers(0, worlds, (DRAWS, worlds))]
+    draws = [np.arange(worlds), *rng.integers(0, worlds, (count, worlds))]
     return np.array([[misfit_of(reading.parts(rows)) for reading in readings] for rows in draws])
 
 
