@@ -5,12 +5,20 @@ from dataclasses import replace
 import numpy as np
 
 from pipistrelle.detection.scans import COLUMNS, EXCESS_PATH, EXCESS_PATH_STD, NUMBERS, make_scan
+from pipistrelle.estimation.measurement import excess_path_slopes
 
 
 def excess_paths_to(points, vehicle, caller):
     """Length of the path over each point (n, 2), minus the direct path from the caller."""
     over = np.hypot(*(points - caller).T) + np.hypot(*(points - vehicle).T)
     return over - np.hypot(*(caller - vehicle))
+
+
+def excess_path_jacobians(vehicle, point, caller):
+    """Derivatives of the excess path by vehicle, point and caller, (2) each."""
+    _, *slopes = excess_path_slopes(*vehicle, *point, *caller)
+    by_point, by_caller = np.array(slopes[:2]), np.array(slopes[2:])
+    return -by_point - by_caller, by_point, by_caller
 
 
 def timed(mission, callers, rng, *, std=0.05, off=None, share=1.0, least=0.0, direct=True):

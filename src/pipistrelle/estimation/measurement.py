@@ -229,21 +229,6 @@ def excess_path_of(
     return excess_path_slopes(*vehicle, *point, *caller)[0]
 
 
-def excess_path_jacobians(
-    vehicle: Float[np.ndarray, "2"], point: Float[np.ndarray, "2"], caller: Float[np.ndarray, "2"]
-) -> tuple[Float[np.ndarray, "2"], Float[np.ndarray, "2"], Float[np.ndarray, "2"]]:
-    r"""Return the derivatives of the excess path by vehicle, point and caller, (2) each.
-
-    .. math:: e_l = w + u, \quad e_b = -w - v, \quad e_p = v - u
-
-    with the unit vectors u and w to the point from the vehicle and from the caller, and v from the
-    vehicle to the caller.
-    """
-    _, *slopes = excess_path_slopes(*vehicle, *point, *caller)
-    by_point, by_caller = np.array(slopes[:2]), np.array(slopes[2:])
-    return -by_point - by_caller, by_point, by_caller
-
-
 def landmark_range(excess_path: float, caller: Float[np.ndarray, "2"], bearing: float) -> float:
     r"""Return the range of a point [m] from its bearing and its excess path via a known caller.
 

@@ -82,7 +82,7 @@ from typing import NamedTuple, get_args
 import numpy as np
 from jaxtyping import Bool, Float
 
-from pipistrelle.config import RayConfig
+from pipistrelle.config import FastSlamConfig, RayConfig
 from pipistrelle.jit import Whole, kernel, no_alloc
 
 SMALLEST_AGGREGATED_SHARE = 0.05
@@ -148,18 +148,14 @@ def gate_bounds(gate: float) -> tuple[float, float]:
 
 @lru_cache(maxsize=16)
 def update_params(
-    rays: RayConfig,
-    gate: float,
-    *,
-    robust: bool = False,
-    exact: bool = False,
-    rays_weigh: bool = True,
+    rays: RayConfig, gate: float, *, robust: bool = False, swarm: FastSlamConfig | None = None
 ) -> UpdateParams:
-    """Return parameters of gates and bearing-only landmarks; ``exact``: full mixture update."""
+    """Return parameters of gates and bearing-only landmarks; ``swarm``: FastSLAM's settings."""
     passive_bound, active_bound = gate_bounds(gate)
     ray_ranges, ray_stds = ray_members(rays)
     ray_ranges.setflags(write=False)  # shared by all estimators with the same settings
     ray_stds.setflags(write=False)
+    exact = swarm is not None and swarm.mixture == "exact"
     return UpdateParams(
         passive_bound=passive_bound,
         active_bound=active_bound,
@@ -172,7 +168,7 @@ def update_params(
         ranged=RANGED[rays.ranged],
         sharing=EXACT if exact else _SHARING[rays.spacing, rays.likelihood],
         robust=robust,
-        rays_weigh=rays_weigh,
+        rays_weigh=swarm is not None and swarm.weighed_by == "all",
     )
 
 

@@ -11,7 +11,6 @@ from pipistrelle.detection.scans import make_scan
 from pipistrelle.estimation.beliefs import Gaussian
 from pipistrelle.estimation.ekf.filter import EkfSlam, InvariantEkfSlam
 from pipistrelle.estimation.measurement import (
-    excess_path_jacobians,
     excess_path_of,
     landmark_range,
     range_by_excess_path,
@@ -33,7 +32,7 @@ from reference.missions import (
     steady,
 )
 from reference.timed_ekf import SlowTimedEkfSlam, SlowTimedInvariantEkfSlam
-from reference.timing import timed
+from reference.timing import excess_path_jacobians, timed
 
 KINDS = [EkfSlam, InvariantEkfSlam]
 PAIRS = [(EkfSlam, SlowTimedEkfSlam), (InvariantEkfSlam, SlowTimedInvariantEkfSlam)]

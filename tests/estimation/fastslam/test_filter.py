@@ -154,7 +154,7 @@ def test_rays_that_restart_at_resampling_equal_the_slow_reference():
 
 
 @pytest.mark.parametrize(("ranged", "weights"), [("anew", "marginal"), ("bearing", "sampled")])
-def test_particles_weighed_by_initialised_landmarks_alone_equal_the_slow_reference(ranged, weights):
+def test_particles_that_rays_do_not_weigh_equal_the_slow_reference(ranged, weights):
     rays = ray_config(power=2.0, ranged=ranged)
     slam = swarm_filter(5, weights=weights, weighed_by="initialised", rays=rays)
     _, slow = assert_equal_to_reference(slam, small_mission("fused", frames=16))

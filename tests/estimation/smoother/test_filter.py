@@ -7,7 +7,7 @@ import pytest
 
 from pipistrelle.detection.scans import EXCESS_PATH, rows_of, with_columns
 from pipistrelle.estimation.beliefs import Gaussian, placed
-from pipistrelle.estimation.measurement import excess_path_jacobians, excess_path_of
+from pipistrelle.estimation.measurement import excess_path_of
 from pipistrelle.estimation.motion import Motion
 from pipistrelle.estimation.smoother.filter import Smoother
 from pipistrelle.evaluation.accuracy import alignment, moved
@@ -33,7 +33,7 @@ from reference.missions import (
     steady,
 )
 from reference.optimum import from_the_truth, poses_of
-from reference.timing import timed
+from reference.timing import excess_path_jacobians, timed
 
 STD = {"range_std": 0.2, "bearing_std": 0.05}
 STOPS = 2e-3

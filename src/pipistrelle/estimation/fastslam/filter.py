@@ -42,9 +42,6 @@ The update by a frame has five steps; frames without measurements only extend th
 share. ``exact`` uses their independence given the pose: each is updated with R, only the weights
 distinguish them (Gaussian sum filter), and the proposal has the moments of their mixture.
 
-A frame without measurements is not sampled: its motion accumulates. The start is not sampled
-either: its covariance P0 is the first to accumulate.
-
 Excess paths are not used: they tie each landmark to a caller, and the paper's FastSLAM has an
 independent Gaussian for each landmark.
 """
@@ -144,8 +141,7 @@ class FastSlamBelief(Belief):
 
     def cloud(self) -> Float[np.ndarray, "p 3"]:
         """Return the particles' poses, (p, 3) [m, m, rad]."""
-        rows = self.poses.reshape(len(self.poses), -1, LANES).swapaxes(1, 2)
-        return rows[:, :, :3].reshape(-1, 3)[: self.log_weight.size]
+        return _numbers(self.poses, 9)[: self.log_weight.size, :3]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -252,15 +248,9 @@ class FastSlam:
             raise InputError("update: found no generator, expected one: FastSLAM draws poses by it")
         particles, sampled = self.settings.particles, self.settings.weights == "sampled"
         normal, uniform = rng.standard_normal((particles, 3)), rng.random(particles)
-        params = update_params(
-            self.rays,
-            self.gate,
-            exact=self.settings.mixture == "exact",
-            rays_weigh=self.settings.weighed_by == "all",
-        )
+        params = update_params(self.rays, self.gate, swarm=self.settings)
         inside, gated = self._inside(belief, scan, params)
-        most = int(belief.log_weight.argmax())
-        off = innovations_of(_arrays(belief), scan_columns(inside), most)
+        off = innovations_of(_arrays(belief), scan_columns(inside), int(belief.log_weight.argmax()))
         (poses, landmark, first, count, member), gained = correct_particles(
             _arrays(belief), scan_columns(inside), normal, params, sampled
         )
@@ -300,11 +290,10 @@ class FastSlam:
         poses, count, member = resample_into(_arrays(belief), ancestor)
         if self.settings.resampled_rays == "restart":
             restart_rays(belief.first, count, member)
-        log_weight = np.full(ancestor.size, -math.log(ancestor.size))
         return replace(
             belief,
             poses=poses,
-            log_weight=log_weight,
+            log_weight=np.full(ancestor.size, -math.log(ancestor.size)),
             count=count,
             member=member,
             best=int(np.argmax(ancestor == belief.best)),
@@ -423,8 +412,7 @@ def joint_of(belief: FastSlamBelief) -> JointGaussian:
     covariance = np.einsum("p,pd,pe->de", weight, off, off, optimize=True)
     xx, xy, yy, xh, yh, hh = np.einsum("p,pe->e", weight, rows[:, 3:9])
     covariance[:3, :3] += np.array([[xx, xy, xh], [xy, yy, yh], [xh, yh, hh]])
-    own = np.einsum("pn,pne->ne", share, members[..., 2:5])
-    for n, (xx, xy, yy) in enumerate(own.tolist()):
+    for n, (xx, xy, yy) in enumerate(np.einsum("pn,pne->ne", share, members[..., 2:5]).tolist()):
         covariance[3 + 2 * n : 5 + 2 * n, 3 + 2 * n : 5 + 2 * n] += [[xx, xy], [xy, yy]]
     return JointGaussian(landmark=belief.landmark[there], mean=mean, covariance=covariance)
 

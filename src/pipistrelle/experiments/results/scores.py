@@ -321,17 +321,15 @@ def with_bound(scores: Scores, bound: Float[np.ndarray, "t 3 3"] | None) -> Scor
 @np.errstate(over="ignore", invalid="ignore")
 def with_shared(trials: Sequence[TrialResult], truth: Truth) -> tuple[TrialResult, ...]:
     """Add the map RMSE over the landmarks that every strategy of an estimator has placed."""
+    if truth.landmarks is None:
+        return tuple(trials)
+    maps = [heaviest(one.track.landmarks if one.mapped is None else one.mapped) for one in trials]
     scored = []
-    for trial in trials:
-        maps = {
-            one.strategy: heaviest(one.track.landmarks if one.mapped is None else one.mapped)
-            for one in trials
-            if one.filter == trial.filter
-        }
-        shared = set.intersection(*({*m.landmark[m.full].tolist()} for m in maps.values()))
+    for trial, own in zip(trials, maps, strict=True):
+        of_filter = [m for one, m in zip(trials, maps, strict=True) if one.filter == trial.filter]
+        shared = set.intersection(*({*m.landmark[m.full].tolist()} for m in of_filter))
         error = None
-        if truth.landmarks is not None and len(maps) > 1:
-            own = maps[trial.strategy]
+        if len(of_filter) > 1:
             kept = replace(own, full=own.full & np.isin(own.landmark, [*shared]))
             error = _aligned_rmse(*scored_landmarks(kept, *truth.landmarks))
         scored.append(replace(trial, scores=replace(trial.scores, map_rmse_shared_m=error)))
