@@ -1,68 +1,48 @@
 """The plan of the paper is the reading that the experiment chose, by its own rule."""
 
-import csv
 from pathlib import Path
 
-import pytest
+import polars as pl
 
-from pipistrelle.estimation.rays import RANGED
+from pipistrelle.config import Config
 from pipistrelle.experiments.studies.plan import find_plan, read_plan
+from reference.papers import papers_module
 
 TABLE = Path(__file__).parents[2] / "papers/bradley_abaid/readings.csv"
-DROPPED = ("heaviest", "reset", "corrected", "others")
-"""Readings of a range that lose most worlds, which the package no longer has."""
-READ_AS = {
-    ("snapshots", "maxima"): {"detection.snapshots": "maxima", "detection.peak_db": -8.0},
-    ("snapshots", "run, strongest"): {"detection.snapshots": "runs", "detection.peak_db": 0.0},
-    ("snapshots", "run, 3 dB"): {"detection.snapshots": "runs", "detection.peak_db": -3.0},
-    ("snapshots", "run, 8 dB"): {"detection.snapshots": "runs", "detection.peak_db": -8.0},
-    ("off_axis", "20 log p"): {"emitter.off_axis": "pressure"},
-    ("off_axis", "10 log p"): {"emitter.off_axis": "power"},
-    ("likelihood", "density"): {"rays.likelihood": "normal"},
-    ("likelihood", "printed"): {"rays.likelihood": "printed"},
-    ("weights", "marginal"): {"fastslam.weights": "marginal"},
-    ("weights", "sampled"): {"fastslam.weights": "sampled"},
-    **{("ranged", name): {"rays.ranged": name} for name in (*RANGED, *DROPPED)},
-    **{("resampled", name): {"fastslam.resampled_rays": name} for name in ("kept", "restart")},
-}
-FACTORS = ("snapshots", "off_axis", "likelihood", "weights", "ranged", "resampled")
+changed = papers_module("calibration").changed
+first = papers_module("readings")
+FACTORS = first.FACTORS | {"ranged": first.ALL_RANGED}
+PLAN = read_plan(find_plan("paper")).config
 
 
-@pytest.fixture(scope="module")
-def rows():
-    with TABLE.open(encoding="utf-8") as file:
-        return list(csv.DictReader(file))
+def departures(config, row, factors):
+    """Settings of the levels of a row that a config has otherwise, of all that the levels name."""
+    wanted = Config()
+    for factor, levels in factors.items():
+        wanted = changed(wanted, levels[row[factor]])
+    keys = {key for levels in factors.values() for way in levels.values() for key in way}
+    return {key for key in keys for a, b in [key.split(".")]
+            if getattr(getattr(config, a), b) != getattr(getattr(wanted, a), b)}  # fmt: skip
 
 
-def settings_of(row):
-    return {k: v for factor in FACTORS for k, v in READ_AS[factor, row[factor]].items()}
+def test_every_combination_of_the_first_experiment_was_tried():
+    rows = pl.read_csv(TABLE)
+    assert rows.select(*first.FACTORS).is_unique().sum() == rows.height == 162
+    assert rows.filter(pl.col("ranged").is_in(["anew", "bearing"])).height == 4 * 2**5
+    assert rows["misfit"].is_sorted()
 
 
-def value(config, name):
-    section, field = name.split(".")
-    return getattr(getattr(config, section), field)
+def test_the_plan_departs_least_among_the_tied_readings():
+    rows = pl.read_csv(TABLE)
+    tied = rows.filter(pl.col("above_best") <= pl.col("above_best_error"))
+    assert tied.height == rows["tied"].sum()
+    chosen = tied.sort("departures", "misfit").row(0, named=True)
+    assert not departures(PLAN, chosen, FACTORS)
 
 
-def test_all_combinations_were_tried(rows):
-    tried = {tuple(row[factor] for factor in FACTORS) for row in rows}
-    crossed = [row for row in rows if row["ranged"] in ("anew", "bearing")]
-    assert len(tried) == len(rows) == 162
-    assert len(crossed) == 4 * 2 * 2 * 2 * 2 * 2
-    misfits = [float(row["misfit"]) for row in rows]
-    assert misfits == sorted(misfits)
-
-
-def test_the_plan_departs_least_among_the_tied_readings(rows):
-    near = [row for row in rows if float(row["above_best"]) <= float(row["above_best_error"])]
-    assert len(near) == sum(row["tied"] == "true" for row in rows) == 6
-    chosen = min(near, key=lambda row: (int(row["departures"]), float(row["misfit"])))
-    config = read_plan(find_plan("paper")).config
-    for name, level in settings_of(chosen).items():
-        assert value(config, name) == level
-
-
-def test_the_defaults_are_one_of_the_readings(rows):
-    config = read_plan(find_plan("physics")).config
-    mine = [r for r in rows if all(value(config, k) == v for k, v in settings_of(r).items())]
+def test_the_defaults_are_one_of_the_readings_and_far_from_the_least():
+    config, near = read_plan(find_plan("physics")).config, pl.read_csv(TABLE)
+    near = near.filter(pl.col("ranged").is_in([*first.ALL_RANGED]))
+    mine = [r for r in near.rows(named=True) if not departures(config, r, FACTORS)]
     assert len(mine) == 1
-    assert float(mine[0]["above_best"]) > 2.0 * float(mine[0]["above_best_error"])
+    assert mine[0]["above_best"] > 2.0 * mine[0]["above_best_error"]

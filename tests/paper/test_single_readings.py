@@ -67,22 +67,19 @@ def test_one_update_of_a_single_measurement_is_the_usual_one(own, heard):
     np.testing.assert_allclose(*(track.pose.mean for track in tracks), atol=1e-9)
 
 
+RESTART = {"resampled_rays": "restart"}
+CHANGES = ({}, {"weights": "sampled"}, RESTART, {**RESTART, "weighed_by": "initialised"})
+
+
 @pytest.mark.slow  # compiles
-@pytest.mark.parametrize(
-    ("weights", "rays", "by"),
-    [
-        ("marginal", "kept", "all"), ("sampled", "kept", "all"), ("marginal", "restart", "all"),
-        ("marginal", "restart", "initialised"),
-    ],
-)  # fmt: skip
+@pytest.mark.parametrize("change", CHANGES)
 @pytest.mark.parametrize("strategy", ["active", "fused", "passive"])
-def test_fastslam_with_nothing_changed_is_the_packages(own, heard, strategy, weights, rays, by):
-    change = {"weights": weights, "resampled_rays": rays, "weighed_by": by}
+def test_fastslam_with_nothing_changed_is_the_packages(own, heard, strategy, change):
     config = SETTINGS.model_copy(update={"fastslam": SETTINGS.fastslam.model_copy(update=change)})
     details = own.own_fastslam.Details(
-        weight=own.own_fastslam.NONE if by == "initialised" else own.own_fastslam.MIXTURE,
-        at_sample=weights == "sampled",
-        restart=rays == "restart",
+        weight=own.own_fastslam.NONE if "weighed_by" in change else own.own_fastslam.MIXTURE,
+        at_sample="weights" in change,
+        restart="resampled_rays" in change,
     )
     slam = own.own_fastslam.OwnFastSlam(config, DRIVE.motion, details)
     assert_is_the_packages(own, slam, heard, strategy, "fastslam")

@@ -109,24 +109,11 @@ class AssumingFastSlam(FastSlam):
         return FastSlam.update(self, belief, assumed, rng)
 
 
-def swarm_filter(
-    particles=20,
-    mixture="federated",
-    resample_below=0.75,
-    weights="marginal",
-    resampled_rays="kept",
-    weighed_by="all",
-    **changes,
-):
-    """Return a filter with the paper's settings, except for the changes."""
-    swarm = FastSlamConfig(
-        particles=particles,
-        mixture=mixture,
-        resample_below=resample_below,
-        weights=weights,
-        resampled_rays=resampled_rays,
-        weighed_by=weighed_by,
-    )
+def swarm_filter(particles=20, mixture="federated", resample_below=0.75, **changes):
+    """Return a filter with the paper's settings, except for the changes of it and its particles."""
+    own = {name: changes.pop(name) for name in FastSlamConfig.model_fields if name in changes}
+    first = {"particles": particles, "mixture": mixture, "resample_below": resample_below}
+    swarm = FastSlamConfig(**first, **own)
     slam = AssumingFastSlam(motion=BICYCLE, rays=ray_config(), settings=swarm)
     return replace(slam, **changes)
 
