@@ -15,7 +15,7 @@ import pytest
 import pipistrelle
 from pipistrelle.__main__ import main
 from pipistrelle.acoustics.emitter import beamwidth
-from pipistrelle.config import BagConfig, Config
+from pipistrelle.config import BagConfig, Config, FastSlamConfig
 from pipistrelle.settings import known_settings
 
 HEAVY = {"numpy", "pydantic", "numba", "matplotlib"}
@@ -97,7 +97,7 @@ def test_help_all_of_slam_omits_settings_that_a_log_decides(printed):
     found = set(re.findall(r"--[a-z]+\.[a-z-]+", printed("slam", "--help-all")))
     rays = ("ratio", "density", "prune", "power", "weights", "likelihood", "spacing")
     rays = (*rays, "merge", "ranged")
-    swarm = ("particles", "resample-below", "mixture", "weights", "estimate", "resampled-rays")
+    swarm = (name.replace("_", "-") for name in FastSlamConfig.model_fields)
     assert found == {
         "--listening.timing",
         *(f"--association.{name}" for name in ("method", "detection", "clutter", "bearing-std")),

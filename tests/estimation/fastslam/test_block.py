@@ -5,6 +5,7 @@ import math
 import numpy as np
 import pytest
 
+from pipistrelle.config import FastSlamConfig, RayConfig
 from pipistrelle.estimation.fastslam.block import (
     HEADING,
     LANES,
@@ -28,6 +29,7 @@ from pipistrelle.estimation.fastslam.block import (
     weigh_by_active,
 )
 from pipistrelle.estimation.measurement import NEAREST, Row
+from pipistrelle.estimation.rays import update_params
 
 
 def uncertain_pair(offset):
@@ -112,7 +114,8 @@ def weighed(unit, distance=5.0):
     log_weight, row = np.zeros(LANES), Row(1, 0.1, distance * unit, 0.01, 0.04 * unit**2)
     scratch = scratch_for(3)
     part_lanes(count, scratch)
-    weigh_by_active(pose, rows, row, count, scratch.ray, scratch, log_weight)
+    params = update_params(RayConfig(), 1.0, swarm=FastSlamConfig())
+    weigh_by_active(pose, rows, row, count, params, scratch.ray, scratch, log_weight)
     assert not log_weight[1::2].any()
     refine_by_active(pose, rows[0], row, count, log_weight)
     return log_weight[:2]
