@@ -9,8 +9,8 @@ mean of Table II, in this order:
     emitter.level_db    landmarks seen, fused at 180 degrees      43.7
     rays.prune (tau)    fully initialised, EKF-SLAM, passive      26.6
 
-in `physics` the vehicle's level no higher than leaves active sensing at 180 degrees with 36.5
-landmarks (our choice: the paper sees more of them passively at every beamwidth); and
+the vehicle's level no higher than leaves active sensing at 180 degrees with 36.5 landmarks (our
+choice: the paper sees more of them passively at every beamwidth); and
 ``rays.power`` (n) by a rule that looks at no result: one count cannot settle two numbers; the
 paper's n says by how much likelier members count for more, so n > 1; of the whole numbers above 1
 the least is taken for which some tau reaches the count. The other n are listed with the tau that
@@ -20,7 +20,6 @@ prediction.
 """
 
 import argparse
-import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from contextlib import contextmanager
@@ -50,8 +49,6 @@ PAPER = {"fused 180": 43.7, "fused 33": 40.8, "fused 11": 40.1, "passive": 39.5}
 """Landmarks seen: Table II."""
 MOST_ACTIVE = 36.5
 """Landmarks that active sensing may see at 180 degrees: clearly fewer than passive sensing."""
-CAPS = {"paper": math.inf, "physics": MOST_ACTIVE}
-"""The limit of each plan."""
 PAPER_FULL = 26.6
 """Fully initialised by passive EKF-SLAM: Table II."""
 POWERS = (1.0, 2.0, 3.0, 4.0)
@@ -76,7 +73,7 @@ def main() -> None:
         options.error(f"--output: {output} cannot be a file; name one in a folder that there is")
     readings = read_plan(find_plan(chosen.plan)).config.model_copy(update={"seed": SEED})
     with in_worlds(chosen.worlds, chosen.workers) as run:
-        config = fit_levels(readings, run, most_active=CAPS[chosen.plan])
+        config = fit_levels(readings, run)
         rows = run(partial(landmarks_seen, config, [*BEAMS]))
         seen = {name: [row[name] for row in rows] for name in rows[0]}
         rays = fit_rays(config, run)

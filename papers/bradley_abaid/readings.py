@@ -516,7 +516,8 @@ def misfits(
                 "departures": sum(map(str.__ne__, levels, defaults.values())),
             }
         )
-    tied = pl.col("above_best") <= pl.col("above_best_error")
+    error = pl.col("above_best_error").fill_nan(0.0)  # of one that loses all worlds in some draws
+    tied = pl.col("above_best") <= error
     return pl.DataFrame(table).with_columns(tied=tied).sort("misfit")
 
 
