@@ -180,13 +180,19 @@ def nees(name, strategy, factor=1.0, step=1):
     return planted
 
 
+def diverging(trials, rows, columns=slice(None)):
+    """The same trials, of which some have a NEES far above every limit."""
+    lost = np.zeros_like(trials.diverged)
+    lost[rows, columns] = True
+    nees = np.where(lost[:, :, np.newaxis], 1e6, trials.nees)
+    return replace(trials, diverged=trials.diverged | lost, nees=nees)
+
+
 def losing(name, count):
     """Let a filter diverge in so many worlds."""
 
     def planted(study):
-        trials = study.trials[name, "active"]
-        lost = (np.arange(len(study.worlds)) < count)[:, np.newaxis]
-        trials = replace(trials, diverged=trials.diverged | lost)
+        trials = diverging(study.trials[name, "active"], np.arange(len(study.worlds)) < count)
         return replace(study, trials=study.trials | {(name, "active"): trials})
 
     return planted

@@ -58,7 +58,8 @@ def write_planted(
             row |= {"beamwidth_deg": None, "seed": 7, "status": "done", "wall_s": 1.0, "cpu_s": 0.5}
             tables["trials"].append(row | scores | {"diverged": diverged(case, world)})
             tables["steps"] += [
-                {"case": case.number, "frame": k, "nees": scores["nees_mean"],
+                {"case": case.number, "frame": k,
+                 "nees": 1e6 if diverged(case, world) else scores["nees_mean"],
                  "nees_expected": 2.5, "nees_variance": 4.0}
                 for k in range(1, FRAMES + 1)
             ]  # fmt: skip

@@ -17,7 +17,7 @@ from pipistrelle.report.charts import (
 from pipistrelle.report.effects import effects_of, measures_of
 from pipistrelle.report.sentences import TABLE_II
 from pipistrelle.report.study import COMMON, RULES, lap_time, read_study, select
-from report.invented import BEAMWIDTH, invent, narrowed, only
+from report.invented import BEAMWIDTH, diverging, invent, narrowed, only
 from report.planted import LEVELS as GRID
 from report.planted import by_level, write_planted
 
@@ -30,7 +30,8 @@ NAMES = [
 @pytest.fixture(scope="module")
 def study():
     study = invent(20)
-    study.trials["ekf", "active"].diverged[4, 2] = True
+    way = "ekf", "active"
+    study.trials[way] = diverging(study.trials[way], 4, 2)
     return study
 
 
@@ -148,8 +149,8 @@ def test_charts_without_data_are_not_drawn(study):
 def test_charts_can_be_had_where_no_world_counts_or_one(rule):
     lonely = invent(1)
     assert [chart.name for chart in study_charts(select(lonely, rule))] == NAMES
-    for trials in lonely.trials.values():
-        trials.diverged[:] = True
+    for way, trials in lonely.trials.items():
+        lonely.trials[way] = diverging(trials, 0)
     charts = study_charts(select(lonely, rule))
     assert ("anees_ekf" in [chart.name for chart in charts]) == (rule == "none")
 

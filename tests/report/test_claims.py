@@ -20,7 +20,7 @@ from pipistrelle.report.study import (
     select,
     selections,
 )
-from report.invented import BEAMWIDTH, add, changed, invent, noise, only, with_third
+from report.invented import BEAMWIDTH, add, changed, diverging, invent, noise, only, with_third
 
 FUSED = "ekf", "fused"
 
@@ -91,7 +91,7 @@ def spoilt(study, way, count=30, **changes):
     """Let some worlds diverge with a filter and a strategy; errors change there by so much."""
     trials, first = study.trials[way], (np.arange(60) < count)[:, None]
     scores = {score: trials.scores[score] + change * first for score, change in changes.items()}
-    made = replace(trials, diverged=trials.diverged | first, scores=trials.scores | scores)
+    made = replace(diverging(trials, slice(count)), scores=trials.scores | scores)
     return replace(study, trials=study.trials | {way: made})
 
 
@@ -267,7 +267,7 @@ def test_the_answer_is_undecided_without_worlds_or_cases():
 
 def test_a_filter_without_worlds_is_undecided_and_the_other_is_answered():
     study = with_map(np.full(12, -0.3) + JITTER)
-    study.trials["ekf", "passive"].diverged[:] = True
+    study.trials["ekf", "passive"] = diverging(study.trials["ekf", "passive"], slice(None))
     headline, *lines = answer_of(study)
     assert headline == "It depends on which worlds are counted."
     assert [lines[0], lines[2]] == [
@@ -284,7 +284,7 @@ def test_a_filter_without_worlds_is_undecided_and_the_other_is_answered():
 def test_an_answer_that_depends_on_the_exclusion_is_given_under_each_rule():
     study = with_map(np.where(np.arange(60) < 20, 2.7, -0.3)[:, None] + JITTER)
     for name in ("ekf", "fastslam"):
-        study.trials[name, "fused"].diverged[:20] = True
+        study.trials[name, "fused"] = diverging(study.trials[name, "fused"], slice(20))
     headline, *lines = answer_of(study)
     assert headline == "It depends on which worlds are counted."
     assert [line.split(", averaged")[0] for line in lines] == [

@@ -17,7 +17,7 @@ from pipistrelle.report.page import write_report
 from pipistrelle.report.sentences import SENTENCES
 from pipistrelle.report.study import HEADING, RULES, selections
 from report.drawing import draw_only
-from report.invented import BEAMWIDTH, changed, invent
+from report.invented import BEAMWIDTH, changed, diverging, invent
 
 GUIDE = Path(__file__).resolve().parents[2] / "docs" / "extending.md"
 
@@ -37,7 +37,7 @@ def guide():
 def extended(guide, tmp_path_factory):
     folder = tmp_path_factory.mktemp("extended")
     study = invent(8)
-    study.trials["ekf", "fused"].diverged[3] = True
+    study.trials["ekf", "fused"] = diverging(study.trials["ekf", "fused"], 3)
     with pytest.MonkeyPatch.context() as patch:  # the package's own are drawn elsewhere
         draw_only(patch, "worlds")
         write_report(

@@ -13,7 +13,18 @@ from pipistrelle.report.sentences import SEEN, SENTENCES, TABLE_II, cell_of, lap
 from pipistrelle.report.study import COMMON, HEADING, LANDMARKS, NEES, POSITION, select
 from pipistrelle.report.variables import BEAMWIDTHS, beam_name, setting_variable
 from report import invented
-from report.invented import BEAMWIDTH, FILTERS, add, changed, invent, losing, nees, only, spread
+from report.invented import (
+    BEAMWIDTH,
+    FILTERS,
+    add,
+    changed,
+    diverging,
+    invent,
+    losing,
+    nees,
+    only,
+    spread,
+)
 
 NARROW = BEAMWIDTH < 41.0
 OCTAVE = np.log2(BEAMWIDTH / 180.0)
@@ -64,7 +75,7 @@ HOLDS = {
 FAILS = [
     (1, losing("ekf", 60)),
     (2, losing("fastslam", 60)),
-    (3, nees("ekf", "active", 99.0)),
+    (3, nees("fastslam", "active", 0.01)),
     (4, nees("ekf", "active", step=-1)),
     (5, nees("ekf", "active", 9.0)),
     (6, nees("ekf", "fused", (1.0 - OCTAVE)[:, np.newaxis])),
@@ -240,9 +251,9 @@ def test_the_departure_is_computed_from_the_mean_over_worlds():
 
 def test_curves_are_of_the_worlds_that_count_and_have_all_numbers(small):
     trials = small.trials["ekf", "fused"]
-    nees, diverged = trials.nees.copy(), trials.diverged.copy()
-    nees[2, 4, 100], diverged[3, 5] = np.inf, True
-    spoilt = {("ekf", "fused"): replace(trials, nees=nees, diverged=diverged)}
+    spoilt = diverging(trials, 3, 5)
+    spoilt.nees[2, 4, 100] = np.nan
+    spoilt = {("ekf", "fused"): spoilt}
     study = replace(small, trials=small.trials | spoilt)
     for rule, fused, active in (("world", [2, 3], [3]), ("case", [2, 3], []), ("none", [2], [])):
         for strategy, left_out in (("fused", fused), ("active", active)):

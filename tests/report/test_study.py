@@ -36,6 +36,7 @@ from report.invented import (
     RADII,
     STRATEGIES,
     changed,
+    diverging,
     invent,
     narrowed,
     only,
@@ -49,8 +50,8 @@ from report.planted import LEVELS, write_planted
 @pytest.fixture
 def study():
     study = invent(6)
-    study.trials["ekf", "fused"].diverged[0, 3] = True
-    study.trials["ekf", "passive"].diverged[1, 0] = True
+    for way, at in (("fused", (0, 3)), ("passive", (1, 0))):
+        study.trials["ekf", way] = diverging(study.trials["ekf", way], *at)
     study.trials["fastslam", "active"].failed[2, 5] = True
     return study
 
@@ -129,12 +130,12 @@ def cell_of(case):
 
 
 def test_a_written_study_is_read_back(written):
-    folder, study, _, _, _, _ = written
+    folder, study, plan, _, _, _ = written
     read = read_study(folder)
     assert (read.name, read.planned, read.worlds.tolist()) == ("invented", 9, list(range(5)))
     assert read.beamwidth == pytest.approx(BEAMWIDTH, rel=1e-12)
     assert set(read.trials) == {(f, s) for f in FILTERS for s in STRATEGIES}
-    assert read.config.seed == 2022
+    assert read.config.seed == plan.config.seed
     (beam,) = read.variables
     assert (beam.name, beam.words[0], beam.words[-1]) == ("beamwidth", "11°", "180°")
     assert list(read.grid) == ["emitter.radius"]

@@ -20,7 +20,7 @@ from pipistrelle.report.tables import (
     table_ii_rows,
 )
 from pipistrelle.settings import from_flags
-from report.invented import RADII, invent, only, with_third
+from report.invented import RADII, diverging, invent, only, with_third
 from report.planted import by_level, write_planted
 
 TWO = '"beacon.level_db" = [36.8, 48.8]\n"rays.power" = [1.0, 3.0]'
@@ -110,8 +110,8 @@ def test_settings_and_cases_that_are_not_the_papers_are_named_with_both_values()
 
 def test_exclusions_count_worlds_and_trials_and_have_the_papers():
     study = invent(6)
-    study.trials["ekf", "fused"].diverged[0, 2:5] = True
-    study.trials["ekf", "active"].diverged[0, 0] = True
+    for way, columns in (("fused", slice(2, 5)), ("active", slice(1))):
+        study.trials["ekf", way] = diverging(study.trials["ekf", way], 0, columns)
     study.trials["fastslam", "passive"].failed[3, 0] = True
     ekf, fastslam = exclusion_rows(study)
     assert (ekf["excluded"], ekf["worlds"], ekf["paper"], ekf["limit"]) == (1, 6, 8, 50.0)
@@ -127,7 +127,7 @@ def test_exclusions_count_worlds_and_trials_and_have_the_papers():
 
 def test_table_ii_has_the_means_of_the_worlds_that_count():
     study = invent(6)
-    study.trials["ekf", "passive"].diverged[2, 0] = True
+    study.trials["ekf", "passive"] = diverging(study.trials["ekf", "passive"], 2)
     rows = table_ii_rows(select(study, "world"))
     count = np.delete(study.trials["ekf", "fused"].scores["landmarks_full"][:, 11], 2)
     assert rows[0]["full"] == pytest.approx([count.mean(), count.std(ddof=1)])

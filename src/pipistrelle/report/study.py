@@ -46,7 +46,7 @@ if TYPE_CHECKING:
 
 Rule = Literal["world", "case", "none"]
 RULES: dict[Rule, str] = {
-    "world": "a world is dropped for a filter where any of the filter's cases diverged",
+    "world": "a world is dropped for a filter where the mean NEES of a strategy's cases diverged",
     "case": "a world is dropped where a case at hand diverged",
     "none": "nothing is dropped but what has no number",
 }
@@ -138,7 +138,7 @@ class Selection:
     study: Study
     rule: Rule
     lost: Mapping[str, Bool[np.ndarray, " n"]]
-    """By filter, the worlds in which any of its cases diverged or failed."""
+    """By filter, the worlds in which it diverged (`lost_worlds`)."""
 
 
 def selections(study: Study) -> dict[Rule, Selection]:
@@ -207,9 +207,19 @@ def filter_titles(study: Study) -> dict[str, str]:
 
 
 def lost_worlds(study: Study, name: str) -> Bool[np.ndarray, " n"]:
-    """Return a mask of worlds where any case of a filter diverged or failed."""
-    of_filter = [trials for (other, _), trials in study.trials.items() if other == name]
-    return np.any([np.any(t.failed | t.diverged, axis=1) for t in of_filter], axis=0)
+    """Return a mask of worlds where a case failed, or the mean NEES of a strategy's cases diverged.
+
+    Bradley & Abaid, Sec. V-A: the ANEES of an iteration. Without a limit in the catalogue, any
+    diverged case counts.
+    """
+    lost = np.zeros(len(study.worlds), dtype=bool)
+    limit = CATALOGUE[name].nees_limit if name in CATALOGUE else inf
+    for trials in (of for (other, _), of in study.trials.items() if other == name):
+        count = np.sum(~np.isnan(trials.nees), axis=1)
+        mean = np.nansum(trials.nees, axis=1) / np.maximum(count, 1)
+        alone = trials.diverged & (~np.isfinite(trials.scores[NEES]) | (limit == inf))
+        lost |= (trials.failed | alone).any(axis=1) | (mean > limit).any(axis=1)
+    return lost
 
 
 def kept(selection: Selection, cells: Sequence[Cell]) -> Bool[np.ndarray, " n"]:

@@ -210,7 +210,7 @@ def _moments(sample: np.ndarray, *, ratio: bool) -> list[float] | None:
 def exclusion_rows(study: Study) -> list[dict[str, Any]]:
     """Return table rows with the numbers of excluded worlds and trials of each filter.
 
-    A row has finished worlds, worlds with a diverged or failed case, the paper's count, diverged
+    A row has finished worlds, excluded worlds (`lost_worlds`), the paper's count, diverged
     trials per strategy, failed trials, and the NEES limit; None for unknown limits and counts.
     """
     rows = []

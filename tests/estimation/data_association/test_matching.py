@@ -5,12 +5,7 @@ from itertools import product
 import numpy as np
 import pytest
 
-from pipistrelle.estimation.data_association.pairs import (
-    NOTHING,
-    marginal,
-    nearest,
-    probabilities,
-)
+from pipistrelle.estimation.data_association.pairs import NOTHING, _shares, marginal, nearest
 
 
 def costs_of(seed, rows=4, landmarks=3):
@@ -18,6 +13,13 @@ def costs_of(seed, rows=4, landmarks=3):
     rng = np.random.default_rng(seed)
     costs = rng.normal(-2.0, 4.0, (rows, landmarks))
     return np.where(rng.random(costs.shape) < 0.3, np.inf, costs)
+
+
+def probabilities(costs):
+    """Return the probability that each row is of each landmark; the rest is clutter."""
+    (rows, landmarks, values), shares = _shares(costs), np.zeros(costs.shape)
+    shares[rows, landmarks] = values
+    return shares
 
 
 def assignments(costs):

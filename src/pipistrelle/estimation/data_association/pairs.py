@@ -119,19 +119,6 @@ def _what_is_sure(costs: Float[np.ndarray, "m n"]) -> Int[np.ndarray, " m"]:
 
 
 @kernel
-def probabilities(costs: Float[np.ndarray, "m n"]) -> Float[np.ndarray, "m n"]:
-    """Return the probability that each measurement is of each landmark; the rest is clutter.
-
-    >>> probabilities(np.array([[0.0]]))
-    array([[0.5]])
-    """
-    (rows, landmarks, values), shares = _shares(costs), np.zeros(costs.shape)
-    for p in range(rows.size):
-        shares[rows[p], landmarks[p]] = values[p]
-    return shares
-
-
-@kernel
 def _shares(
     costs: Float[np.ndarray, "m n"],
 ) -> tuple[Int[np.ndarray, " p"], Int[np.ndarray, " p"], Float[np.ndarray, " p"]]:
