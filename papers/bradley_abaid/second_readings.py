@@ -135,6 +135,11 @@ FACTORS = {
     "layout": LAYOUT, "labels": LABELS, "cap": CAP, "front_end": FRONT_END, "ranged": RANGED,
     "weighed": WEIGHED, "exclusions": EXCLUSIONS,
 }  # fmt: skip
+WAYS: dict[str, dict[str, Change]] = {
+    "layout": LAYOUT, "labels": LABELS, "front_end": FRONT_END,
+    "ranged": {name: {"rays.ranged": name} for name in RANGED}, "weighed": WEIGHED,
+}  # fmt: skip
+"""Settings of the levels of factors that a plan has."""
 DEFAULTS = {name: next(iter(levels)) for name, levels in FACTORS.items()}
 """The plan `paper` as it was."""
 OUTPUT = Path(__file__).with_name("second_readings.csv")
@@ -262,8 +267,8 @@ def trials_in(
         heard = dict(zip(BEAMS, frames, strict=True))
         for name, strategy in product(EXCLUDED, STRATEGIES):
             for ranged, weighed in ways_of(name, strategy):
-                change = {} if ranged == ALL_DRAWN else {"rays.ranged": ranged}
-                ways = changed(config, change | WEIGHED.get(weighed, {}))
+                change = WAYS["ranged"].get(ranged, {}) | WEIGHED.get(weighed, {})
+                ways = changed(config, change)
                 case = Case(strategy=strategy, filter=name, iteration=world)
                 mapped = list(mapped_at_each_beam(scenario, heard, case, ways))
                 average = np.mean([row.pop("track_nees") for row in mapped], axis=0)
