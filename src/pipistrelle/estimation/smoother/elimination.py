@@ -68,6 +68,7 @@ from pipistrelle.estimation.smoother.records import (
     Work,
     add,
     add_image,
+    add_multiple,
     add_product,
     cholesky,
     congruent,
@@ -666,40 +667,48 @@ def joint(
 ) -> Float[np.ndarray, "q q"]:
     """Return the covariance of linear functions of the newest state, landmarks and parameters."""
     C, P, _ = front
-    q, d = by_chain.shape
-    Z, covariance, last = by_border.copy(), np.empty((q, q)), np.zeros(q, np.int64)
+    (q, d), Z = by_chain.shape, by_border.copy()
     for e in range(q):
         for a in range(d):
             if by_chain[e, a] != 0.0:
                 for j in range(n):
                     Z[e, j] += by_chain[e, a] * C[a, j]
         rooted(R, Z[e], n)
-        for j in range(n):
-            if Z[e, j] != 0.0:
-                last[e] = j
-        for f in range(e + 1):
-            total = 0.0
-            for j in range(min(last[e], last[f]) + 1):
-                total += Z[e, j] * Z[f, j]
-            for a in range(d):
-                if by_chain[e, a] != 0.0:
+    covariance = np.empty((q, q))
+    _write_gram(Z, np.empty((n, q)), covariance)
+    for e in range(q):
+        for a in range(d):
+            if by_chain[e, a] != 0.0:
+                for f in range(e + 1):
                     for b in range(d):
-                        total += by_chain[e, a] * P[a, b] * by_chain[f, b]
-            covariance[e, f] = covariance[f, e] = total
+                        covariance[e, f] += by_chain[e, a] * P[a, b] * by_chain[f, b]
+                    covariance[f, e] = covariance[e, f]
     return covariance
+
+
+@no_alloc
+def _write_gram(
+    Z: Float[np.ndarray, "q n"], turned: Float[np.ndarray, "n q"], gram: Float[np.ndarray, "q q"]
+) -> None:
+    """Write the matrix product Z Z^T to ``gram``, a row at a time, and Z^T to ``turned``."""
+    transpose(Z, turned)
+    for e in range(gram.shape[0]):
+        row = gram[e, e:]
+        row[:] = 0.0
+        for j in range(Z.shape[1]):
+            if Z[e, j] != 0.0:
+                add_multiple(turned[j, e:], Z[e, j], row)
+        for f in range(row.size):
+            gram[e + f, e] = row[f]
 
 
 @optimised_once
 def border_covariance(R: Factor) -> Factor:
     """Return the covariance of landmarks and parameters from the factor of their information."""
-    n = R.shape[0]
-    Z, covariance = np.zeros((n, n)), np.zeros((n, n))
-    for i in range(1, n):
+    Z = np.zeros(R.shape)
+    for i in range(1, len(R)):
         Z[i, i] = 1.0
         rooted(R, Z[i], i + 1)
-        for j in range(1, i + 1):
-            total = 0.0
-            for e in range(1, j + 1):
-                total += Z[i, e] * Z[j, e]
-            covariance[i, j] = covariance[j, i] = total
+    covariance = np.empty(R.shape)
+    _write_gram(Z, np.empty(R.shape), covariance)
     return covariance
