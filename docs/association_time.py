@@ -18,6 +18,7 @@ from pipistrelle.estimation.data_association.sequential import association_of
 from pipistrelle.estimation.session import Session
 from pipistrelle.experiments.hearing.listening import listen
 from pipistrelle.experiments.hearing.scenario import world_of
+from pipistrelle.experiments.machine import keep_freed_memory
 from pipistrelle.experiments.runs.heard_world import drive_of, scans_of
 
 SEED, WORLDS, TURNS = 515151, 5, 3
@@ -46,6 +47,7 @@ def times(config, name, drive, scans):
 
 def main(worlds):
     """Print median and 99th of a hundred of the frames' times, and how much longer missions are."""
+    keep_freed_memory()  # as the commands do
     told = settings("iekf", "known")
     scenarios = [world_of(told, world) for world in range(worlds)]
     heard = [

@@ -12,6 +12,8 @@ from pipistrelle.estimation.beliefs import Gaussian
 from pipistrelle.estimation.catalogue import CATALOGUE, entry
 from pipistrelle.estimation.motion import Motion
 from pipistrelle.estimation.session import REMEMBERED, Session
+from pipistrelle.estimation.smoother.history import STRETCH
+from pipistrelle.estimation.smoother.sweep import eliminated
 
 MOTION = Motion(model="unicycle", control_std=(0.05, 0.02))
 PLACES = np.array([[4.0, 1.0], [5.0, -3.0], [2.0, 5.0]])
@@ -51,16 +53,9 @@ def driven(name, script, scans=10, ghosts=()):
         places = np.vstack([PLACES, [-3.0 + 0.3 * k, 2.0]]) if k in ghosts else PLACES
         off = places - [0.2 * (k + 1), 0.0]
         noise = rng.normal(0.0, 0.02, (2, 4))[:, : len(off)]
-        session.hear(
-            make_scan(
-                float(k),
-                np.full(len(off), UNLABELLED),
-                np.arctan2(off[:, 1], off[:, 0]) + noise[0],
-                range=np.hypot(*off.T) + noise[1],
-                bearing_std=0.02,
-                range_std=0.05,
-            )
-        )
+        heard = {"range": np.hypot(*off.T) + noise[1], "bearing_std": 0.02, "range_std": 0.05}
+        bearing = np.arctan2(off[:, 1], off[:, 0]) + noise[0]
+        session.hear(make_scan(float(k), np.full(len(off), UNLABELLED), bearing, **heard))
     return session
 
 
@@ -82,12 +77,17 @@ def test_a_removed_ghost_landmark_leaves_no_trace(name, ghosts):
 
 @pytest.mark.parametrize("name", CATALOGUE)
 def test_a_landmark_from_before_all_that_is_remembered_is_removed_too(name):
-    labels = {2: [1, 2, 3, GHOST], 3: [1, 2, 3, GHOST]}
-    late = REMEMBERED + 8
-    script = Script(labels, remove={late: (GHOST,)})
-    session = driven(name, script, scans=late + 3, ghosts=(2, 3))
-    assert GHOST not in session.belief.labels()
-    assert {*session.belief.landmarks().landmark.tolist()} == {1, 2, 3}
+    ghosts = STRETCH + 2, STRETCH + 5
+    late = ghosts[1] + REMEMBERED + 5
+    script = Script({k: [1, 2, 3, GHOST] for k in ghosts}, remove={late: (GHOST,)})
+    session = driven(name, script, scans=late + 3, ghosts=ghosts)
+    belief = session.belief
+    assert GHOST not in belief.labels()
+    assert {*belief.landmarks().landmark.tolist()} == {1, 2, 3}
+    if name == "smoother":
+        whole = eliminated(belief.history, belief.noise, belief.solution.points)
+        np.testing.assert_allclose(belief.solution.state, whole.state, rtol=1e-9)
+        np.testing.assert_allclose(belief.solution.covariance, whole.covariance, rtol=1e-9)
 
 
 @pytest.mark.parametrize("name", CATALOGUE)

@@ -172,17 +172,9 @@ def judged(
     sight: Sight = (0.0, 0.0),
 ) -> Known:
     """Update landmarks' log odds of existence, counts and levels by a scan; return new records."""
-    after = _copied(tuple(known))
-    _judge(after, rows, place, near, scan, sight)
-    return Known(*after)
-
-
-@kernel
-def _copied(columns: tuple[np.ndarray, ...]) -> tuple[np.ndarray, ...]:
-    """Copy the arrays of landmark records that a scan changes; return them with the others."""
-    label, born, heard, count, odds, confirmed, source, aim, together = columns
-    counts = heard.copy(), count.copy(), odds.copy(), confirmed.copy()
-    return (label, born, *counts, source.copy(), aim.copy(), together.copy())
+    after = Known(*(column.copy() for column in known))
+    _judge(tuple(after), rows, place, near, scan, sight)
+    return after
 
 
 @kernel
@@ -360,12 +352,13 @@ def asked_of(
     """Return the mapped landmarks, their distinct pairs, and which to test for duplicates now."""
     known = Known(*columns)
     old = np.flatnonzero((at >= 0) & (known.born < now))
-    asked, apart = np.zeros(old.size, np.bool_), np.ones((old.size, old.size), np.bool_)
-    for i in range(old.size):
-        a = old[i]
+    asked = np.zeros(old.size, np.bool_)
+    for i, a in enumerate(old):
         asked[i] = known.heard[a] == now and known.count[a] in ASKED
+    apart = np.ones((old.size, old.size) if asked.any() else (0, 0), np.bool_)
+    for i in range(apart.shape[0]):
         for j in range(i):
-            b = old[j]
+            a, b = old[i], old[j]
             rarer = min(known.count[a], known.count[b])
             apart[i, j] = apart[j, i] = known.together[a, b] > BOTH * rarer
     return old, apart, np.flatnonzero(asked)

@@ -11,7 +11,6 @@ afterwards the session repeats all scans in its memory.
 import math
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
-from functools import partial
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -53,6 +52,7 @@ from pipistrelle.estimation.data_association.pairs import (
     OWN_CALL,
     UNPLACED,
     Chances,
+    Innovations,
     Match,
     PlainChances,
     Rows,
@@ -229,8 +229,11 @@ class _Work:
         rows, chances, known = tuple(self.rows), self.stage.chances, self.memory.known
         joint, telling = self._joint(), 2.0 * self.stage.limits.bearing_std
         used, costs, near = compared(rows, joint, self.moving, self.near, caller, chances, telling)
-        part, there = part_of(self.rows, used, 0.0), 3 + 2 * np.arange(costs.shape[1])
-        innovate = partial(pair_innovations, part, *joint[1:], there, at)
+
+        def innovate(pairs: tuple[np.ndarray, np.ndarray]) -> Innovations:
+            part, there = part_of(self.rows, used, 0.0), 3 + 2 * np.arange(costs.shape[1])
+            return pair_innovations(part, *joint[1:], there, at, pairs)
+
         matched = used, self.stage.match(costs, innovate), near
         confirmed = known.label[known.confirmed]
         begun, count = label_matched(self.label, rows, joint, confirmed, matched, caller, chances)

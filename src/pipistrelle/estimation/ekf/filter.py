@@ -161,23 +161,21 @@ def is_placed(landmark: Labels) -> Bool[np.ndarray, " h"]:
     return placed
 
 
-def removed(belief: "EkfBelief", label: int) -> "EkfBelief":
-    """Return the belief without a landmark, or without a moving caller and its velocity."""
-    state = belief.mean, belief.covariance, belief.landmark, belief.weight
-    mean, covariance, landmark, weight = _left(*state, _present(belief, label))
+def removed(belief: "EkfBelief", labels: Sequence[int]) -> "EkfBelief":
+    """Return the belief without some landmarks, and moving callers with their velocities."""
+    gone = np.array([_present(belief, label) for label in labels])[:, np.newaxis]
+    landmark = belief.landmark
+    kept = np.flatnonzero(((landmark != gone) & (landmark != _SUM - gone)).all(axis=0))
+    mean, covariance = _left(belief.mean, belief.covariance, kept)
+    landmark, weight = landmark[kept], belief.weight[kept]
     return replace(belief, mean=mean, covariance=covariance, landmark=landmark, weight=weight)
 
 
 @kernel
 def _left(
-    mean: Mean,
-    covariance: Covariance,
-    landmark: Labels,
-    weight: Float[np.ndarray, " h"],
-    label: Whole,
-) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Return a state's mean, covariance, labels and weights without a landmark."""
-    kept = np.flatnonzero((landmark != label) & (landmark != velocity_of(label)))
+    mean: Mean, covariance: Covariance, kept: Int[np.ndarray, " k"]
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return a state's mean and covariance with only the given entries of its map."""
     left, P = np.empty(3 + 2 * kept.size), np.empty((3 + 2 * kept.size, 3 + 2 * kept.size))
     at = np.arange(left.size)
     for n in range(kept.size):
@@ -186,7 +184,7 @@ def _left(
         left[i] = mean[at[i]]
         for j in range(at.size):
             P[i, j] = covariance[at[i], at[j]]
-    return left, P, landmark[kept], weight[kept]
+    return left, P
 
 
 def merged(belief: "EkfBelief", kept: int, gone: int) -> "EkfBelief":
@@ -207,9 +205,9 @@ def merged(belief: "EkfBelief", kept: int, gone: int) -> "EkfBelief":
         mean, covariance = _equated(belief.mean, belief.covariance, k, g, belief.error)
         belief = replace(belief, mean=mean, covariance=covariance)
     elif placed[second].all():
-        belief = removed(belief, kept)
+        belief = removed(belief, [kept])
         return replace(belief, landmark=np.where(belief.landmark == gone, kept, belief.landmark))
-    return removed(belief, gone)
+    return removed(belief, [gone])
 
 
 @kernel
@@ -315,9 +313,7 @@ class EkfBelief(Recoverable):
         belief = self
         for kept, gone in merge:
             belief = merged(belief, kept, gone)
-        for label in remove:
-            belief = removed(belief, label)
-        return belief
+        return removed(belief, remove) if remove else belief
 
     def freed(self, pose: Pose, stds: Pose) -> "EkfBelief":
         """Return the belief with the vehicle moved to a pose, and its covariance enlarged."""

@@ -14,7 +14,7 @@ from pipistrelle.estimation.motion import Pose
 from pipistrelle.estimation.rays import ray_members
 from pipistrelle.estimation.recovery import Recoverable
 from pipistrelle.estimation.smoother.elimination import joint
-from pipistrelle.estimation.smoother.history import NEVER, History
+from pipistrelle.estimation.smoother.history import STRETCH, History
 from pipistrelle.estimation.smoother.preintegration import Odometry, placed, poses_between
 from pipistrelle.estimation.smoother.records import CALLER, POSE, ChainState, NoiseModel, Stack
 from pipistrelle.estimation.smoother.sweep import (
@@ -30,21 +30,26 @@ from pipistrelle.jit import kernel
 
 def edited(
     history: History, remove: Sequence[int], merge: Sequence[tuple[int, int]]
-) -> tuple[History, Bool[np.ndarray, " l"]]:
-    """Remove and merge landmarks in a smoother's history; return it and a mask of landmarks kept.
+) -> tuple[History, Bool[np.ndarray, " l"], int]:
+    """Remove and merge landmarks in a history; return it, a mask of those kept, first node changed.
 
-    Their measurements are deleted or relabelled; the chain must be eliminated again.
+    Their measurements are deleted or relabelled; the chain must be eliminated again from this node.
     """
-    for kept, gone in merge:
-        history = _merged(history, _slot(history, kept), _slot(history, gone))
-    keep, slots = np.ones(history.rows.size, bool), [_slot(history, label) for label in remove]
-    ends = history.rows.entries(0).copy()
-    keep &= ~np.isin(ends[:, 0], slots)
-    ends[np.isin(ends[:, 1], slots), 1] = -1
-    history = _forgetting(_with_rows(history, ends, keep), slots)
-    border = np.zeros(len(history.placed), bool)
-    border[history.index[history.index > 0] - 1] = True
-    return _renumbered(history, border), border
+    first = history.nodes - 1
+    for pair in merge:
+        kept, gone = (_slot(history, label) for label in pair)
+        first = min(first, *history.heard[[kept, gone], 0].tolist())
+        history = _merged(history, kept, gone)
+    slots = [_slot(history, label) for label in remove]
+    first = min([first, *history.heard[slots, 0].tolist()])
+    history = _without(history, history.rows.entries(0), slots)
+    index, border = history.index.copy(), np.zeros(len(history.placed), bool)
+    border[index[index > 0] - 1] = True
+    index[index > 0] = np.cumsum(border)[index[index > 0] - 1]
+    placed = tuple(np.array(history.placed, np.int64)[border].tolist())
+    known, leaves = tuple(one[border] for one in history.known), history.leaves[border]
+    history = replace(history, index=index, placed=placed, known=known, leaves=leaves)
+    return history, border, first
 
 
 def _slot(history: History, label: int) -> int:
@@ -65,26 +70,31 @@ def _merged(history: History, kept: int, gone: int) -> History:
     if index[kept] == 0:
         index[kept], index[gone] = index[gone], 0
     heard[kept] = min(heard[kept, 0], heard[gone, 0]), max(heard[kept, 1], heard[gone, 1])
-    history = replace(history, index=index, heard=heard)
-    return _forgetting(_with_rows(history, ends, np.ones(len(ends), bool)), [gone])
+    return _without(replace(history, index=index, heard=heard), ends, [gone])
 
 
-def _with_rows(
-    history: History, ends: Int[np.ndarray, "r 4"], keep: Bool[np.ndarray, " r"]
-) -> History:
-    """Return a smoother's history with changed landmark indices, and only selected measurements."""
-    numbers = history.rows.entries(1)[keep]
-    ends, latest = ends[keep], np.full(history.latest.size, -1)
+def _without(history: History, ends: Int[np.ndarray, "r 4"], slots: Sequence[int]) -> History:
+    """Return a smoother's history with changed measurements, without some landmarks and theirs."""
+    kept = np.append(np.ones(history.latest.size, bool), False)  # the last entry: no caller
+    kept[slots] = False
+    number, keep, legs = np.where(kept, np.cumsum(kept) - 1, -1), kept[ends[:, 0]], history.legs
+    numbers, ends, latest = history.rows.entries(1)[keep], ends[keep], np.full(kept.sum(), -1)
+    ends[:, :2] = number[ends[:, :2]]
     _link(ends, numbers, latest)
-    rows = Stack((ends, numbers), len(ends), [len(ends)])
     before = np.append(0, np.cumsum(keep))
-    spans = before[history.legs.entries(3)]
-    legs = history.legs
-    arrays = tuple(
-        spans if number == 3 else array[: legs.size] for number, array in enumerate(legs.arrays)
+    arrays = [array[: legs.size] for array in legs.arrays]
+    arrays[3] = before[arrays[3]]
+    names = [name for name, slot in history.slots.items() if kept[slot]]
+    return replace(
+        history,
+        slots={name: slot for slot, name in enumerate(names)},
+        index=history.index[kept[:-1]],
+        latest=latest,
+        heard=history.heard[kept[:-1]],
+        moves=history.moves[kept[:-1]],
+        rows=Stack((ends, numbers), len(ends), [len(ends)]),
+        legs=Stack(tuple(arrays), legs.size, [legs.size]),
     )
-    moved = Stack(arrays, legs.size, [legs.size])
-    return replace(history, rows=rows, legs=moved, latest=latest)
 
 
 @kernel
@@ -96,30 +106,6 @@ def _link(
         ends[row, 3] = -1
         if not np.isnan(numbers[row, BEARING]):
             ends[row, 3], latest[ends[row, 0]] = latest[ends[row, 0]], row
-
-
-def _forgetting(history: History, slots: Sequence[int]) -> History:
-    """Detach landmarks from their labels in a smoother's history, keeping their indices."""
-    named = {slot: key for key, slot in history.slots.items()}
-    named |= {slot: (-2 - slot, False) for slot in slots}
-    index, heard = history.index.copy(), history.heard.copy()
-    index[slots], heard[slots] = 0, (NEVER, -1)
-    names = {named[slot]: slot for slot in range(len(named))}
-    return replace(history, slots=names, index=index, heard=heard)
-
-
-def _renumbered(history: History, kept: Bool[np.ndarray, " l"]) -> History:
-    """Return a smoother's history with only selected landmarks as unknowns, renumbered."""
-    number, index = np.append(0, np.cumsum(kept)), history.index.copy()
-    index[index > 0] = number[index[index > 0]]
-    mean, information = history.known
-    return replace(
-        history,
-        index=index,
-        placed=tuple(np.array(history.placed, np.int64)[kept].tolist()),
-        known=(mean[kept], information[kept]),
-        leaves=history.leaves[kept],
-    )
 
 
 MapRow = tuple[int, Float[np.ndarray, "2"], Float[np.ndarray, "2 2"], float]
@@ -209,7 +195,7 @@ class SmootherBelief(Recoverable):
 
     def labels(self) -> list[int]:
         """Return the labels of all landmarks and callers, initialised or not."""
-        return [label for label, _ in self.history.slots if label >= 0]
+        return [label for label, _ in self.history.slots]
 
     def joint(self, among: Int[np.ndarray, " n"] | None = None) -> JointGaussian:
         """Return the joint Gaussian of pose, initialised landmarks and moving callers."""
@@ -244,9 +230,14 @@ class SmootherBelief(Recoverable):
 
     def edited(self, remove: Sequence[int], merge: Sequence[tuple[int, int]]) -> "SmootherBelief":
         """Return the belief with some landmarks removed and some pairs of landmarks merged."""
-        history, kept = edited(self.history, remove, merge)
+        history, kept, node = edited(self.history, remove, merge)
         points = replace(self.solution.points, spots=self.solution.points.spots[kept])
-        solution = eliminated(history, self.noise, points)
+        first, number = node // STRETCH, np.cumsum(kept) - 1
+        stretches = [
+            replace(one, columns=one.columns[kept[: one.columns.size]], gone=number[one.gone])
+            for one in self.solution.stretches[: first + 1]
+        ]
+        solution = eliminated(history, self.noise, points, stretches, first)
         at = Gaussian(mean=solution.state[:3], covariance=solution.covariance[:3, :3])
         belief = replace(self, at=at, ahead=at, history=history, solution=solution)
         if not len(self.odometry.mean):
