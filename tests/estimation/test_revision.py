@@ -78,7 +78,7 @@ def test_a_removed_ghost_landmark_leaves_no_trace(name, ghosts):
 @pytest.mark.parametrize("name", CATALOGUE)
 def test_a_landmark_from_before_all_that_is_remembered_is_removed_too(name):
     ghosts = STRETCH + 2, STRETCH + 5
-    late = ghosts[1] + REMEMBERED + 5
+    late = ghosts[1] + STRETCH + REMEMBERED
     script = Script({k: [1, 2, 3, GHOST] for k in ghosts}, remove={late: (GHOST,)})
     session = driven(name, script, scans=late + 3, ghosts=ghosts)
     belief = session.belief
