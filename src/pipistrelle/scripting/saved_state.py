@@ -57,7 +57,7 @@ from pipistrelle.version import find_version
 
 HEAD = b"# Of Pipistrelle: a drive to go on from\n"
 """First line of the file; the second is the checksum of the rest."""
-FORM = 2
+FORM = 3
 """Version of the file format; 1 was a pickle."""
 ROLES = ("filter", "association")
 """Keys of the head with the names of estimator and association."""
@@ -671,7 +671,7 @@ LAWS: dict[Any, Callable[[Any], Any]] = {
         and 0 <= it.size <= it.written[0] <= min(room)
     ),
     Tracks: lambda it: (
-        len(it.rows) == len(it.poses)
+        len(it.rows) == len(it.poses) == len(it.times) == len(it.direct)
         and all(within(rows[:, 0], 0, len(it.last)) for rows in it.rows)
     ),
     StoredScan: lambda it: (

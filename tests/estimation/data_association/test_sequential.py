@@ -12,7 +12,7 @@ from pipistrelle.estimation.beliefs import Gaussian, JointGaussian, placed
 from pipistrelle.estimation.catalogue import entry
 from pipistrelle.estimation.data_association.existence import LASTING, PATIENCE
 from pipistrelle.estimation.data_association.rows import CallerPlace, CallerState, Memory
-from pipistrelle.estimation.data_association.sequential import PLACE_SHARE, association_of
+from pipistrelle.estimation.data_association.sequential import association_of
 from pipistrelle.estimation.motion import Motion
 from pipistrelle.estimation.session import Session
 from pipistrelle.experiments.runs.trial import run_mission
@@ -229,14 +229,15 @@ def test_associate_changes_nothing_that_it_is_given():
 def test_a_found_caller_is_measured_by_its_range_and_bearing():
     joint = JointGaussian(landmark=np.empty(0, int), mean=np.zeros(3), covariance=0.01 * np.eye(3))
     stage = association_of(Config(association=AssociationConfig(method="marginal")))
-    memory = Memory(labels=1, callers={1: CallerState(label=1, place=CallerPlace(6.0, 8.0))})
+    place = CallerPlace(6.0, 8.0, std=0.07)
+    memory = Memory(labels=1, callers={1: CallerState(label=1, place=place)})
     heard = make_scan(0.0, np.full(1, UNLABELLED), np.full(1, 0.9), caller=np.ones(1, int), **STDS)
     scan = replace(heard, direct=np.array([-1, 0]))
     _, assignment = stage.associate(memory, SimpleNamespace(joint=lambda: joint), scan)
     told = assignment.scan
     assert assignment.label.tolist() == [1]
     assert told.range[0] == pytest.approx(10.0)
-    assert told.range_std[0] == pytest.approx(10.0 * PLACE_SHARE)
+    assert told.range_std[0] == pytest.approx(10.0 * 0.07)
     assert (told.bearing[0], told.bearing_std[0]) == (0.9, STDS["bearing_std"])
 
 

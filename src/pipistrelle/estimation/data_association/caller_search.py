@@ -1,13 +1,11 @@
 r"""Find the position of a caller that is not on the map, and label early scans by a later map.
 
-**Search** (`searched`). Given the caller's position, bearing and excess path of a measurement fix a
-point, and the points of a landmark coincide over time only for the true position. A grid of ranges
-and bearings about the direct call is scored by the robust misfit of all tracks (`misfit`: points as
-weighted means, heading errors as medians over tracks, residuals capped at :math:`3 \sigma`), and
-the best node is refined by a pattern search. It is accepted if every position at another range fits
-much worse. For a moving caller, the begin, middle and end of a parabolic trajectory are searched:
-bearings alone locate fixed landmarks as the vehicle moves, so that excess paths determine the
-caller's velocity and acceleration.
+**Search** (`place_caller`). The echoes of a landmark, tracked over scans, agree in its position
+only for the true position of the caller. Both are fitted, with the errors of all poses, by
+Gauss-Newton; landmarks are eliminated. Its unknowns are the logarithm of the caller's range from
+the first pose, its bearing, velocity and acceleration (0 if stationary). Echoes are normal or
+outliers of uniform density (`recovery`), softly at first (graduated non-convexity). The position is
+returned when the std of its range is small; a constant acceleration serves as few scans are needed.
 
 **Turns** (`turned`). Estimators model a caller's velocity as a random walk, and lag behind a sharp
 turn. Where few of its measurements match the map, positions about its direct call are tried.
@@ -27,7 +25,6 @@ import math
 from collections.abc import Callable, Mapping
 from dataclasses import replace
 from functools import partial
-from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -44,170 +41,54 @@ from pipistrelle.estimation.data_association.pairs import (
     pair_innovations,
 )
 from pipistrelle.estimation.data_association.rows import (
-    TURN,
     CallerPlace,
-    CallerState,
     EarlyScan,
+    Model,
     Tracks,
     in_window,
     part_of,
 )
+from pipistrelle.estimation.measurement import NEAREST, excess_path_slopes, range_by_excess_path
 from pipistrelle.geometry import wrap_angle
 from pipistrelle.jit import kernel, no_alloc
 
-SCANS, SIGHTINGS, LEAST_TRACKS = 14, 4, 8
-"""Scans of the window, sightings that make a track count, and tracks required."""
-RANGES = np.geomspace(2.5, 45.0, 22)
-"""Ranges of the grid [m]."""
-BEARINGS = np.array([-0.1, -0.05, 0.0, 0.05, 0.1])
-"""Bearings of the grid relative to the direct call [rad]."""
-ANOTHER, CLEARLY, WELL = math.log(1.5), 25.0, 2.6
-"""Log ratio of distinct ranges, margin of misfit between them, largest misfit per measurement."""
-DIRECT_STD, LEAST_BEARING_STD, LEAST_WAY_STD = 0.05, 0.01, 0.05
-"""Floors of standard deviations: direct call [rad], other bearings [rad], excess paths [m]."""
-FARTHEST, NEAREST = 80.0, 0.05
-"""Largest range of a landmark and least distance from the caller [m]."""
-FASTEST = 2.0
-"""Largest speed of a moving caller [m/s]."""
-CAP = 9.0
-"""Cap of the misfit of a measurement [squared standard deviations]."""
-PASSES, WEIGHINGS = 3, 2
-FIRST, FIRST_MOVING = 8, 10
-"""Scans before the search for a stationary or a moving caller, repeated every second scan."""
-SECOND, LAST, APART, WIDELY = 20, 30, 0.15, math.log(2.0)
-"""For a stationary caller, scans before the second search and before it ends; log ratios of the two
-ranges from which their mean is taken, and from which only the second counts."""
+SCANS, SURE = 14, 0.1
+"""Most scans of a search, which bound its cost; largest relative std of a range that an estimator
+uses, as it linearises about it."""
+MEDIAN, SPREAD, FIELD = 10.0, 1.0, 40.0
+"""Prior of a caller's range: median [m] and std of its logarithm; std of the positions of landmarks
+about the vehicle [m]."""
+STARTS = np.log(np.geomspace(2.5, 45.0, 8))
+"""Logarithms of the ranges [m] at which fits begin."""
+MOTION, SOFTNESS, PASSES, LEAST_STD = 6, 16.0, 5, 1e-5
+"""Numbers of a caller's range, bearing and motion; softness of outliers in the first pass, divided
+by 4 in each further (graduated non-convexity); passes; least std of an error [m, rad, m/s]."""
+
+Seen = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
+"""Times [s] (k), poses (k, 3), world bearings of direct calls with stds (k, 2), and for each track
+and scan world bearing, excess path and their stds (t, k, 4); NaN where missed."""
 
 
-class Found(NamedTuple):
-    """Result of a search for a caller: position, misfit, and margin over other positions."""
-
-    place: CallerPlace
-    misfit: float
-    """Misfit per measurement."""
-    ahead: float
-    """Margin by which positions at other ranges fit worse."""
-    tracks: int
-
-    @property
-    def sure(self) -> bool:
-        """Whether the found position is certain enough to be accepted."""
-        return self.ahead > CLEARLY and self.misfit < WELL and self.tracks >= LEAST_TRACKS
-
-
-def searched(caller: CallerState, moves: bool) -> tuple[CallerState, CallerPlace | None]:
-    """Search for a caller's position if due; return its record, and the position if it is new.
-
-    A second result is averaged with the first, or replaces it where they differ widely.
-    """
-    tracks, first, scans = caller.tracks, caller.place, len(caller.tracks.poses)
-    begin = SECOND if first is not None else FIRST_MOVING if moves else FIRST
-    if scans < begin or scans % 2:
-        return caller, None
-    found = find_moving_caller(tracks) if moves else find_caller(tracks)
-    if found is None or not found.sure:
-        return (caller if first is None or scans < LAST else _agreed(caller, first)), None
-    place = found.place
-    if first is None:
-        return caller, place._replace(agreed=moves or scans >= SECOND)
-    x, y = tracks.poses[0, :2]
-    far = [math.hypot(one.x - x, one.y - y) for one in (first, place)]
-    apart = abs(math.log(far[1] / far[0]))
-    if apart < APART:
-        return _agreed(caller, first), None
-    share = 1.0 if apart > WIDELY else 0.5
-    x, y = first.x + share * (place.x - first.x), first.y + share * (place.y - first.y)
-    return caller, CallerPlace(x, y, agreed=True)
-
-
-def _agreed(caller: CallerState, place: CallerPlace) -> CallerState:
-    """Fix a caller's position and end its search; return its record."""
-    return replace(caller, place=place._replace(agreed=True), tracks=Tracks())
-
-
-def find_caller(tracks: Tracks) -> Found | None:
-    """Find a stationary caller's position from tracked echoes; None without enough data."""
-    table, poses, direct = in_window(tracks, SCANS, SIGHTINGS)
-    heard = direct[~np.isnan(direct)]
-    if len(table) < LEAST_TRACKS or not heard.size:
+def place_caller(tracks: Tracks, moves: bool, model: Model) -> CallerPlace | None:
+    """Return a caller's position from tracked echoes, or None if it is uncertain or not due."""
+    times, poses, direct, table = in_window(tracks, SCANS)
+    heard = direct[~np.isnan(direct[:, 0]), 0]
+    if len(tracks.poses) % 2 or not (len(table) and heard.size):
         return None
-    seen, still = (poses, table, direct), np.ones((len(poses), 1))
-    grid = [(r, heard[-1] + b) for r in RANGES.tolist() for b in BEARINGS.tolist()]
-    nodes = [seen_from(poses[-1], r, angle)[np.newaxis] for r, angle in grid]
-    ranges, misfits = np.array([r for r, _ in grid]), _misfits(nodes, still, seen)
-    best = int(misfits.argmin())
-    node, least = _downhill(nodes[best], misfits[best], 0.12 * ranges[best], still, seen)
-    others = _another(ranges, math.hypot(*(node[0] - poses[-1, :2])))
-    ahead = float(misfits[others].min(initial=math.inf) - least)
-    x, y = node[0].tolist()
-    return Found(CallerPlace(x, y), least / _rows(table), ahead, len(table))
-
-
-def find_moving_caller(tracks: Tracks) -> Found | None:
-    """Find a moving caller's position and motion from tracked echoes; None without enough data."""
-    table, poses, direct = in_window(tracks, SCANS, SIGHTINGS)
-    heard, times = np.flatnonzero(~np.isnan(direct)), tracks.times[-len(poses) :]
-    if len(table) < LEAST_TRACKS or heard.size < 2:
+    model = model if moves else (*model[:2], 0.0, 0.0, model[4])
+    seen, tried = (times - times[0], poses * np.array([1.0, 1.0, 0.0]), direct, table), []
+    for start in STARTS.tolist():
+        points, unknown = np.full((len(table), 2), np.nan), np.zeros(MOTION + 3 * len(poses))
+        unknown[:2] = start, heard[0]
+        tried.append((fitted(unknown, points, seen, model, SOFTNESS)[0], unknown, points))
+    _, unknown, points = min(tried, key=lambda one: one[0])
+    _, std = fitted(unknown, points, seen, model, 1.0)
+    if not std < SURE:
         return None
-    seen, first, last = (poses, table, direct), heard[0], heard[-1]
-    took = float(times[last] - times[first])
-    share = (times - times[first]) / took
-    ends = [(s, r) for r in RANGES.tolist() for s in RANGES.tolist() if abs(r - s) < FASTEST * took]
-    begins, finish = (poses[first], direct[first]), (poses[last], direct[last])
-    nodes = [
-        np.stack([seen_from(begins[0], s, begins[1]), seen_from(finish[0], r, finish[1])])
-        for s, r in ends
-    ]
-    ranges = np.array([r for _, r in ends])
-    misfits = _misfits(nodes, np.stack([1.0 - share, share], axis=1), seen)
-
-    def range_of(way: Float[np.ndarray, "n 2"]) -> float:
-        return math.hypot(*(way[-1] - poses[last, :2]))
-
-    def best_of(
-        costs: Float[np.ndarray, " g"], within: Callable[[np.ndarray], bool]
-    ) -> tuple[Float[np.ndarray, "3 2"], float]:
-        best = int(costs.argmin())
-        return _bent((nodes[best], misfits[best], 0.12 * ranges[best]), share, seen, within)
-
-    one = best_of(misfits, lambda way: True)
-    found = range_of(one[0])
-    other = best_of(
-        np.where(_another(ranges, found), misfits, np.inf),
-        lambda way: abs(math.log(range_of(way) / found)) > ANOTHER,
-    )
-    (way, least), (_, next_least) = sorted((one, other), key=lambda found: found[1])
-    place = _at_end(way, float(times[last]), took)._replace(since=float(times[0]))
-    return Found(place, least / _rows(table), next_least - least, len(table))
-
-
-def _bent(
-    begun: tuple[np.ndarray, float, float],
-    share: Float[np.ndarray, " k"],
-    seen: tuple[np.ndarray, ...],
-    within: Callable[[np.ndarray], bool],
-) -> tuple[Float[np.ndarray, "3 2"], float]:
-    """Fit a caller's parabolic trajectory to tracked echoes; return its three points and misfit."""
-    node, least, step = begun
-    line = np.stack([1.0 - share, share], axis=1)
-    node, least = _downhill(node, least, step, line, seen, within)
-    middle = 4.0 * share * (1.0 - share)
-    curve = np.stack([line[:, 0] - 0.5 * middle, middle, line[:, 1] - 0.5 * middle], axis=1)
-    node = np.stack([node[0], 0.5 * (node[0] + node[1]), node[1]])
-    return _downhill(node, least, step / 3.0, curve, seen, within)
-
-
-def _at_end(node: Float[np.ndarray, "3 2"], time: float, took: float) -> CallerPlace:
-    """Return position, velocity and acceleration at the end of a parabola through three points."""
-    velocity = (node[0] - 4.0 * node[1] + 3.0 * node[2]) / took
-    acceleration = 4.0 * (node[0] - 2.0 * node[1] + node[2]) / took**2
-    (x, y), (vx, vy), (ax, ay) = (of.tolist() for of in (node[2], velocity, acceleration))
-    return CallerPlace(x, y, motion=(vx, vy, ax, ay), time=time)
-
-
-def _another(ranges: Float[np.ndarray, " n"], distance: float) -> Bool[np.ndarray, " n"]:
-    """Return whether each range differs from a distance by more than a fixed ratio."""
-    return np.abs(np.log(ranges / distance)) > ANOTHER
+    (x, y), time = seen_from(poses[0], math.exp(unknown[0]), unknown[1]).tolist(), float(times[0])
+    vx, vy, ax, ay = unknown[2:MOTION].tolist()
+    place = CallerPlace(x, y, motion=(vx, vy, ax, ay), time=time, since=time, std=std)
+    return place if moves else CallerPlace(x, y, std=std)
 
 
 def seen_from(pose: Float[np.ndarray, "3"], far: float, angle: float) -> Float[np.ndarray, "2"]:
@@ -215,179 +96,245 @@ def seen_from(pose: Float[np.ndarray, "3"], far: float, angle: float) -> Float[n
     return pose[:2] + far * np.array([math.cos(angle), math.sin(angle)])
 
 
-def _rows(table: Float[np.ndarray, "t k 4"]) -> int:
-    """Count the measurements in a table of tracked echoes, without its NaN entries."""
-    return int(np.count_nonzero(~np.isnan(table[..., 0])))
-
-
-def _misfits(
-    nodes: list[np.ndarray], weights: Float[np.ndarray, "k n"], seen: tuple[np.ndarray, ...]
-) -> Float[np.ndarray, " g"]:
-    """Return the misfit to tracked echoes of each candidate trajectory of a caller."""
-    return np.array([misfit(weights @ node, *seen) for node in nodes])
-
-
-def _downhill(
-    nodes: Float[np.ndarray, "n 2"],
-    least: float,
-    step: float,
-    weights: Float[np.ndarray, "k n"],
-    seen: tuple[np.ndarray, ...],
-    within: Callable[[np.ndarray], bool] = lambda nodes: True,
-) -> tuple[Float[np.ndarray, "n 2"], float]:
-    """Minimise a caller trajectory's misfit by pattern search; return its points and the misfit."""
-    end, size = step / 12.0, len(nodes)
-    which = [np.ones((size, 1)), *(np.eye(size)[:, :, np.newaxis] if size > 1 else ())]
-    angles = np.arange(8) * np.pi / 4.0
-    moves = [one * np.array([math.cos(a), math.sin(a)]) for one in which for a in angles]
-    while step > end:
-        for move in moves:
-            other = nodes + step * move
-            value = misfit(weights @ other, *seen)
-            if value < least and within(other):
-                nodes, least = other, value
-                break
-        else:
-            step *= 0.5
-    return nodes, least
-
-
 @kernel
-def misfit(
-    places: Float[np.ndarray, "k 2"],
-    poses: Float[np.ndarray, "k 3"],
-    table: Float[np.ndarray, "t k 4"],
-    direct: Float[np.ndarray, " k"],
-) -> float:
-    """Return the robust misfit of a caller's trajectory to all tracked echoes [squared stds]."""
-    tracks, scans = table.shape[0], table.shape[1]
-    turn, off = np.zeros(scans), np.full((tracks, scans), np.nan)
-    points, total = np.empty((scans, 6)), 0.0
-    for _ in range(PASSES - 1):
-        for t in range(tracks):
-            _write_off(places, poses, table[t], turn, points, off[t])
-        _correct_headings(off, turn)
-    for t in range(tracks):
-        point = _write_off(places, poses, table[t], turn, points, off[t])
-        total += _of_track(places, poses, table[t], points, off[t], point)
-    for k in range(scans):
-        if not math.isnan(direct[k]):
-            towards = math.atan2(places[k, 1] - poses[k, 1], places[k, 0] - poses[k, 0])
-            sight = wrap_angle(direct[k] + turn[k] - towards) / DIRECT_STD
-            total += min(sight * sight, CAP)
-        if k > 0:
-            total += ((turn[k] - turn[k - 1]) / TURN) ** 2
-    return total
-
-
-@no_alloc
-def _write_off(
-    places: Float[np.ndarray, "k 2"],
-    poses: Float[np.ndarray, "k 3"],
-    rows: Float[np.ndarray, "k 4"],
-    turn: Float[np.ndarray, " k"],
-    points: Float[np.ndarray, "k 6"],
-    off: Float[np.ndarray, " k"],
+def fitted(
+    unknown: Float[np.ndarray, " u"],
+    points: Float[np.ndarray, "t 2"],
+    seen: Seen,
+    model: Model,
+    softness: float,
 ) -> tuple[float, float]:
-    """Return the landmark position that fits a track of echoes; write its bearing residuals."""
-    x, y, weight = 0.0, 0.0, 0.0
-    for k in range(rows.shape[0]):
-        _write_point(places[k], poses[k], rows[k], turn[k], points[k])
-        if not math.isnan(points[k, 0]):
-            share = 1.0 / (points[k, 4] + points[k, 5] + 4e-4)
-            x, y, weight = x + share * points[k, 0], y + share * points[k, 1], weight + share
-    for number in range(1 + WEIGHINGS if weight > 0.0 else 0):
-        x, y = _weighed(points, x, y) if number else (x / weight, y / weight)
-    for k in range(rows.shape[0]):
-        if not math.isnan(points[k, 0]):
-            towards = math.atan2(y - poses[k, 1], x - poses[k, 0])
-            off[k] = wrap_angle(rows[k, 0] + turn[k] - towards)
-    return x, y
+    """Fit a caller to tracked echoes by Gauss-Newton, in place; return cost and relative std.
+
+    ``unknown``: logarithm of its range and its bearing from the first pose, velocity, acceleration,
+    and the errors of all poses; ``points``: landmarks (NaN: unknown). The std is that of the range.
+    """
+    (times, poses, _, table), size, tracks = seen, unknown.size, len(points)
+    cost, variance, places = math.inf, math.nan, np.empty((len(poses), 2))
+    for number in range(PASSES + 1):
+        there, start = poses + unknown[MOTION:].reshape(poses.shape), (unknown[0], unknown[1])
+        far, ahead = math.exp(start[0]), (math.cos(start[1]), math.sin(start[1]))
+        for e in range(2):
+            motion = times * (unknown[2 + e] + 0.5 * times * unknown[4 + e])
+            places[:, e] = poses[0, e] + far * ahead[e] + motion
+        for t in range(tracks if number == 0 or number == PASSES // 2 else 0):
+            _write_point(points[t], places, there, table[t], model[4])
+        A, g, C = np.zeros((size, size)), np.zeros((size, 2)), np.zeros((tracks + 1, 2, size))
+        B = np.zeros((tracks + 1, 5))
+        cost = _add_priors((A, g, C[tracks], B[tracks]), unknown, seen, model)
+        cost += _add_rows((A, g, C, B), start, points, places, there, seen, model[4], softness)
+        cost += _eliminate_points((A, g, C, B), points, poses[0])
+        g[0, 1] = 1.0
+        variance = _solve(A, g)
+        if number < PASSES:
+            unknown += g[:, 0]
+            for t in range(tracks):
+                hx, hy = B[t, 3], B[t, 4]
+                for e in range(size):
+                    hx, hy = hx - C[t, 0, e] * g[e, 0], hy - C[t, 1, e] * g[e, 0]
+                points[t, 0] += B[t, 0] * hx + B[t, 1] * hy
+                points[t, 1] += B[t, 1] * hx + B[t, 2] * hy
+        softness = max(1.0, 0.25 * softness)
+    return cost, math.sqrt(variance)
 
 
 @no_alloc
-def _of_track(
-    places: Float[np.ndarray, "k 2"],
-    poses: Float[np.ndarray, "k 3"],
-    rows: Float[np.ndarray, "k 4"],
-    points: Float[np.ndarray, "k 6"],
-    off: Float[np.ndarray, " k"],
-    point: tuple[float, float],
-) -> float:
-    """Return the robust misfit of a track's bearings and excess paths to a landmark position."""
-    total, (x, y) = 0.0, point
-    for k in range(rows.shape[0]):
-        if math.isnan(rows[k, 0]):
-            continue
-        if math.isnan(points[k, 0]):
-            total += CAP
-            continue
-        straight = math.hypot(places[k, 0] - poses[k, 0], places[k, 1] - poses[k, 1])
-        onward = math.hypot(x - places[k, 0], y - places[k, 1])
-        path = onward + math.hypot(x - poses[k, 0], y - poses[k, 1]) - straight
-        across = off[k] / math.hypot(rows[k, 2], LEAST_BEARING_STD)
-        along = (rows[k, 1] - path) / math.hypot(rows[k, 3], LEAST_WAY_STD)
-        total += min(across * across + along * along, CAP)
-    return total
-
-
-@no_alloc
-def _weighed(points: Float[np.ndarray, "k 6"], x: float, y: float) -> tuple[float, float]:
-    """Return a robust mean of points, with less weight for points far from the previous mean."""
-    sx, sy, weight = 0.0, 0.0, 0.0
-    for k in range(points.shape[0]):
-        if math.isnan(points[k, 0]):
-            continue
-        c, s = points[k, 2], points[k, 3]
-        dx, dy = points[k, 0] - x, points[k, 1] - y
-        along, across = c * dx + s * dy, c * dy - s * dx
-        squared = along * along / points[k, 4] + across * across / (points[k, 5] + 1e-4)
-        share = 1.0 / ((points[k, 4] + points[k, 5] + 4e-4) * (1.0 + 0.25 * squared))
-        sx, sy, weight = sx + share * points[k, 0], sy + share * points[k, 1], weight + share
-    return sx / weight, sy / weight
-
-
-@no_alloc
-def _write_point(
-    place: Float[np.ndarray, "2"],
-    pose: Float[np.ndarray, "3"],
-    row: Float[np.ndarray, "4"],
-    turn: float,
-    point: Float[np.ndarray, "6"],
+def _write_slopes(
+    slopes: Float[np.ndarray, "9"],
+    start: tuple[float, float],
+    time: float,
+    by_caller: tuple[float, float],
+    by_pose: tuple[float, float, float],
 ) -> None:
-    """Write the point at a measurement's bearing and excess path, with variances; NaN if none."""
-    point[0], angle = math.nan, row[0] + turn
-    if math.isnan(row[0]):
-        return
-    c, s = math.cos(angle), math.sin(angle)
-    wx, wy = pose[0] - place[0], pose[1] - place[1]
-    straight = math.sqrt(wx * wx + wy * wy)
-    whole = straight + max(row[1], 0.02)
-    down = whole + wx * c + wy * s
-    far = 0.5 * row[1] * (2.0 * straight + row[1]) / max(down, 1e-3)
-    if not 0.0 < far < FARTHEST:
-        return
-    fx, fy = wx + far * c, wy + far * s
-    onward = max(math.sqrt(fx * fx + fy * fy), NEAREST)
-    by_range = max(1.0 + (fx * c + fy * s) / onward, 0.02)
-    by_bearing = far * (c * fy - s * fx) / onward
-    along = by_bearing / by_range * row[2], math.hypot(row[3], 0.03) / by_range
-    point[0], point[1], point[2], point[3] = pose[0] + far * c, pose[1] + far * s, c, s
-    point[4] = along[0] * along[0] + along[1] * along[1]
-    point[5] = (far * math.hypot(row[2], LEAST_BEARING_STD)) ** 2
+    """Write derivatives by a caller's range, bearing and motion and by a pose."""
+    far, c, s, (hx, hy) = math.exp(start[0]), math.cos(start[1]), math.sin(start[1]), by_caller
+    slopes[0], slopes[1] = far * (c * hx + s * hy), far * (c * hy - s * hx)
+    slopes[2], slopes[3] = time * hx, time * hy
+    slopes[4], slopes[5] = 0.5 * time * time * hx, 0.5 * time * time * hy
+    slopes[6], slopes[7], slopes[8] = by_pose
 
 
 @kernel
-def _correct_headings(off: Float[np.ndarray, "t k"], turn: Float[np.ndarray, " k"]) -> None:
-    """Correct each scan's heading by its median bearing residual, relative to the last scan."""
-    scans = turn.size
-    medians = np.zeros(scans)
-    for k in range(scans):
-        seen = off[:, k][~np.isnan(off[:, k])]
-        if seen.size >= 3:
-            medians[k] = np.median(seen)
-    for k in range(scans):
-        turn[k] -= min(max(medians[k] - medians[scans - 1], -0.1), 0.1)
+def _add_priors(
+    normal: tuple[np.ndarray, ...],
+    unknown: Float[np.ndarray, " u"],
+    seen: Seen,
+    model: Model,
+) -> float:
+    """Add the priors of a caller's range and motion and of the poses' errors; return the cost."""
+    (times, poses, _, _), (along, turn, speed, walk, _) = seen, model
+    slopes, index, none = np.ones(3), np.zeros(3, np.int64), (0.0, 0.0)
+    cost = _add(normal, index[:1], slopes, none, SPREAD, math.log(MEDIAN) - unknown[0])
+    for e in range(2, MOTION + 3):
+        index[0], std = e, speed if e < 4 else walk / math.sqrt(times[-1])
+        std = max(std, LEAST_STD) if e < MOTION else LEAST_STD
+        cost += _add(normal, index[:1], slopes, none, std, -unknown[e])
+    for k in range(1, len(poses)):
+        (dx, dy, _), now, slopes[1] = poses[k] - poses[k - 1], MOTION + 3 * k, -1.0
+        for e in range(3):
+            index[0], index[1], index[2] = now + e, now + e - 3, now - 1
+            slopes[2] = (dy, -dx, 0.0)[e]
+            nu = unknown[now + e - 3] - unknown[now + e] - slopes[2] * unknown[now - 1]
+            cost += _add(normal, index, slopes, none, max(turn if e == 2 else along, LEAST_STD), nu)
+    return cost
+
+
+@kernel
+def _add_rows(
+    normal: tuple[np.ndarray, ...],
+    start: tuple[float, float],
+    points: Float[np.ndarray, "t 2"],
+    places: Float[np.ndarray, "k 2"],
+    there: Float[np.ndarray, "k 3"],
+    seen: Seen,
+    clutter: float,
+    softness: float,
+) -> float:
+    """Add tracked echoes and direct calls to the normal equations; return their robust cost."""
+    (A, g, C, B), (times, _, direct, table), tracks = normal, seen, len(points)
+    index, slopes, cost, none = np.arange(MOTION + 3), np.empty(MOTION + 3), 0.0, (0.0, 0.0)
+    for k in range(len(there)):
+        (px, py, turn), place, (bearing, std) = there[k], places[k], direct[k]
+        index[MOTION:] = MOTION + 3 * k + np.arange(3)
+        if not math.isnan(bearing):
+            off, by = _off_bearing(bearing + turn, place[0] - px, place[1] - py)
+            most = math.log(2.0 * math.pi / (std * std))
+            weight, lost = _weighed(((off / std) ** 2, most), softness)
+            _write_slopes(slopes, start, times[k], by, (-by[0], -by[1], -1.0))
+            _add((A, g, C[tracks], B[tracks]), index, slopes, none, std / weight, off)
+            cost += lost
+        for t in range(tracks):
+            if not math.isnan(table[t, k, 0]):
+                row = table[t, k]
+                found = _off_echo(row, there[k], place, points[t], clutter)
+                off, by, late, (lx, ly, cx, cy), costs = found
+                weight, lost = _weighed(costs, softness)
+                _write_slopes(slopes, start, times[k], none, (-by[0], -by[1], -1.0))
+                _add((A, g, C[t], B[t]), index, slopes, by, row[2] / weight, off)
+                _write_slopes(slopes, start, times[k], (cx, cy), (-lx - cx, -ly - cy, 0.0))
+                _add((A, g, C[t], B[t]), index, slopes, (lx, ly), row[3] / weight, late)
+                cost += lost
+    return cost
+
+
+@no_alloc
+def _off_bearing(bearing: float, dx: float, dy: float) -> tuple[float, tuple[float, float]]:
+    """Return the residual of a bearing to a point, and its derivatives by the point."""
+    squared = max(dx * dx + dy * dy, NEAREST * NEAREST)
+    return wrap_angle(bearing - math.atan2(dy, dx)), (-dy / squared, dx / squared)
+
+
+@no_alloc
+def _off_echo(
+    row: Float[np.ndarray, "4"],
+    pose: Float[np.ndarray, "3"],
+    place: Float[np.ndarray, "2"],
+    point: Float[np.ndarray, "2"],
+    clutter: float,
+) -> tuple[float, tuple[float, float], float, tuple[float, ...], tuple[float, float]]:
+    """Return an echo's residuals with derivatives, and the costs of an echo and of an outlier."""
+    x, y, px, py = pose[0], pose[1], point[0], point[1]
+    off, by = _off_bearing(row[0] + pose[2], px - x, py - y)
+    path, lx, ly, cx, cy = excess_path_slopes(x, y, px, py, place[0], place[1])
+    late, most = row[1] - path, -2.0 * math.log(2.0 * math.pi * clutter * row[2] * row[3])
+    return off, by, late, (lx, ly, cx, cy), ((off / row[2]) ** 2 + (late / row[3]) ** 2, most)
+
+
+@no_alloc
+def _weighed(costs: tuple[float, float], softness: float) -> tuple[float, float]:
+    """Return the root of a measurement's weight, and its cost, normal or as an outlier."""
+    ahead = 0.5 * (costs[1] - costs[0])
+    rare = math.exp(-abs(ahead) / softness)
+    weight = (1.0 if ahead > 0.0 else rare) / (1.0 + rare)
+    return math.sqrt(weight), min(costs) - 2.0 * math.log1p(math.exp(-abs(ahead)))
+
+
+@no_alloc
+def _add(
+    normal: tuple[np.ndarray, ...],
+    index: Int[np.ndarray, " s"],
+    slopes: Float[np.ndarray, " s"],
+    by_point: tuple[float, float],
+    std: float,
+    residual: float,
+) -> float:
+    """Add a residual with its derivatives to the normal equations; return its square."""
+    (A, g, C, B), (lx, ly), weight = normal, by_point, 1.0 / (std * std)
+    for a in range(index.size):
+        i, share = index[a], weight * slopes[a]
+        g[i, 0] += share * residual
+        C[0, i], C[1, i] = C[0, i] + share * lx, C[1, i] + share * ly
+        for b in range(index.size):
+            A[i, index[b]] += share * slopes[b]
+    B[0], B[1], B[2] = B[0] + weight * lx * lx, B[1] + weight * lx * ly, B[2] + weight * ly * ly
+    B[3], B[4] = B[3] + weight * lx * residual, B[4] + weight * ly * residual
+    return weight * residual * residual
+
+
+@kernel
+def _eliminate_points(
+    normal: tuple[np.ndarray, ...], points: Float[np.ndarray, "t 2"], pose: Float[np.ndarray, "3"]
+) -> float:
+    """Eliminate landmarks from the normal equations, with their prior; return its cost."""
+    (A, g, C, B), cost, none = normal, 0.0, np.empty(0, np.int64)
+    for t in range(len(points)):
+        for e in range(2):
+            way = (1.0, 0.0) if e == 0 else (0.0, 1.0)
+            cost += _add((A, g, C[t], B[t]), none, pose, way, FIELD, pose[e] - points[t, e])
+        xx, xy, yy, hx, hy = B[t]
+        det = xx * yy - xy * xy
+        xx, xy, yy = yy / det, -xy / det, xx / det
+        B[t, 0], B[t, 1], B[t, 2] = xx, xy, yy
+        for i in range(len(A)):
+            sx, sy = xx * C[t, 0, i] + xy * C[t, 1, i], xy * C[t, 0, i] + yy * C[t, 1, i]
+            if sx != 0.0 or sy != 0.0:
+                g[i, 0] -= sx * hx + sy * hy
+                for j in range(i, len(A)):
+                    A[i, j] -= sx * C[t, 0, j] + sy * C[t, 1, j]
+    return cost
+
+
+@no_alloc
+def _solve(A: Float[np.ndarray, "u u"], g: Float[np.ndarray, "u 2"]) -> float:
+    """Solve for the first column by the upper triangle; return the variance of the second."""
+    size, variance = len(A), 0.0
+    for e in range(size):
+        variance += g[e, 1] * g[e, 1] / A[e, e]
+        for i in range(e + 1, size):
+            share = A[e, i] / A[e, e]
+            if share != 0.0:
+                g[i, 0], g[i, 1] = g[i, 0] - share * g[e, 0], g[i, 1] - share * g[e, 1]
+                for j in range(i, size):
+                    A[i, j] -= share * A[e, j]
+    for e in range(size - 1, -1, -1):
+        for j in range(e + 1, size):
+            g[e, 0] -= A[e, j] * g[j, 0]
+        g[e, 0] /= A[e, e]
+    return variance
+
+
+@kernel
+def _write_point(
+    point: Float[np.ndarray, "2"],
+    places: Float[np.ndarray, "k 2"],
+    there: Float[np.ndarray, "k 3"],
+    rows: Float[np.ndarray, "k 4"],
+    clutter: float,
+) -> None:
+    """Write the point of a track's measurements that fits all best, unless it fits best already."""
+    least, tried, heard = math.inf, point.copy(), np.flatnonzero(~np.isnan(rows[:, 0]))
+    for one in range(-1, heard.size):
+        if one >= 0:
+            k = heard[one]
+            angle, (dx, dy) = rows[k, 0] + there[k, 2], places[k] - there[k, :2]
+            c, s, path = math.cos(angle), math.sin(angle), max(rows[k, 1], rows[k, 3])
+            far = min(range_by_excess_path(path, dx, dy, c, s, False), FIELD)
+            tried[0], tried[1] = there[k, 0] + far * c, there[k, 1] + far * s
+        cost = 0.0
+        for k in heard:
+            cost += _weighed(_off_echo(rows[k], there[k], places[k], tried, clutter)[4], 1.0)[1]
+        if cost < least and not math.isnan(tried[0]):
+            point[:], least = tried, cost
 
 
 FITTING_SHARE, LEAST_ROWS = 0.5, 6

@@ -50,11 +50,11 @@ AT_SCAN, AT_BEARING, AT_WAY, AT_BEARING_STD, AT_WAY_STD, AT_LEVEL, AT_X, AT_Y = 
 """Columns of a sighting; the bearing is in the world, and x and y are the vehicle's."""
 SILENT, EVEN = 4, 6
 """Scans without sightings that end a track, and scans over which its change counts as linear."""
-TURN = 0.03
-"""Drift of the dead-reckoned heading per scan [rad]."""
-CLUTTER, NEW_BEARING_STD, NEW_WAY_STD, GATE, LEVEL_STD = 0.075, 0.05, 0.3, 12.0, 5.0
-"""Clutter per rad and m over the detection probability; largest stds of a first sighting [rad, m];
-gate on the squared distance; std of levels [dB]."""
+NEW_BEARING_STD, NEW_WAY_STD, GATE, LEVEL_STD = 0.05, 0.3, 12.0, 5.0
+"""Largest stds of a first sighting [rad, m]; gate on the squared distance; std of levels [dB]."""
+Model = tuple[float, float, float, float, float]
+"""Stds of the change of a pose's error in a scan [m, rad], stds of a caller's initial velocity
+[m/s] and of its change in a second [m/s], and clutter density over detection probability."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -65,8 +65,8 @@ class Tracks:
     """Predicted vehicle pose at each scan."""
     times: Float[np.ndarray, " k"] = field(default_factory=lambda: np.empty(0))
     """Times of the scans [s]."""
-    direct: Float[np.ndarray, " k"] = field(default_factory=lambda: np.empty(0))
-    """World bearing of the direct call [rad], or NaN."""
+    direct: Float[np.ndarray, "k 2"] = field(default_factory=lambda: np.empty((0, 2)))
+    """World bearing of the direct call and its std [rad], or NaN."""
     rows: tuple[Float[np.ndarray, "r 5"], ...] = ()
     """For each scan: track number, world bearing, excess path, and their standard deviations."""
     last: Float[np.ndarray, "t 3 8"] = field(default_factory=lambda: np.empty((0, SIGHTINGS, 8)))
@@ -74,16 +74,24 @@ class Tracks:
 
 
 def followed(
-    tracks: Tracks, time: float, pose: Float[np.ndarray, "3"], direct: float, rows: Rows
+    tracks: Tracks,
+    time: float,
+    pose: Float[np.ndarray, "3"],
+    direct: Float[np.ndarray, "2"],
+    rows: Rows,
+    model: Model,
 ) -> Tracks:
-    """Return a caller's tracks of echoes extended by a scan; ``direct``: bearing to it or NaN."""
+    """Return a caller's tracks of echoes extended by a scan.
+
+    ``direct``: bearing of its direct call and std, or NaN.
+    """
     now, (x, y, heading) = len(tracks.poses), pose
     ones = np.ones(len(rows.bearing))
     seen = np.column_stack(
         (now * ones, rows.bearing + heading, *rows[2:3], *rows[1:2], *rows[3:], x * ones, y * ones)
     )
     going = np.flatnonzero(now - tracks.last[:, 0, AT_SCAN] <= SILENT)
-    of = nearest(_costs(seen, tracks.last[going], (now, x, y)))
+    of = nearest(_costs(seen, tracks.last[going], (now, x, y), model))
     track = np.where(of == NOTHING, NOTHING, going[of] if going.size else NOTHING)
     fresh = (track == NOTHING) & (seen[:, AT_BEARING_STD] < NEW_BEARING_STD)
     fresh &= seen[:, AT_WAY_STD] < NEW_WAY_STD
@@ -97,7 +105,7 @@ def followed(
         tracks,
         poses=np.vstack([tracks.poses, pose]),
         times=np.append(tracks.times, time),
-        direct=np.append(tracks.direct, direct + heading),
+        direct=np.vstack([tracks.direct, direct + np.array([heading, 0.0])]),
         rows=(*tracks.rows, np.column_stack((track[kept], columns))),
         last=last,
     )
@@ -107,6 +115,7 @@ def _costs(
     seen: Float[np.ndarray, "m 8"],
     last: Float[np.ndarray, "t 3 8"],
     here: tuple[int, float, float],
+    model: Model,
 ) -> Float[np.ndarray, "m t"]:
     """Return the cost of continuing each track by each measurement; infinite beyond the gate."""
     latest, earlier, (now, x, y) = last[:, 0], last[:, -1], here
@@ -120,24 +129,28 @@ def _costs(
     off = wrap(seen[:, [AT_BEARING]] - bearing), seen[:, [AT_WAY]] - way
     strayed = gone / np.where(even, 15.0, 6.0), gone * np.where(even, 0.3, 1.0)
     across = seen[:, [AT_BEARING_STD]] ** 2 + latest[:, AT_BEARING_STD] ** 2
-    across = across + TURN**2 * scans + strayed[0] ** 2
-    along = seen[:, [AT_WAY_STD]] ** 2 + latest[:, AT_WAY_STD] ** 2 + strayed[1] ** 2 + TURN**2
+    across = across + model[1] ** 2 * scans + strayed[0] ** 2
+    along = seen[:, [AT_WAY_STD]] ** 2 + latest[:, AT_WAY_STD] ** 2 + strayed[1] ** 2
+    along = along + model[0] ** 2 * scans
     squared = off[0] ** 2 / across + off[1] ** 2 / along
     squared = squared + ((seen[:, [AT_LEVEL]] - latest[:, AT_LEVEL]) / LEVEL_STD) ** 2
-    costs = squared + np.log(across * along) + 2.0 * np.log(2.0 * np.pi * CLUTTER)
+    costs = squared + np.log(across * along) + 2.0 * np.log(2.0 * np.pi * model[4])
     return np.where(squared < GATE, costs, np.inf)
 
 
 def in_window(
-    tracks: Tracks, scans: int, sightings: int
-) -> tuple[Float[np.ndarray, "t k 4"], Float[np.ndarray, "k 3"], Float[np.ndarray, " k"]]:
-    """Return a caller's often detected tracks in recent scans, with poses and direct bearings."""
+    tracks: Tracks, scans: int
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, Float[np.ndarray, "t k 4"]]:
+    """Return times, poses, direct bearings and tracks of a caller's last scans.
+
+    Tracks with a single measurement are left out: they contain no information.
+    """
     window = tracks.rows[-scans:]
     table = np.full((len(tracks.last), len(window), 4), np.nan)
     for k, rows in enumerate(window):
         table[rows[:, 0].astype(np.int64), k] = rows[:, 1:]
-    often = np.count_nonzero(~np.isnan(table[..., 0]), axis=1) >= sightings
-    return table[often], tracks.poses[-scans:], tracks.direct[-scans:]
+    often = np.count_nonzero(~np.isnan(table[..., 0]), axis=1) > 1
+    return tracks.times[-scans:], tracks.poses[-scans:], tracks.direct[-scans:], table[often]
 
 
 BESIDE, ASIDE = 0.96, 0.5
@@ -397,8 +410,8 @@ class CallerPlace(NamedTuple):
     """Time of the position [s]."""
     since: float = -math.inf
     """First time at which position and motion are valid [s]."""
-    agreed: bool = False
-    """Whether the search is finished."""
+    std: float = 0.0
+    """Std of its range, relative to it."""
 
     def at(self, time: float) -> tuple[float, float]:
         """Return the caller's position [m] at a time [s], by constant acceleration."""
@@ -446,3 +459,21 @@ class Memory:
     """Callers by number."""
     early: tuple[EarlyScan, ...] = ()
     """Scans that wait for a settled map."""
+    pose: Gaussian | None = None
+    """Predicted pose of the last scan."""
+    drift: tuple[float, float] = (0.0, 0.0)
+    """Largest stds of the change of a predicted pose's error between two scans [m, rad]."""
+
+
+def drift_of(memory: Memory, pose: Gaussian) -> tuple[float, float]:
+    r"""Return the largest stds of the change of a predicted pose's error up to a scan [m, rad].
+
+    The change has the covariance :math:`P - F P^- F^T` before there is a map.
+    """
+    if memory.pose is None:
+        return memory.drift
+    (dx, dy, _), F = pose.mean - memory.pose.mean, np.eye(3)
+    F[:2, 2] = -dy, dx
+    grown = np.diag(pose.covariance - F @ memory.pose.covariance @ F.T)
+    along, turn = math.sqrt(max(grown[0] + grown[1], 0.0)), math.sqrt(max(grown[2], 0.0))
+    return max(along, memory.drift[0]), max(turn, memory.drift[1])

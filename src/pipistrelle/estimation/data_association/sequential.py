@@ -17,6 +17,8 @@ from jaxtyping import Bool, Float, Int
 
 from pipistrelle.config import Config, InputError
 from pipistrelle.detection.scans import (
+    BEARING,
+    BEARING_STD,
     OWN,
     RANGE,
     RANGE_STD,
@@ -34,7 +36,7 @@ from pipistrelle.estimation.data_association.caller_search import (
     direct_row,
     labelled_by_map,
     may_have_turned,
-    searched,
+    place_caller,
     turned,
 )
 from pipistrelle.estimation.data_association.existence import (
@@ -69,9 +71,11 @@ from pipistrelle.estimation.data_association.rows import (
     EarlyScan,
     Joint,
     Memory,
+    Model,
     Tracks,
     bearing_fits,
     compared,
+    drift_of,
     followed,
     label_matched,
     part_of,
@@ -80,8 +84,6 @@ from pipistrelle.estimation.data_association.rows import (
     rows_of_scan,
 )
 
-PLACE_SHARE, MOVING_SHARE = 0.12, 0.2
-"""Std of the range of a found caller, stationary or moving, relative to the range."""
 DIRECT_GATE = 9.0
 """Gate on the squared distance of a caller's direct call."""
 PROBATION = 40
@@ -138,6 +140,8 @@ class Sequential(Association[Memory]):
     chances: PlainChances
     """`pairs.Chances` as a tuple."""
     limits: Limits = Limits()
+    motion: tuple[float, float] = (1.0, 0.2)
+    """Stds of a moving caller's initial velocity [m/s] and of its change in a second [m/s]."""
 
     def start(self) -> Memory:
         """Return the empty memory of data association before the first scan."""
@@ -158,7 +162,7 @@ class Sequential(Association[Memory]):
         rows = zip(known.landmark.tolist(), known.mean.tolist(), strict=True)
         stated = {
             numbers[label]: CallerState(
-                label=label, place=CallerPlace(x, y, agreed=True), told=True, since=-PROBATION - 1
+                label=label, place=CallerPlace(x, y), told=True, since=-PROBATION - 1
             )
             for label, (x, y) in rows
             if label in numbers
@@ -185,7 +189,11 @@ class _Work:
     def __init__(self, stage: Sequential, memory: Memory, belief: Belief, scan: Scan) -> None:
         self.stage, self.memory, self.scan = stage, memory, scan
         self.joint: JointGaussian = belief.joint()
-        self.pose, limits = self.joint.mean[:3], stage.limits
+        self.pose = Gaussian(
+            mean=self.joint.mean[:3].copy(), covariance=self.joint.covariance[:3, :3].copy()
+        )
+        drift, limits = drift_of(memory, self.pose), stage.limits
+        self.model: Model = (*drift, *stage.motion, stage.chances[1] / stage.chances[3])
         self.label = np.full(scan.landmark.size, UNLABELLED)
         self.labels, self.callers = memory.labels, dict(memory.callers)
         self.numbers, self.named = scan.numbers, np.full(scan.direct.size, UNLABELLED)
@@ -204,8 +212,9 @@ class _Work:
             if number == OWN or (row < 0 and number not in self.callers):
                 continue
             caller = self.callers.get(number) or CallerState(label=self._another())
-            if caller.place is None or (caller.told and not caller.place.agreed):
-                caller, place = searched(self._followed(number, caller, row), number in self.moves)
+            if caller.place is None:
+                caller = self._followed(number, caller, row)
+                place = place_caller(caller.tracks, number in self.moves, self.model)
                 if place is not None:
                     news[number] = place
             self.callers[number] = caller
@@ -214,9 +223,10 @@ class _Work:
     def _followed(self, number: int, caller: CallerState, row: int) -> CallerState:
         """Add this scan's measurements to the tracks of an unlocated caller; return its record."""
         rows = self._some(self.rows.with_way & (self.scan.caller == number))
-        direct = self.scan.bearing[row] if row >= 0 else math.nan
-        tracks = followed(caller.tracks, self.scan.time, self.pose, direct, rows)
-        return replace(caller, tracks=tracks)
+        numbers = self.scan.numbers[[BEARING, BEARING_STD]]
+        direct = numbers[:, row] if row >= 0 else np.full(2, math.nan)
+        time, pose = self.scan.time, self.pose.mean
+        return replace(caller, tracks=followed(caller.tracks, time, pose, direct, rows, self.model))
 
     def match(self, number: int) -> None:
         """Match a caller's measurements with landmarks; begin landmarks where none fits."""
@@ -301,6 +311,8 @@ class _Work:
             known=merged(known, merge),
             callers=self.callers,
             early=early,
+            pose=self.pose,
+            drift=self.model[:2],
         )
         return after, Assignment(
             label=self.label, remove=remove, merge=merge, scan=scan, earlier=earlier
@@ -321,8 +333,7 @@ class _Work:
         landmarks = self.memory.known.label.size + len(self.new)
         if placed or landmarks >= FEW or len(early) == MOST:
             return early
-        pose = Gaussian(mean=self.pose, covariance=self.joint.covariance[:3, :3])
-        return *early, EarlyScan(number, scan, self.rows, self.scan.direct, pose)
+        return *early, EarlyScan(number, scan, self.rows, self.scan.direct, self.pose)
 
     def _labelled_by_map(self, early: tuple[EarlyScan, ...], known: Known) -> dict[int, Scan]:
         """Label early scans by the map; return them by number, none if no caller is mapped."""
@@ -393,10 +404,9 @@ class _Work:
         if caller.place is None or row < 0 or self.scan.time < caller.place.since:
             return
         x, y = caller.place.at(self.scan.time)
-        far = math.hypot(x - self.pose[0], y - self.pose[1])
+        far = math.hypot(x - self.pose.mean[0], y - self.pose.mean[1])
         self.numbers = self.numbers.copy()
-        share = MOVING_SHARE if number in self.moves else PLACE_SHARE
-        self.numbers[RANGE, row], self.numbers[RANGE_STD, row] = far, share * far
+        self.numbers[RANGE, row], self.numbers[RANGE_STD, row] = far, caller.place.std * far
         self.label[row] = self.named[number] = caller.label
         told = replace(caller, told=True, tracks=Tracks(), since=self.memory.scan)
         self.callers[number] = told
@@ -505,7 +515,8 @@ def association_of(config: Config) -> Association | None:
             assumed=_assumed(config),
             sight=(settings.max_range or 0.0, settings.field_of_view),
         )
-        return Sequential(match=METHODS[name], chances=tuple(chances), limits=limits)
+        motion = told.caller_speed_std, told.caller_walk_std
+        return Sequential(match=METHODS[name], chances=tuple(chances), limits=limits, motion=motion)
     if not names_class(name):
         expected = ", ".join(map(repr, [KNOWN, *METHODS]))
         raise InputError(f"association.method: found {name!r}, expected {expected} or module:Class")
