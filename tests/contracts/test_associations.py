@@ -29,6 +29,7 @@ SHORT = (
 )
 JOINT = '''
 from dataclasses import dataclass, field
+from itertools import combinations
 
 import numpy as np
 
@@ -61,14 +62,12 @@ class Joint:
         if joint.landmark.size:
             callers = np.where(scan.direct >= 0, CALLER, -1)
             pairs = expected(joint, scan, rows.ravel(), there.ravel(), callers)
-            d2 = [self.distance(pairs, n) for n in range(rows.size)]
-            d2 = np.reshape(d2, rows.shape)
-            best = d2.argmin(axis=1)
+            d2 = np.reshape([self.distance(pairs, n) for n in range(rows.size)], rows.shape)
             near = d2.min(axis=1) < self.gate
-            label[near] = joint.landmark[best[near]]
-        for m in np.flatnonzero((label == UNLABELLED) & ~np.isnan(scan.range)):
-            last += 1
-            label[m] = last
+            label[near] = joint.landmark[d2.argmin(axis=1)[near]]
+        fresh = (label == UNLABELLED) & ~np.isnan(scan.range)
+        label[fresh] = last + np.arange(1, 1 + fresh.sum())
+        last += int(fresh.sum())
         label[scan.direct[scan.direct >= 0]] = CALLER
         for name in set(label.tolist()) - {UNLABELLED, CALLER}:
             heard[name] = (heard.get(name, (0, 0))[0] + 1, memory.scan)
@@ -80,9 +79,8 @@ class Joint:
         for name in (*remove, *(gone for _, gone in merge)):
             heard.pop(name, None)
         label[np.isin(label, [gone for _, gone in merge])] = UNLABELLED
-        return Memory(memory.scan + 1, last, heard), Assignment(
-            label=label, remove=remove, merge=merge
-        )
+        found = Assignment(label=label, remove=remove, merge=merge)
+        return Memory(memory.scan + 1, last, heard), found
 
     def distance(self, pairs, n):
         difference, covariance = pairs.difference[n], pairs.covariance[n, :, n]
@@ -93,13 +91,12 @@ class Joint:
         return nu @ np.linalg.solve(S, nu)
 
     def doubles(self, joint, others):
-        points, taken, pairs = joint.mean[3:].reshape(-1, 2), set(others), []
-        for a in range(len(points)):
-            for b in range(a):
-                labels = int(joint.landmark[b]), int(joint.landmark[a])
-                if np.hypot(*(points[a] - points[b])) < self.nearest and not taken & {*labels}:
-                    pairs.append(labels)
-                    taken |= {*labels}
+        places, taken, pairs = joint.mean[3:].reshape(-1, 2), set(others), []
+        points = zip(joint.landmark.tolist(), places, strict=True)
+        for (a, one), (b, other) in combinations(points, 2):
+            if np.hypot(*(one - other)) < self.nearest and not taken & {a, b}:
+                pairs.append((a, b))
+                taken |= {a, b}
         return tuple(pairs)
 '''
 

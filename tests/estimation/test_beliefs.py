@@ -69,8 +69,8 @@ def test_an_association_of_an_outside_class_has_defaults_for_missing_methods():
     association = completed(Noted(), Association)
     assert association.knowing("memory", no_landmarks(), ()) == "memory"
     assert [*association.tentative("memory")] == []
-    with pytest.raises(InputError, match=r"but a Noted has no informed\(memory, news\)"):
-        association.informed("memory", None)
+    with pytest.raises(InputError, match=r"but a Noted has no carried\(memory, later\)"):
+        association.carried("memory", None)
 
 
 def test_only_a_smoother_revises_its_path():

@@ -5,11 +5,14 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 import pytest
 
-from pipistrelle.config import Config, InputError
+from pipistrelle.config import Config
 from pipistrelle.detection.scans import RANGE, UNLABELLED, make_scan
 from pipistrelle.estimation.association import Assignment
 from pipistrelle.estimation.beliefs import Gaussian
 from pipistrelle.estimation.catalogue import CATALOGUE, entry
+from pipistrelle.estimation.data_association.pairs import nearest
+from pipistrelle.estimation.data_association.rows import CallerPlace, CallerState, Memory
+from pipistrelle.estimation.data_association.sequential import Sequential
 from pipistrelle.estimation.motion import Motion
 from pipistrelle.estimation.session import REMEMBERED, Session
 from pipistrelle.estimation.smoother.history import STRETCH
@@ -27,18 +30,15 @@ class Script:
     labels: dict
     remove: dict = field(default_factory=dict)
     merge: dict = field(default_factory=dict)
-    again: dict = field(default_factory=dict)
-    earlier: dict = field(default_factory=dict)
+    revised: dict = field(default_factory=dict)
 
     def start(self):
         return 0
 
     def associate(self, number, belief, scan):
         label = np.array(self.labels.get(number, [1, 2, 3])[: scan.landmark.size])
-        return number + 1, Assignment(
-            label=label, remove=self.remove.get(number, ()), merge=self.merge.get(number, ()),
-            again=self.again.get(number), earlier=self.earlier.get(number, {}),
-        )  # fmt: skip
+        more = {key: getattr(self, key).get(number, ()) for key in ("remove", "merge")}
+        return number + 1, Assignment(label=label, revised=self.revised.get(number, {}), **more)
 
 
 def driven(name, script, scans=10, ghosts=()):
@@ -52,26 +52,28 @@ def driven(name, script, scans=10, ghosts=()):
         session.move(np.array([[0.4, 0.05]]), np.array([0.5]))
         places = np.vstack([PLACES, [-3.0 + 0.3 * k, 2.0]]) if k in ghosts else PLACES
         off = places - [0.2 * (k + 1), 0.0]
-        noise = rng.normal(0.0, 0.02, (2, 4))[:, : len(off)]
-        heard = {"range": np.hypot(*off.T) + noise[1], "bearing_std": 0.02, "range_std": 0.05}
-        bearing = np.arctan2(off[:, 1], off[:, 0]) + noise[0]
-        session.hear(make_scan(float(k), np.full(len(off), UNLABELLED), bearing, **heard))
+        noise, stds = rng.normal(0.0, 0.02, (2, 4)), {"bearing_std": 0.02, "range_std": 0.05}
+        bearing, far = (np.arctan2(off[:, 1], off[:, 0]), np.hypot(*off.T)) + noise[:, : len(off)]
+        unknown = np.full(len(off), UNLABELLED)
+        session.hear(make_scan(float(k), unknown, bearing, range=far, **stds))
     return session
+
+
+def assert_same(session, other):
+    one, other = session.belief.joint(), other.belief.joint()
+    assert one.landmark.tolist() == other.landmark.tolist()
+    np.testing.assert_allclose(one.mean, other.mean, atol=1e-7)
+    np.testing.assert_allclose(one.covariance, other.covariance, atol=1e-8)
 
 
 @pytest.mark.parametrize("name", ["ekf", "iekf", "smoother"])
 @pytest.mark.parametrize("ghosts", [(2,), (2, 3, 4)])
 def test_a_removed_ghost_landmark_leaves_no_trace(name, ghosts):
-    labels = {k: [1, 2, 3, GHOST] for k in ghosts}
-    haunted = driven(name, Script(labels, remove={GONE_AT: (GHOST,)}), ghosts=ghosts)
+    labels = {k: [1, 2, 3, GHOST if k < 4 else 8] for k in ghosts}
+    merge = {5: ((GHOST, 8),)} if 4 in ghosts else {}
+    haunted = driven(name, Script(labels, {GONE_AT: (GHOST,)}, merge), ghosts=ghosts)
     plain = driven(name, Script({}))
-    for one, other in (
-        (haunted.belief.pose(), plain.belief.pose()),
-        (haunted.belief.landmarks(), plain.belief.landmarks()),
-    ):
-        np.testing.assert_allclose(one.mean, other.mean, atol=1e-7)
-        np.testing.assert_allclose(one.covariance, other.covariance, atol=1e-8)
-    assert GHOST not in haunted.belief.labels()
+    assert_same(haunted, plain)
     assert haunted.labels[2].tolist() == [1, 2, 3, UNLABELLED]
 
 
@@ -79,7 +81,7 @@ def test_a_removed_ghost_landmark_leaves_no_trace(name, ghosts):
 def test_a_landmark_from_before_all_that_is_remembered_is_removed_too(name):
     ghosts = STRETCH + 2, STRETCH + 5
     late = ghosts[1] + STRETCH + REMEMBERED
-    script = Script({k: [1, 2, 3, GHOST] for k in ghosts}, remove={late: (GHOST,)})
+    script = Script({k: [1, 2, 3, GHOST] for k in ghosts}, {late: (GHOST,)})
     session = driven(name, script, scans=late + 3, ghosts=ghosts)
     belief = session.belief
     assert GHOST not in belief.labels()
@@ -92,14 +94,13 @@ def test_a_landmark_from_before_all_that_is_remembered_is_removed_too(name):
 
 @pytest.mark.parametrize("name", CATALOGUE)
 def test_two_labels_of_one_landmark_become_one(name):
-    labels = {k: [1, 2, 7] for k in range(4)}
-    session = driven(name, Script(labels, merge={7: ((3, 7),)}))
+    labels = {key: [1, 2, 7, GHOST] for key in range(4)}
+    session = driven(name, Script(labels, {8: (GHOST,)}, {7: ((3, 7),)}), ghosts=(2,))
     assert sorted(session.belief.labels()) == [1, 2, 3]
-    plain = driven(name, Script({}))
-    np.testing.assert_allclose(session.belief.pose().mean, plain.belief.pose().mean, atol=0.1)
-    found = session.belief.landmarks()
-    place = found.mean[found.landmark.tolist().index(3)]
-    assert np.hypot(*(place - PLACES[2])) < 0.3
+    assert session.labels[2].tolist() == [1, 2, 3, UNLABELLED]
+    pose, found = driven(name, Script({})).belief.pose().mean, session.belief.landmarks()
+    np.testing.assert_allclose(session.belief.pose().mean, pose, atol=0.1)
+    assert np.hypot(*(found.mean[found.landmark == 3][0] - PLACES[2])) < 0.3
 
 
 @pytest.mark.parametrize("name", CATALOGUE)
@@ -111,79 +112,91 @@ def test_the_joint_gaussian_contains_the_pose_and_map_of_the_belief(name):
     np.testing.assert_allclose(joint.covariance[:3, :3], pose.covariance, atol=1e-6)
     np.testing.assert_allclose(joint.covariance, joint.covariance.T, atol=1e-12)
     assert np.linalg.eigvalsh(joint.covariance).min() > -1e-12
-    error = joint.mean[3:].reshape(-1, 2) - PLACES[joint.landmark - 1]
-    assert np.abs(error).max() < 0.5
+    assert np.abs(joint.mean[3:].reshape(-1, 2) - PLACES[joint.landmark - 1]).max() < 0.5
 
 
 @pytest.mark.parametrize("name", ["ekf", "iekf", "smoother"])
 def test_a_scan_revised_later_equals_a_scan_revised_at_once(name):
     heard = driven(name, Script({})).state().past[1].original
-    stated = replace(
-        heard, landmark=np.array([7, 2, UNLABELLED]), numbers=heard.numbers + np.zeros((8, 1))
-    )
-    stated.numbers[RANGE, 0] += 0.03
+    numbers = heard.numbers + 0.03 * (np.arange(8)[:, np.newaxis] == RANGE) * [1, 0, 0]
+    stated = replace(heard, landmark=np.array([7, 2, UNLABELLED]), numbers=numbers)
     first = {1: [1, UNLABELLED, UNLABELLED]}
-    late = driven(name, Script(first, earlier={GONE_AT: {1: stated, -40: stated}}))
-    at_once = driven(name, Script(first, earlier={2: {1: stated}}))
+    late = driven(name, Script(first, revised={GONE_AT: {1: stated, -40: stated}}))
+    at_once = driven(name, Script(first, revised={2: {1: stated}}))
     assert late.labels[1].tolist() == [1, 2, UNLABELLED], "a row that has a label keeps it"
     plain = driven(name, Script(first))
     assert np.abs(plain.belief.pose().mean - late.belief.pose().mean).max() > 1e-5
-    for one, other in (
-        (late.belief.pose(), at_once.belief.pose()),
-        (late.belief.landmarks(), at_once.belief.landmarks()),
-    ):
-        np.testing.assert_allclose(one.mean, other.mean, atol=1e-7)
-        np.testing.assert_allclose(one.covariance, other.covariance, atol=1e-8)
+    assert_same(late, at_once)
 
 
-class Informed(Script):
-    """Calls the second landmark another name once that is known."""
+@dataclass(frozen=True)
+class Finder:
+    """Finds facts one after the other, each at one scan, and names landmarks by their number."""
+
+    found: tuple
+    since: int = 0
 
     def start(self):
-        return (0, 2)
+        return 0, 0
 
-    def informed(self, memory, news):
-        return (memory[0], news)
+    def carried(self, memory, later):
+        return memory[0], later[1]
 
     def associate(self, memory, belief, scan):
-        number, name = memory
-        again = 5 if number == GONE_AT and name == 2 else None
-        return (number + 1, name), Assignment(label=np.array([1, name, 3]), again=again)
+        number, facts = memory
+        new = number in self.found[facts : facts + 1]
+        label = np.arange(1, 4) + 10 * (facts + new)
+        revised = {self.since: None} if new else {}
+        return (number + 1, facts + new), Assignment(label=label, revised=revised)
 
 
 @pytest.mark.parametrize("name", ["ekf", "iekf", "smoother"])
-def test_remembered_scans_are_associated_again_with_new_information(name):
-    session = driven(name, Informed({}))
-    assert all(label.tolist() == [1, 5, 3] for label in session.labels)
-    assert len(session.labels) == 10
-    plain = driven(name, Script({k: [1, 5, 3] for k in range(10)}))
-    np.testing.assert_allclose(session.belief.pose().mean, plain.belief.pose().mean, atol=1e-12)
+@pytest.mark.parametrize(
+    ("found", "since", "facts"),
+    [
+        ((6,), 3, [0] * 3 + [1] * 7),
+        ((0,), 0, [1] * 10),
+        ((6, 4), 0, [2] * 10),
+        ((6, 6), 0, [1] * 6 + [2] * 4),
+    ],
+    ids=["later", "first", "within a repetition", "once by a scan"],
+)
+def test_remembered_scans_are_associated_again_with_later_facts(name, found, since, facts):
+    session = driven(name, Finder(found, since))
+    labels = [[1 + 10 * number, 2 + 10 * number, 3 + 10 * number] for number in facts]
+    assert [label.tolist() for label in session.labels] == labels
+    assert session.state().memory == (10, len(found))
+    assert_same(session, driven(name, Script(dict(enumerate(labels)))))
 
 
-def test_an_association_that_cannot_be_informed_is_refused():
-    with pytest.raises(InputError, match=r"a Script has no informed\(memory, news\)"):
-        driven("ekf", Script({}, again={GONE_AT: 5}))
-
-
-class Renamed(Informed):
-    """Removes a landmark, then is informed, and gives its label to another."""
+class Renamed(Finder):
+    """Removes a landmark, finds a fact, gives the label to another, and removes two more."""
 
     def associate(self, memory, belief, scan):
-        number, name = memory
-        if name == 5:
-            return (number + 1, name), Assignment(label=np.array([1, GHOST, 3]))
-        ghost = [1, 2, 3, GHOST][: scan.landmark.size]
-        remove = (GHOST,) if number == 4 else ()
-        again = 5 if number == GONE_AT else None
-        return (number + 1, name), Assignment(label=np.array(ghost), remove=remove, again=again)
+        number, facts = memory
+        after, assignment = super().associate(memory, belief, scan)
+        third = UNLABELLED if number < 3 else 8 if number in (6, 7) and after[1] else 3
+        label = [1, GHOST, third] if after[1] else [1, 2, third, GHOST]
+        remove = {(6, 0): (GHOST,), (9, 1): (3,), (10, 1): (8,)}.get((number, facts), ())
+        label = np.array(label[: scan.landmark.size])
+        return after, replace(assignment, label=label, remove=remove)
 
 
 def test_a_removed_label_may_be_assigned_again():
-    session = driven("iekf", Renamed({}), ghosts=())
-    assert sorted(session.belief.labels()) == [1, 3, GHOST]
-    haunted = driven("iekf", Renamed({}), scans=6, ghosts=(2,))
-    assert sorted(haunted.belief.labels()) == [1, 2, 3]
-    last = session.labels[-1].copy()
-    session._remove((3,))
-    assert sorted(session.belief.labels()) == [1, GHOST], "and no more goes than is asked for"
-    assert last.tolist() == [1, GHOST, 3]
+    session = driven("iekf", Renamed((7,), 5), scans=12, ghosts=(2,))
+    labels = [[1, 2, -1]] * 5 + [[1, GHOST, -1]] * 4 + [[1, GHOST, 3]] * 3
+    plain = driven("iekf", Script(dict(enumerate(labels))), scans=12)
+    assert [label[:3].tolist() for label in session.labels] == labels
+    assert_same(session, plain)
+
+
+def test_a_place_is_carried_once():
+    place = CallerPlace(3.0, 4.0)
+    told = CallerState(label=5, place=place, told=True)
+    agreed = replace(told, place=place._replace(agreed=True))
+    others = {2: CallerState(label=9, place=place), 3: CallerState(label=11)}
+    stage = Sequential(match=nearest, chances=(25.0, 0.06, 1.3, 0.8, 0.02))
+    after = stage.carried(Memory(labels=7, callers={1: told}), Memory(callers={1: agreed} | others))
+    assert {*after.callers} == {1, 2}
+    assert (after.callers[1], after.callers[2].place) == (told, place)
+    assert after.callers[2].label == after.labels == 8

@@ -10,7 +10,7 @@ predicts measurements from the joint Gaussian of the belief, as they share the e
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any, Generic, TypeVar
+from typing import Generic, TypeVar
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -42,12 +42,11 @@ class Assignment:
     scan: Scan | None = None
     """The scan with changes by the association, such as callers' labels or a caller's range; the
     same measurements in the same order."""
-    again: Any = None
-    """Information on earlier scans, or None. It makes the session associate all scans in its memory
-    again, with memories changed by ``informed``."""
-    earlier: Mapping[int, Scan] = field(default_factory=dict)
-    """Earlier scans, by number from 0, with changes or new labels: the session repeats them, and
-    all later scans, before the update."""
+    revised: Mapping[int, Scan | None] = field(default_factory=dict)
+    """Earlier scans, by number from 0: with changes, or labels for measurements without; the
+    session repeats them, and all later scans, before the update. None makes it associate the scan
+    and all later ones again, from the memory before it as changed by ``carried``, and ignore the
+    rest of the assignment."""
 
 
 class Association(ABC, Generic[M]):
@@ -66,11 +65,11 @@ class Association(ABC, Generic[M]):
     def associate(self, memory: M, belief: Belief, scan: Scan) -> tuple[M, Assignment]:
         """Return the new memory and a scan's assignment to landmarks; change no argument."""
 
-    def informed(self, memory: M, news: Any) -> M:
-        """Add information from a later scan to an earlier memory, and return the memory."""
+    def carried(self, memory: M, later: M) -> M:
+        """Return an earlier memory with the facts that a later one adds, as callers' positions."""
         raise InputError(
             f"association: found scans to be associated again, but a {type(self).__name__} has no "
-            "informed(memory, news)"
+            "carried(memory, later)"
         )
 
     def knowing(self, memory: M, known: Landmarks, callers: Int[np.ndarray, " c"]) -> M:

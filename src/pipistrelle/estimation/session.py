@@ -1,11 +1,11 @@
 """Session: runs an estimator over control steps and scans, with optional data association.
 
 Beliefs are immutable, so data association may revise its decisions: the session stores the last
-`REMEMBERED` scans with the beliefs before them, returns to these beliefs and repeats the scans.
+`REMEMBERED` scans with the beliefs before them, returns to the first that is revised, and repeats
+it and all later scans, with their labels or with data association.
 """
 
-from collections import deque
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Generic, NamedTuple
 
@@ -53,7 +53,9 @@ class StoredScan:
     scan: Scan
     """The scan as changed by the association (`Assignment.scan`)."""
     label: Int[np.ndarray, " m"]
-    merge: tuple[tuple[int, int], ...]
+    merge: tuple[tuple[int, int], ...] = ()
+    remove: tuple[int, ...] = ()
+    """Landmarks that are on no map from this scan on; beliefs before may still contain them."""
 
 
 class SessionState(NamedTuple):
@@ -68,7 +70,6 @@ class SessionState(NamedTuple):
     legs: Sequence[Leg]
     open: Any
     """Belief and random state before the last control steps, if further steps may join them."""
-    dropped: Collection[int]
     labels: Sequence[Int[np.ndarray, " m"]]
     first: int
     """Number of the scan with the first entry of `labels`."""
@@ -131,11 +132,10 @@ class Session(Generic[B]):
         live: bool = False,
     ) -> None:
         self._estimator, self._rng = estimator, rng
-        self._association = completed(association, Association) if association else None
+        self._association: Any = completed(association, Association) if association else None
         self._memory, self._noise = association.start() if association else None, noise
-        self._past: deque[StoredScan] = deque(maxlen=REMEMBERED)
+        self._past: list[StoredScan] = []
         self._legs: list[Leg] = []
-        self._dropped: set[int] = set()
         self.labels: list[Int[np.ndarray, " m"]] = []
         self._live, self._first = live, 0
         self._open: tuple[B, Mapping[str, Any]] | None = None
@@ -168,11 +168,21 @@ class Session(Generic[B]):
         if self._association is None:
             self._legs = []
             return self._update(scan)
-        memory, assignment = self._associate(scan)
-        if assignment.again is not None and self._past:
-            self._associate_again(self._association, assignment.again)
-            memory, assignment = self._associate(scan)
-        return self._store(scan, memory, assignment)
+        new = StoredScan(
+            number=self._first + len(self.labels),
+            legs=self._legs,
+            belief=self.belief,
+            memory=self._memory,
+            original=scan,
+            scan=scan,
+            label=scan.landmark,
+        )
+        used = self._associated([*self._past, new])
+        self._legs = []
+        if self._live and (old := len(self.labels) - REMEMBERED) > 0:
+            del self.labels[:old]
+            self._first += old
+        return used
 
     def landmarks(self) -> Landmarks:
         """Return the map, without landmarks that data association considers uncertain."""
@@ -191,7 +201,6 @@ class Session(Generic[B]):
             past=tuple(self._past),
             legs=tuple(self._legs),
             open=self._open,
-            dropped=frozenset(self._dropped),
             labels=tuple(self.labels),
             first=self._first,
         )
@@ -200,9 +209,8 @@ class Session(Generic[B]):
         """Restore a session from a snapshot (`state`) of a session with the same settings."""
         self.belief, self._memory, self._first = state.belief, state.memory, state.first
         self._rng.bit_generator.state = state.draws
-        self._past = deque(state.past, maxlen=REMEMBERED)
-        self._legs, self._open, self._dropped = [*state.legs], state.open, {*state.dropped}
-        self.labels = [*state.labels]
+        self._past, self._legs = [*state.past], [*state.legs]
+        self._open, self.labels = state.open, [*state.labels]
 
     def _move(self, controls: Controls, dt: Durations) -> Gaussian:
         """Predict the belief through control steps by the estimator; return the poses."""
@@ -239,47 +247,85 @@ class Session(Generic[B]):
         self.belief = belief
         return used
 
-    def _associate(self, scan: Scan) -> tuple[Any, Assignment]:
-        """Run data association on a scan; return its new memory and the assignment of labels."""
-        assert self._association is not None, "hear asks only where there is one"
+    def _associated(self, past: list[StoredScan]) -> Scan:
+        """Associate the last of these scans, repeat the scans that it revises, and use it.
+
+        A repeated scan may extend the repetition, once.
+        """
+        n = first = undecided = len(past) - 1
+        asked: set[int] = set()
+        while True:
+            if n == undecided:
+                back, undecided = self._decided(past, n, asked)
+                if (back, undecided) != (n, n + 1):
+                    removed = {label for one in past[back : n + 1] for label in one.remove}
+                    self.belief = _edited(past[back].belief, remove=[*removed])
+                    n = first = back
+                    continue
+            merge, since = past[n].merge, 0
+            if n + 1 < undecided:  # a repetition, without absent landmarks
+                merge = tuple(pair for pair in merge if len(_present(self.belief, pair)) == 2)
+                since = past[first].number - self._first
+            past[n] = replace(past[n], belief=self.belief, merge=merge)
+            used, n = self._use(past[n], since), n + 1
+            if n == len(past):
+                self._past = past[-REMEMBERED:]
+                return used
+            for controls, dt in past[n].legs:
+                self._move(controls, dt)
+
+    def _decided(self, past: list[StoredScan], n: int, asked: set[int]) -> tuple[int, int]:
+        """Associate a scan; return the first scans to be repeated and to be associated next."""
+        scan, association = past[n].original, self._association
+        past[n] = replace(past[n], belief=self.belief, memory=self._memory)
         stated = self._noise(scan) if self._noise else scan
-        found = self._association.associate(self._memory, self.belief, stated)
-        if not (isinstance(found, tuple) and len(found) == 2 and type(found[1]) is Assignment):
-            raise _wrong_return(
-                self._association, "associate", found, "the memory and an Assignment"
-            )
-        return found
+        answer = association.associate(self._memory, self.belief, stated)
+        if not (isinstance(answer, tuple) and len(answer) == 2 and type(answer[1]) is Assignment):
+            raise _wrong_return(association, "associate", answer, "the memory and an Assignment")
+        self._memory, found = answer
+        again = [number for number, scan in found.revised.items() if scan is None]
+        if not again or n in asked:
+            return self._revised(past, n, found), n + 1
+        asked.add(n)
+        back = min(max(min(again) - past[0].number, 0), n)
+        self._memory = association.carried(past[back].memory, self._memory)
+        removed = tuple({label for one in past[back:n] for label in one.remove})
+        past[back : n + 1] = [replace(one, remove=()) for one in past[back : n + 1]]
+        past[back] = replace(past[back], remove=removed)  # other labels may be issued again
+        return back, back
 
-    def _store(self, scan: Scan, memory: Any, assignment: Assignment) -> Scan:
-        """Update the belief with a scan and its assigned labels, and store it for revision."""
-        if assignment.remove:
-            self._remove(assignment.remove)
-        past = [*self._past]
-        if changed := [n for n, one in enumerate(past) if one.number in assignment.earlier]:
-            for n in changed:
-                stated, label = assignment.earlier[past[n].number], past[n].label
-                label = np.where(label == UNLABELLED, stated.landmark, label)
-                past[n] = replace(past[n], scan=stated, label=label)
-            self._repeat(past, changed[0])
-        stored = StoredScan(
-            number=self._first + len(self.labels),
-            legs=self._legs,
-            belief=self.belief,
-            memory=self._memory,
-            original=scan,
-            scan=assignment.scan or scan,
-            label=assignment.label,
-            merge=assignment.merge,
+    def _revised(self, past: list[StoredScan], n: int, found: Assignment) -> int:
+        """Apply an assignment to its scan and to earlier scans; return the first to be repeated."""
+        merges = [pair for one in past[:n] for pair in one.merge]
+        remove = (*found.remove, *(gone for kept, gone in merges if kept in found.remove))
+        past[n] = replace(
+            past[n],
+            scan=found.scan or past[n].original,
+            label=found.label,
+            merge=found.merge,
+            remove=(*past[n].remove, *remove),
         )
-        self._past.append(stored)
-        self._memory, self._legs = memory, []
-        used = self._use(stored)
-        if self._live and (old := len(self.labels) - REMEMBERED) > 0:
-            del self.labels[:old]
-            self._first += old
-        return used
+        named, rows = np.array(remove, np.int64), {}
+        for m, one in enumerate(past[:n] if remove or found.revised else ()):
+            scan, label = found.revised.get(one.number) or one.scan, one.label
+            if scan is not one.scan:
+                label = np.where(label == UNLABELLED, scan.landmark, label)
+            gone, callers = is_among(label, named), is_among(scan.callers, named)
+            if scan is not one.scan or gone.any() or callers.any():
+                rows[m] = int(gone.sum())
+                scan = replace(scan, callers=np.where(callers, UNLABELLED, scan.callers))
+                past[m] = replace(one, label=np.where(gone, UNLABELLED, label), scan=scan)
+        once = [*rows.values()] == [len(remove)] and not found.revised
+        if rows and not (once and not _present(past[min(rows)].belief, remove)):
+            return min(rows)
+        # An object measured only once has not affected anything else.
+        self.belief = _edited(self.belief, remove=remove)
+        for at in (past[m].number - self._first for m in rows):
+            label = self.labels[at]
+            self.labels[at] = np.where(is_among(label, named), UNLABELLED, label)
+        return n
 
-    def _use(self, stored: StoredScan, since: int = 0) -> Scan:
+    def _use(self, stored: StoredScan, since: int) -> Scan:
         """Update the belief with a stored scan; merges change the labels from scan ``since`` on."""
         self.labels[stored.number - self._first :] = [stored.label]
         for kept, gone in stored.merge:
@@ -290,69 +336,6 @@ class Session(Generic[B]):
         merged = labelled(scan, stored.label)
         return self._update(self._noise(merged) if self._noise else merged)
 
-    def _remove(self, labels: tuple[int, ...]) -> None:
-        """Remove landmarks from the belief and the stored scans, repeating scans if necessary."""
-        past = [*self._past]
-        labels = (*labels, *(gone for one in past for kept, gone in one.merge if kept in labels))
-        named = np.array(labels)
-        rows = [int(is_among(one.label, named).sum()) for one in past]
-        heard = [
-            n for n, one in enumerate(past) if rows[n] or is_among(one.scan.callers, named).any()
-        ]
-        self._dropped.update(labels)
-        for n in heard:
-            label, callers = (
-                np.where(is_among(of, named), UNLABELLED, of)
-                for of in (past[n].label, past[n].scan.callers)
-            )
-            past[n] = replace(past[n], label=label, scan=replace(past[n].scan, callers=callers))
-        once = sum(rows) == len(labels) and len(heard) == 1
-        if heard and not (once and not _present(past[heard[0]].belief, labels)):
-            self._repeat(past, heard[0])
-            return
-        # An object measured only once has not affected anything else.
-        self.belief = _without(self.belief, labels)
-        for n in heard:
-            self.labels[past[n].number - self._first] = past[n].label
-        self._past = deque(past, maxlen=REMEMBERED)
-
-    def _repeat(self, past: list[StoredScan], first: int) -> None:
-        """Restore the belief before a stored scan, and repeat all scans from it on, as changed."""
-        self.belief = _without(past[first].belief, [*self._dropped])
-        since = past[first].number - self._first
-        for n in range(first, len(past)):
-            if n > first:
-                self._move_again(past[n].legs)
-            merge = past[n].merge  # without absent landmarks
-            if merge:
-                held = {*_present(self.belief, [label for pair in merge for label in pair])}
-                merge = tuple(pair for pair in merge if {*pair} <= held)
-            past[n] = replace(past[n], belief=self.belief, merge=merge)
-            self._use(past[n], since)
-        self._move_again(self._legs)
-        self._past = deque(past, maxlen=REMEMBERED)
-
-    def _associate_again(self, association: Association[Any], news: Any) -> None:
-        """Repeat data association and updates for all stored scans, given new information."""
-        past, legs = list(self._past), self._legs
-        memory = association.informed(past[0].memory, news)
-        self._past.clear()
-        del self.labels[past[0].number - self._first :]
-        self.belief = _without(past[0].belief, [*self._dropped])
-        self._dropped, self._memory = set(), memory  # labels may be reused
-        for one in past:
-            if one is not past[0]:
-                self._move_again(one.legs)
-            self._legs = list(one.legs)
-            self._store(one.original, *self._associate(one.original))
-        self._move_again(legs)
-        self._legs = legs
-
-    def _move_again(self, legs: Sequence[Leg]) -> None:
-        """Predict the belief again through control steps between stored scans."""
-        for controls, dt in legs:
-            self._move(controls, dt)
-
 
 def _with_columns(controls: Controls, width: int) -> Float[np.ndarray, "k w"]:
     """Return control steps widened to a number of columns, with NaN for unknown covariances."""
@@ -362,18 +345,14 @@ def _with_columns(controls: Controls, width: int) -> Float[np.ndarray, "k w"]:
 
 def _present(belief: Any, labels: Sequence[int]) -> list[int]:
     """Return which of the given labels a belief contains; all, if it does not list labels."""
-    held = completed(belief, Belief).labels()
+    held = completed(belief, Belief).labels() if labels else None
     return [label for label in labels if held is None or label in held]
 
 
-def _without(belief: B, labels: Sequence[int]) -> B:
-    """Return a belief without landmarks of given labels; ignore labels that it does not contain."""
-    return _edited(belief, remove=_present(belief, labels))
-
-
 def _edited(belief: B, remove: Sequence[int] = (), merge: Sequence[tuple[int, int]] = ()) -> B:
-    """Return a belief with landmarks removed and pairs of duplicates merged."""
+    """Return a belief with landmarks removed, if it has them, and pairs of duplicates merged."""
     editable: Any = completed(belief, Belief)
+    remove = _present(belief, remove)
     return editable.edited(remove, merge) if remove or merge else belief
 
 

@@ -9,7 +9,7 @@ afterwards the session repeats all scans in its memory.
 """
 
 import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -147,13 +147,15 @@ class Sequential(Association[Memory]):
         """Return the empty memory of data association before the first scan."""
         return Memory()
 
-    def informed(self, memory: Memory, news: Mapping[int, CallerPlace]) -> Memory:
-        """Return the memory with found callers' positions added, given by caller number."""
+    def carried(self, memory: Memory, later: Memory) -> Memory:
+        """Return an earlier memory with the callers' positions that a later memory adds."""
         known = dict(memory.callers)
-        for number, place in news.items():
-            label = known[number].label if number in known else memory.labels + 1
-            memory = replace(memory, labels=max(memory.labels, label))
-            known[number] = CallerState(label=label, place=place)
+        for number, caller in sorted(later.callers.items()):
+            before = known.get(number, CallerState(label=memory.labels + 1))
+            place, former = caller.place, before.place
+            if place is not None and (former is None or former[:-1] != place[:-1]):
+                memory = replace(memory, labels=max(memory.labels, before.label))
+                known[number] = CallerState(label=before.label, place=place)
         return replace(memory, callers=known)
 
     def knowing(self, memory: Memory, known: Landmarks, callers: Int[np.ndarray, " c"]) -> Memory:
@@ -176,11 +178,11 @@ class Sequential(Association[Memory]):
     def associate(self, memory: Memory, belief: Belief, scan: Scan) -> tuple[Memory, Assignment]:
         """Label a scan's measurements; return the new memory and the assignment."""
         work = _Work(self, memory, belief, scan)
-        if news := work.search_callers():
-            return memory, Assignment(label=work.label, again=news)
+        found = work.search_callers()
         for number in sorted({*scan.caller.tolist()}):
             work.match(number)
-        return work.finished()
+        after, assignment = work.finished()
+        return after, replace(assignment, revised={0: None}) if found else assignment
 
 
 class _Work:
@@ -205,9 +207,9 @@ class _Work:
         self.new: list[int] = []
         self.near = np.zeros(self.joint.landmark.size + scan.landmark.size, np.bool_)
 
-    def search_callers(self) -> dict[int, CallerPlace]:
-        """Track echoes of unlocated callers, and return newly found positions by caller number."""
-        news: dict[int, CallerPlace] = {}
+    def search_callers(self) -> bool:
+        """Track echoes of unlocated callers; return whether a new position was found."""
+        found = False
         for number, row in enumerate(self.scan.direct.tolist()):
             if number == OWN or (row < 0 and number not in self.callers):
                 continue
@@ -216,9 +218,9 @@ class _Work:
                 caller = self._followed(number, caller, row)
                 place = place_caller(caller.tracks, number in self.moves, self.model)
                 if place is not None:
-                    news[number] = place
+                    caller, found = replace(caller, place=place), True
             self.callers[number] = caller
-        return news
+        return found
 
     def _followed(self, number: int, caller: CallerState, row: int) -> CallerState:
         """Add this scan's measurements to the tracks of an unlocated caller; return its record."""
@@ -291,20 +293,21 @@ class _Work:
         memory, scan, (known, at) = self.memory, self.scan, self._judged()
         lost = self._lost(known)
         gone = {*known.label[known.odds < GONE].tolist(), *lost}
-        remove, merge = (), ()
+        merge = () if gone else self._doubles(known, at)
         if gone:
-            known, remove = self._without(known, gone)
-        else:
-            merge = self._doubles(known, at)
+            left = np.array([*gone])
+            known = some(known, ~is_among(known.label, left))
+            for labels in (self.label, self.named):
+                labels[is_among(labels, left)] = UNLABELLED
         for kept, other in merge:
             self.label[self.label == other] = kept
         if self.numbers is not scan.numbers:
             scan = replace(scan, numbers=self.numbers)
         if scan.direct.size:
             scan = with_callers(scan, self.named)
-        early, earlier = () if lost else self._early(scan), {}
+        early, revised = () if lost else self._early(scan), {}
         if early and memory.scan >= early[-1].number + SETTLED and not (gone or merge):
-            early, earlier = (), self._labelled_by_map(early, known)
+            early, revised = (), self._labelled_by_map(early, known)
         after = Memory(
             scan=memory.scan + 1,
             labels=self.labels,
@@ -314,17 +317,10 @@ class _Work:
             pose=self.pose,
             drift=self.model[:2],
         )
+        label, remove = self.label, tuple(sorted(gone))
         return after, Assignment(
-            label=self.label, remove=remove, merge=merge, scan=scan, earlier=earlier
+            label=label, remove=remove, merge=merge, scan=scan, revised=revised
         )
-
-    def _without(self, known: Known, gone: set[int]) -> tuple[Known, tuple[int, ...]]:
-        """Delete landmarks from scan and records; return these and the labels known before."""
-        memory, left = self.memory, np.array([*gone])
-        for labels in (self.label, self.named):
-            labels[is_among(labels, left)] = UNLABELLED
-        before = {*memory.known.label.tolist(), *(c.label for c in memory.callers.values())}
-        return some(known, ~is_among(known.label, left)), tuple(sorted(gone & before))
 
     def _early(self, scan: Scan) -> tuple[EarlyScan, ...]:
         """Return the stored scans from before the first map, with this scan if it is early too."""
