@@ -193,10 +193,10 @@ def test_a_removed_label_may_be_assigned_again():
 def test_a_place_is_carried_once():
     place = CallerPlace(3.0, 4.0)
     told = CallerState(label=5, place=place, told=True)
-    agreed = replace(told, place=place._replace(agreed=True))
-    others = {2: CallerState(label=9, place=place), 3: CallerState(label=11)}
+    later = replace(told, since=4)
+    others = {2: CallerState(label=9, place=place, found=6), 3: CallerState(label=11)}
     stage = Sequential(match=nearest, chances=(25.0, 0.06, 1.3, 0.8, 0.02))
-    after = stage.carried(Memory(labels=7, callers={1: told}), Memory(callers={1: agreed} | others))
+    after = stage.carried(Memory(labels=7, callers={1: told}), Memory(callers={1: later} | others))
     assert {*after.callers} == {1, 2}
     assert (after.callers[1], after.callers[2].place) == (told, place)
-    assert after.callers[2].label == after.labels == 8
+    assert (after.callers[2].label, after.callers[2].found, after.labels) == (8, 6, 8)

@@ -192,7 +192,7 @@ def test_a_scan_without_rows_is_accepted():
 @pytest.mark.parametrize(
     ("name", "steps", "missed"),
     [
-        ("ekf", 200, 12),
+        ("ekf", 200, 13),
         pytest.param("ekf", 480, 8, marks=pytest.mark.slow),
         pytest.param("fastslam", 480, 16, marks=pytest.mark.slow),
     ],

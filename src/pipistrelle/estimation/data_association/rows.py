@@ -432,6 +432,8 @@ class CallerState:
     """Matched and total counts of its measurements, for each scan since it is on the map."""
     since: int = 0
     """Number of the scan in which it was put on the map."""
+    found: int = 0
+    """Number of the scan in which its position was found; later scans test it."""
 
 
 class EarlyScan(NamedTuple):

@@ -152,10 +152,10 @@ class Sequential(Association[Memory]):
         known = dict(memory.callers)
         for number, caller in sorted(later.callers.items()):
             before = known.get(number, CallerState(label=memory.labels + 1))
-            place, former = caller.place, before.place
-            if place is not None and (former is None or former[:-1] != place[:-1]):
+            if caller.place not in (None, before.place):
                 memory = replace(memory, labels=max(memory.labels, before.label))
-                known[number] = CallerState(label=before.label, place=place)
+                found = {"place": caller.place, "found": caller.found}
+                known[number] = CallerState(label=before.label, **found)
         return replace(memory, callers=known)
 
     def knowing(self, memory: Memory, known: Landmarks, callers: Int[np.ndarray, " c"]) -> Memory:
@@ -218,7 +218,8 @@ class _Work:
                 caller = self._followed(number, caller, row)
                 place = place_caller(caller.tracks, number in self.moves, self.model)
                 if place is not None:
-                    caller, found = replace(caller, place=place), True
+                    caller = replace(caller, place=place, found=self.memory.scan)
+                    found = True
             self.callers[number] = caller
         return found
 
@@ -439,7 +440,8 @@ class _Work:
         """Delete misplaced callers; return their labels and the landmarks that depend on them."""
         lost: list[int] = []
         for number, caller in [*self.callers.items()]:
-            if len(caller.trial) < TRIAL or self.memory.scan > caller.since + PROBATION:
+            first, last = caller.found + TRIAL, caller.since + PROBATION
+            if len(caller.trial) < TRIAL or not first <= self.memory.scan <= last:
                 continue
             right, rows = np.sum(caller.trial[SETTLING:], axis=0)
             if rows >= LEAST_ROWS and right < LEAST_SHARE * rows:
