@@ -35,7 +35,6 @@ from pipistrelle.estimation.data_association.existence import Known
 from pipistrelle.estimation.data_association.rows import (
     CallerPlace,
     CallerState,
-    EarlyScan,
     Memory,
     ScanRows,
     Tracks,
@@ -83,7 +82,7 @@ LARGEST = np.sqrt(np.finfo(np.float64).max)
 RECORDS: dict[str, Any] = {
     kind.__name__: kind
     for kind in (
-        Calibration, CallerPlace, CallerState, EarlyScan, EkfBelief, FastSlamBelief, Gaussian,
+        Calibration, CallerPlace, CallerState, EkfBelief, FastSlamBelief, Gaussian,
         History, Innovations, JointGaussian, Known, Landmarks, Memory, NoiseModel, Odometry, Points,
         RayConfig, Scan, ScanRows, SessionState, SmootherBelief, Solution, Stack, StoredScan,
         Stretch, Tracks,
@@ -649,11 +648,6 @@ def _stretches(
 
 LAWS: dict[Any, Callable[[Any], Any]] = {
     Calibration: lambda it: within(it.odometry, 0, POSE) and it.sensor.min() >= 0,
-    EarlyScan: lambda it: (
-        it.scan.landmark.size == it.rows.caller.size
-        and within(it.direct, -1, it.scan.landmark.size)
-        and _is_pose(it.pose)
-    ),
     EkfBelief: _ekf,
     FastSlamBelief: _fastslam,
     History: _history,

@@ -1,4 +1,4 @@
-r"""Find the position of a caller that is not on the map, and label early scans by a later map.
+"""Find the position of a caller that is not on the map, or that has turned.
 
 **Search** (`place_caller`). The echoes of a landmark, tracked over scans, agree in its position
 only for the true position of the caller. Both are fitted, with the errors of all poses, by
@@ -9,44 +9,21 @@ returned when the std of its range is small; a constant acceleration serves as f
 
 **Turns** (`turned`). Estimators model a caller's velocity as a random walk, and lag behind a sharp
 turn. Where few of its measurements match the map, positions about its direct call are tried.
-
-**Early scans** (`labelled_by_map`). Excess paths determine landmarks only after the scan in which
-the caller's range is first given. Earlier scans are matched later to the settled map; they fix its
-rotation, as the heading is known best at the start. The map is first rotated relative to the
-vehicle to the best common fit (`_turn`), as the heading error exceeds that of bearings. With the
-mean bearing of all landmarks :math:`\beta = a^T x` of the variance :math:`a^T P a`, a rotation by
-:math:`\delta` changes mean and covariance to
-
-.. math:: x + \frac{P a}{a^T P a}\, \delta, \qquad
-          P - \frac{P a a^T P}{a^T P a}
 """
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import replace
-from functools import partial
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from pipistrelle.detection.scans import RANGE, RANGE_STD, UNLABELLED, Scan
-from pipistrelle.estimation.association import is_among
 from pipistrelle.estimation.beliefs import JointGaussian
-from pipistrelle.estimation.data_association.pairs import (
-    NOTHING,
-    UNPLACED,
-    Match,
-    PlainChances,
-    pair_costs,
-    pair_innovations,
-)
 from pipistrelle.estimation.data_association.rows import (
     CallerPlace,
-    EarlyScan,
     Model,
     Tracks,
     in_window,
-    part_of,
 )
 from pipistrelle.estimation.measurement import NEAREST, excess_path_slopes, range_by_excess_path
 from pipistrelle.geometry import wrap_angle
@@ -380,89 +357,6 @@ def fit(costs: Float[np.ndarray, "r n"]) -> tuple[float, Bool[np.ndarray, " r"]]
     return float(least.sum()), least < 0.0
 
 
-FEW = 3
-"""A scan is early if it ends with fewer landmarks and no caller was on the map before it."""
-MOST, SETTLED = 16, 12
-"""Most early scans kept, and scans after them until the map counts as settled."""
-TURNS = np.linspace(-3.5, 3.5, 141)
-"""Rotations tried [standard deviations]."""
-SEPARATION, CLEARER = 0.04, 10.0
-"""Rotations farther than the first [rad] from the best must cost more by the second."""
-RANGE_SHARE = 0.2
-"""Standard deviation of a range taken from the map, as a share of it."""
-
-
 def direct_row(direct: Int[np.ndarray, " c"], number: int) -> int:
     """Return the measurement index of a caller's direct call in a scan, or -1 without."""
     return int(direct[number]) if number < direct.size else -1
-
-
-def labelled_by_map(
-    early: EarlyScan,
-    joint: JointGaussian,
-    sure: Int[np.ndarray, " s"],
-    callers: Mapping[int, int],
-    match: Match,
-    chances: PlainChances,
-) -> Scan:
-    """Return an early scan with labels for the callers' measurements, matched to a later map.
-
-    The early pose replaces that of ``joint``, as if uncorrelated with the map. ``callers``: index
-    of each caller in the mean, UNPLACED if it was elsewhere.
-    """
-    mean, covariance = joint.mean.copy(), joint.covariance.copy()
-    mean[:3], covariance[:3], covariance[:, :3] = early.pose.mean, 0.0, 0.0
-    covariance[:3, :3] = early.pose.covariance
-    kept = np.flatnonzero(is_among(joint.landmark, sure))
-    there, names = 3 + 2 * kept, np.append(joint.landmark[kept], UNLABELLED)
-    label, numbers = np.full(early.scan.caller.size, UNLABELLED), early.scan.numbers.copy()
-    for number, place in callers.items():
-        direct = direct_row(early.direct, number)
-        at, rows = place if direct >= 0 else UNPLACED, early.rows
-        heard = rows.usable if at == UNPLACED else rows.with_way
-        used = np.flatnonzero(heard & (rows.caller == number))
-        used = used[used != direct]
-        found = _matched(part_of(rows, used, 0.0), (mean, covariance), there, at, match, chances)
-        label[used] = names[found]
-        if at == UNPLACED:
-            used, i = used[found != NOTHING], there[found[found != NOTHING]]
-            far = np.hypot(mean[i] - mean[0], mean[i + 1] - mean[1])
-            numbers[RANGE, used], numbers[RANGE_STD, used] = far, RANGE_SHARE * far
-    return replace(early.scan, landmark=label, numbers=numbers)
-
-
-def _matched(
-    rows: tuple[np.ndarray, ...],
-    gaussian: tuple[Float[np.ndarray, " d"], Float[np.ndarray, "d d"]],
-    there: Int[np.ndarray, " n"],
-    at: int,
-    match: Match,
-    chances: PlainChances,
-) -> Int[np.ndarray, " r"]:
-    """Match measurements to the map after its best rotation; no matches if it is ambiguous."""
-    (mean, _), (spread, variance, left) = gaussian, _turn(*gaussian, there)
-    turns = math.sqrt(variance) * TURNS
-    means = [mean + spread * (turn / variance) for turn in turns]
-    costs = [pair_costs(rows, turned, left, there, at, chances) for turned in means]
-    total = np.array([fit(cost)[0] for cost in costs]) + TURNS * TURNS
-    best = int(total.argmin())
-    others = total[np.abs(turns - turns[best]) > SEPARATION]
-    if others.min(initial=0.0) < total[best] + CLEARER:
-        return np.full(rows[0].size, NOTHING)
-    return match(costs[best], partial(pair_innovations, rows, means[best], left, there, at))
-
-
-def _turn(
-    mean: Float[np.ndarray, " d"],
-    covariance: Float[np.ndarray, "d d"],
-    there: Int[np.ndarray, " n"],
-) -> tuple[Float[np.ndarray, " d"], float, Float[np.ndarray, "d d"]]:
-    """Return gain and variance of a map rotation, and the covariance without its uncertainty."""
-    dx, dy = mean[there] - mean[0], mean[there + 1] - mean[1]
-    squared = there.size * (dx * dx + dy * dy)
-    slope = np.zeros(mean.size)
-    slope[there], slope[there + 1] = -dy / squared, dx / squared
-    slope[:3] = -slope[there].sum(), -slope[there + 1].sum(), -1.0
-    spread = covariance @ slope
-    variance = float(slope @ spread)
-    return spread, variance, covariance - np.outer(spread, spread) / variance

@@ -436,22 +436,9 @@ class CallerState:
     """Number of the scan in which its position was found; later scans test it."""
 
 
-class EarlyScan(NamedTuple):
-    """A scan from before the first map, kept to be labelled by a later map."""
-
-    number: int
-    scan: Scan
-    """The scan as received."""
-    rows: ScanRows
-    direct: Int[np.ndarray, " c"]
-    """Index of each caller's direct call, or -1."""
-    pose: Gaussian
-    """Vehicle pose predicted for the scan, before its update."""
-
-
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Memory:
-    """Memory of data association between scans: landmarks, callers and unlabelled early scans."""
+    """Memory of data association between scans: landmarks and callers."""
 
     scan: int = 0
     labels: int = 0
@@ -459,8 +446,6 @@ class Memory:
     known: Known = field(default_factory=lambda: nobody(1))
     callers: Mapping[int, CallerState] = field(default_factory=dict)
     """Callers by number."""
-    early: tuple[EarlyScan, ...] = ()
-    """Scans that wait for a settled map."""
     pose: Gaussian | None = None
     """Predicted pose of the last scan."""
     drift: tuple[float, float] = (0.0, 0.0)

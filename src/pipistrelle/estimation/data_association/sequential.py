@@ -30,11 +30,7 @@ from pipistrelle.estimation.association import KNOWN, Assignment, Association, i
 from pipistrelle.estimation.beliefs import Belief, Gaussian, JointGaussian, Landmarks
 from pipistrelle.estimation.catalogue import ASSOCIATION, build, class_of, names_class
 from pipistrelle.estimation.data_association.caller_search import (
-    FEW,
-    MOST,
-    SETTLED,
     direct_row,
-    labelled_by_map,
     may_have_turned,
     place_caller,
     turned,
@@ -68,7 +64,6 @@ from pipistrelle.estimation.data_association.pairs import (
 from pipistrelle.estimation.data_association.rows import (
     CallerPlace,
     CallerState,
-    EarlyScan,
     Joint,
     Memory,
     Model,
@@ -258,8 +253,8 @@ class _Work:
     def _is_elsewhere(self, number: int, count: tuple[int, int]) -> bool:
         """Return whether a moving caller's estimate is wrong: too few of its echoes match."""
         known, own = self.memory.known, self.label[self.scan.caller == OWN]
-        before = known.confirmed & ~np.isnan(known.source[:, number])
-        often = int(before.sum()) >= count[1]
+        heard = known.source[:, number : number + 1]  # without column before its first landmark
+        often = int((known.confirmed[:, np.newaxis] & ~np.isnan(heard)).sum()) >= count[1]
         return often and may_have_turned(*count) and bool((own != UNLABELLED).any())
 
     def _follow_turn(self, number: int, at: int) -> None:
@@ -283,7 +278,12 @@ class _Work:
             return UNPLACED
         if not caller.told:
             self._tell(number, caller)
-            return None
+            row = self._direct(number)
+            if row < 0 or self.label[row] != caller.label:
+                return None
+            numbers = self.numbers[[BEARING, RANGE, BEARING_STD, RANGE_STD], row][:, np.newaxis]
+            self.joint = with_points(self.joint, [caller.label], tuple(numbers))
+            return self._where(caller.label)
         self.named[number] = caller.label
         at = self._where(caller.label)
         self._match_direct(number, caller.label, at)
@@ -306,48 +306,16 @@ class _Work:
             scan = replace(scan, numbers=self.numbers)
         if scan.direct.size:
             scan = with_callers(scan, self.named)
-        early, revised = () if lost else self._early(scan), {}
-        if early and memory.scan >= early[-1].number + SETTLED and not (gone or merge):
-            early, revised = (), self._labelled_by_map(early, known)
         after = Memory(
             scan=memory.scan + 1,
             labels=self.labels,
             known=merged(known, merge),
             callers=self.callers,
-            early=early,
             pose=self.pose,
             drift=self.model[:2],
         )
-        label, remove = self.label, tuple(sorted(gone))
-        return after, Assignment(
-            label=label, remove=remove, merge=merge, scan=scan, revised=revised
-        )
-
-    def _early(self, scan: Scan) -> tuple[EarlyScan, ...]:
-        """Return the stored scans from before the first map, with this scan if it is early too."""
-        early, number = self.memory.early, self.memory.scan
-        placed = any(caller.told and caller.since < number for caller in self.callers.values())
-        landmarks = self.memory.known.label.size + len(self.new)
-        if placed or landmarks >= FEW or len(early) == MOST:
-            return early
-        return *early, EarlyScan(number, scan, self.rows, self.scan.direct, self.pose)
-
-    def _labelled_by_map(self, early: tuple[EarlyScan, ...], known: Known) -> dict[int, Scan]:
-        """Label early scans by the map; return them by number, none if no caller is mapped."""
-        joint, stage, places = self.joint, self.stage, {}
-        sure = known.label[known.confirmed].tolist()
-        for number, caller in self.callers.items():
-            if (at := self._where(caller.label)) >= 0:
-                moves = number in self.moves
-                places[number] = UNPLACED if moves else at
-                sure += [] if moves else [caller.label]
-        if not places:
-            return {}
-        sure = np.array(sure, np.int64)
-        return {
-            one.number: labelled_by_map(one, joint, sure, places, stage.match, stage.chances)
-            for one in early
-        }
+        remove = tuple(sorted(gone))
+        return after, Assignment(label=self.label, remove=remove, merge=merge, scan=scan)
 
     def _judged(self) -> tuple[Known, Int[np.ndarray, " l"]]:
         """Return all landmark records with updated log odds, and joint-mean indices or -1."""

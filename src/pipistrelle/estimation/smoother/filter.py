@@ -513,11 +513,28 @@ class Smoother:
             here.join(new)
             here.hear()
             solution = here.solved()
+            history, solution = self._by_new_callers(before, history, here, solution)
         for _ in range(ENTERING_PASSES if late else 1):
             if off_line(solution, history) <= RELINEARISE_ABOVE:
                 break
             solution = relinearised(solution, history, self.noise)
         return history, solution
+
+    def _by_new_callers(
+        self, before: History, history: History, here: Sweep, solution: Solution
+    ) -> tuple[History, Solution]:
+        """Add the landmarks that the last scan locates by callers that it has located itself."""
+        first, last = history.span[1:]
+        callers = np.unique(history.rows.arrays[0][first:last, 1])
+        found = (history.index != 0) & (before.index == 0)
+        if not found[callers[callers >= 0]].any():
+            return history, solution
+        more = _placed(history, here, solution)
+        if len(more.placed) == len(history.placed):
+            return history, solution
+        here.admit(more)
+        first = int(more.entering[len(history.placed) :].min())
+        return more, eliminated(more, self.noise, here.points, here.stretches, first)
 
 
 def _frame(
