@@ -31,7 +31,7 @@ from pipistrelle.jit import kernel
 def edited(
     history: History, remove: Sequence[int], merge: Sequence[tuple[int, int]]
 ) -> tuple[History, Bool[np.ndarray, " l"], int]:
-    """Remove and merge landmarks in a history; return it, a mask of those kept, first node changed.
+    """Remove and merge landmarks in a history; return it, the kept landmarks and the first change.
 
     Their measurements are deleted or relabelled; the chain must be eliminated again from this node.
     """
