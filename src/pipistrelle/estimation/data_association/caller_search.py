@@ -29,9 +29,9 @@ from pipistrelle.estimation.measurement import NEAREST, excess_path_slopes, rang
 from pipistrelle.geometry import wrap_angle
 from pipistrelle.jit import kernel, no_alloc
 
-SCANS, SURE = 14, 0.1
-"""Most scans of a search, which bound its cost; largest relative std of a range that an estimator
-uses, as it linearises about it."""
+SCANS, SURE = 40, 0.1
+"""Most scans of a search, as many as a session revises; largest relative std of a range that an
+estimator uses, as it linearises about it."""
 MEDIAN, SPREAD, FIELD = 10.0, 1.0, 40.0
 """Prior of a caller's range: median [m] and std of its logarithm; std of the positions of landmarks
 about the vehicle [m]."""
