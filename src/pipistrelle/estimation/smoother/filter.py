@@ -513,6 +513,7 @@ class Smoother:
             here.join(new)
             here.hear()
             solution = here.solved()
+        if history is not before and not late:
             history, solution = self._by_new_callers(before, history, here, solution)
         for _ in range(ENTERING_PASSES if late else 1):
             if off_line(solution, history) <= RELINEARISE_ABOVE:
