@@ -21,7 +21,7 @@ COLUMNS = [(f"{strategy} {beam}", strategy, radius)
            for strategy in ("active", "fused") for beam, radius in BEAMS.items()]  # fmt: skip
 COLUMNS += [("passive", "passive", min(BEAMS.values()))]
 FILTERS = {"iekf": "invariant EKF", "smoother": "smoother, at the end"}
-METHODS = ("marginal", "joint", "nearest")
+METHODS = ("marginal", "nearest")
 LOST_M, LOST_TIMES = 0.25, 5.0
 """A world is lost if its aligned error is above this and so many times that with labels."""
 

@@ -201,7 +201,7 @@ def heard_and_drive(steps=120):
 def test_the_guides_association_reproduces_the_known_labels(guide):
     from pipistrelle.detection.noise import without_hidden
     from pipistrelle.detection.scans import NO_CALLERS, scan_of, without_labels
-    from pipistrelle.estimation.association import Assignment
+    from pipistrelle.estimation.beliefs import Assignment
     from pipistrelle.experiments.named_settings import Case
     from pipistrelle.experiments.runs.heard_world import scans_of
     from pipistrelle.experiments.runs.trial import run_trial

@@ -485,8 +485,8 @@ class AssociationConfig(Section):
 
     method: str = "known"
     """Method of association: "known", the labels of the scans (the paper's); "nearest", the
-    likeliest assignment of a scan; "joint", the largest compatible set; "marginal", the pairs that
-    are probable over all assignments; or module:Class, an association of your own."""
+    likeliest assignment of a scan; "marginal", the pairs that are probable over all assignments; or
+    module:Class, an association of your own."""
     detection: Probability = 0.8
     """Assumed probability of detecting a landmark within the sensor's reach."""
     clutter: Positive = 0.06

@@ -34,7 +34,8 @@ from itertools import combinations
 import numpy as np
 
 from pipistrelle.detection.scans import UNLABELLED
-from pipistrelle.estimation.association import Assignment, expected
+from pipistrelle.estimation.beliefs import Assignment
+from pipistrelle.estimation.data_association.pairs import OWN_CALL, pair_costs
 
 CALLER = 1000
 
@@ -58,13 +59,11 @@ class Joint:
     def associate(self, memory, belief, scan):
         joint, last, heard = belief.joint(), memory.last, dict(memory.heard)
         label = np.full(scan.landmark.size, UNLABELLED)
-        rows, there = np.meshgrid(np.arange(label.size), joint.landmark, indexing="ij")
-        if joint.landmark.size:
-            callers = np.where(scan.direct >= 0, CALLER, -1)
-            pairs = expected(joint, scan, rows.ravel(), there.ravel(), callers)
-            d2 = np.reshape([self.distance(pairs, n) for n in range(rows.size)], rows.shape)
-            near = d2.min(axis=1) < self.gate
-            label[near] = joint.landmark[d2.argmin(axis=1)[near]]
+        for number in {*scan.caller.tolist()} if joint.landmark.size else ():
+            rows = np.flatnonzero(scan.caller == number)
+            costs = self.costs(joint, scan, rows, number)
+            near = costs.min(axis=1) < np.inf
+            label[rows[near]] = joint.landmark[costs.argmin(axis=1)[near]]
         fresh = (label == UNLABELLED) & ~np.isnan(scan.range)
         label[fresh] = last + np.arange(1, 1 + fresh.sum())
         last += int(fresh.sum())
@@ -82,13 +81,20 @@ class Joint:
         found = Assignment(label=label, remove=remove, merge=merge)
         return Memory(memory.scan + 1, last, heard), found
 
-    def distance(self, pairs, n):
-        difference, covariance = pairs.difference[n], pairs.covariance[n, :, n]
-        known = ~np.isnan(difference)
-        if known.sum() < 2:
-            return np.inf  # a bearing alone fits many
-        nu, S = difference[known], covariance[np.ix_(known, known)]
-        return nu @ np.linalg.solve(S, nu)
+    def costs(self, joint, scan, rows, number):
+        way, std = scan.range, scan.range_std
+        at, there = OWN_CALL, 3 + 2 * np.arange(joint.landmark.size)
+        if number:
+            way, std = scan.excess_path, scan.excess_path_std
+            at = next(iter(there[joint.landmark == CALLER]), None)
+        known = rows if at is not None else rows[:0]
+        columns = [part[known] for part in (scan.bearing, scan.bearing_std, way, std)]
+        chances = self.gate, 1.0, np.inf, 1.0, np.inf  # a bearing alone fits many
+        costs = np.full((rows.size, there.size), np.inf)
+        if known.size:
+            placed = joint.mean, joint.covariance, there, at
+            costs[:] = pair_costs((*columns, np.ones(known.size)), *placed, chances)
+        return costs
 
     def doubles(self, joint, others):
         places, taken, pairs = joint.mean[3:].reshape(-1, 2), set(others), []

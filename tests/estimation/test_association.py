@@ -6,7 +6,6 @@ import pytest
 
 from pipistrelle.config import AssociationConfig, Config, InputError, RayConfig
 from pipistrelle.detection.scans import UNLABELLED, labelled, make_scan
-from pipistrelle.estimation.association import expected
 from pipistrelle.estimation.beliefs import Belief, Gaussian, completed
 from pipistrelle.estimation.data_association.sequential import association_of
 from pipistrelle.estimation.ekf.filter import EkfSlam
@@ -149,38 +148,6 @@ def measured(pose, point):
 
 
 @pytest.mark.parametrize("error", [LINEAR, INVARIANT])
-def test_expected_measurements_have_the_covariance_of_finite_differences(error):
-    """Each number is linear in the joint mean, and S its covariance, by finite differences."""
-    _, belief = mapped(error)
-    joint = belief.joint()
-    row, landmark = np.repeat(np.arange(4), 3), np.tile([2, 4, 7], 4)
-    bearing = {"bearing_std": 0.05, "range": np.array([5.0, 6.0, NAN, NAN]), "range_std": 0.1}
-    timed = {"excess_path": np.array([NAN, NAN, 3.0, 2.0]), "excess_path_std": 0.2}
-    scan = make_scan(
-        0.0, np.full(4, UNLABELLED), RNG(7).normal(0.0, 1.0, 4), caller=np.array([0, 0, 1, 1]),
-        **bearing, **timed,
-    )  # fmt: skip
-    callers = np.array([UNLABELLED, 9])
-    found = expected(joint, scan, row, landmark, callers)
-    slopes = np.empty((12, 3, joint.mean.size))
-    for column in range(joint.mean.size):
-        step = np.zeros(joint.mean.size)
-        step[column] = 1e-6
-        up, down = (
-            expected(replace(joint, mean=joint.mean + side), scan, row, landmark, callers)
-            for side in (step, -step)
-        )
-        slopes[:, :, column] = -(up.difference - down.difference) / 2e-6
-    there = ~np.isnan(found.difference)
-    assert there.sum() == 12 + 2 * 3 + 2 * 3
-    H = slopes[there]
-    R = np.stack([scan.bearing_std, scan.range_std, scan.excess_path_std], axis=-1)[row][there]
-    S = H @ joint.covariance @ H.T + np.diag(R**2)
-    np.testing.assert_allclose(found.covariance[there][:, there], S, rtol=1e-6, atol=1e-9)
-    assert np.isnan(found.covariance[~there]).all()
-
-
-@pytest.mark.parametrize("error", [LINEAR, INVARIANT])
 def test_the_joint_gaussian_contains_the_pose_and_map_of_the_belief(error):
     _, belief = mapped(error)
     joint, pose, points = belief.joint(), belief.pose(), belief.landmarks()
@@ -273,15 +240,9 @@ def test_a_belief_that_cannot_be_edited_is_refused():
     assert belief.edited((), ()) is belief
 
 
-def test_an_unmapped_landmark_is_refused_by_expected():
-    _, belief = mapped(LINEAR)
-    with pytest.raises(InputError, match=r"expected: found the landmarks \[5\]"):
-        expected(belief.joint(), scan_of((3, 5.0, 0.3)), np.array([0]), np.array([5]))
-
-
 @pytest.mark.parametrize("name", ["jcbb", "a:", ":B", "a b:C"])
 def test_a_method_that_is_no_name_is_refused(name):
     config = Config(association=AssociationConfig(method=name))
-    expected = "expected 'known', 'nearest', 'joint', 'marginal' or module:Class"
+    expected = "expected 'known', 'nearest', 'marginal' or module:Class"
     with pytest.raises(InputError, match=expected):
         association_of(config)

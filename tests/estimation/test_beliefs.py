@@ -3,9 +3,9 @@
 import pytest
 
 from pipistrelle.config import Config, InputError
-from pipistrelle.estimation.association import Association
 from pipistrelle.estimation.beliefs import (
     NO_INNOVATIONS,
+    Association,
     Belief,
     Innovations,
     completed,

@@ -7,8 +7,7 @@ import pytest
 
 from pipistrelle.config import Config
 from pipistrelle.detection.scans import RANGE, UNLABELLED, make_scan
-from pipistrelle.estimation.association import Assignment
-from pipistrelle.estimation.beliefs import Gaussian
+from pipistrelle.estimation.beliefs import Assignment, Gaussian
 from pipistrelle.estimation.catalogue import CATALOGUE, entry
 from pipistrelle.estimation.data_association.pairs import nearest
 from pipistrelle.estimation.data_association.rows import CallerPlace, CallerState, Memory
@@ -193,10 +192,10 @@ def test_a_removed_label_may_be_assigned_again():
 def test_a_place_is_carried_once():
     place = CallerPlace(3.0, 4.0)
     told = CallerState(label=5, place=place, told=True)
-    later = replace(told, since=4)
-    others = {2: CallerState(label=9, place=place, found=6), 3: CallerState(label=11)}
+    later = replace(told, failed=True)
+    others = {2: CallerState(label=9, place=place), 3: CallerState(label=11)}
     stage = Sequential(match=nearest, chances=(25.0, 0.06, 1.3, 0.8, 0.02))
     after = stage.carried(Memory(labels=7, callers={1: told}), Memory(callers={1: later} | others))
     assert {*after.callers} == {1, 2}
     assert (after.callers[1], after.callers[2].place) == (told, place)
-    assert (after.callers[2].label, after.callers[2].found, after.labels) == (8, 6, 8)
+    assert (after.callers[2].label, after.labels) == (8, 8)

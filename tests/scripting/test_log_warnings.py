@@ -31,6 +31,7 @@ def trial_of(scan, gated, labels=(), **more):
         pose=SimpleNamespace(mean=np.zeros((2, 3))),
         labels=labels,
         landmarks=map_with([1, 1]),
+        report={},
     )
     scores = SimpleNamespace(gated=gated, nis_mean=None)
     return SimpleNamespace(
@@ -61,6 +62,25 @@ def test_units_are_asked_about_where_few_rows_of_an_association_are_on_the_map(
     assert [line.split(" (")[0] for line in lines] == [
         "log: 4 of 10 rows are of landmarks of the map at the end"
     ] * asked
+
+
+@pytest.mark.parametrize(
+    ("call", "repaired", "words"),
+    [
+        (-1, True, ["where the odometry leads", "found again", "skid"]),
+        (-1, False, ["where the odometry leads", "not to be trusted", "skid"]),
+        (0, False, ["other calls' paths do", "not to be trusted", "range setting"]),
+        (1, True, ["by 'mate'", "searched for again", "its name given to another"]),
+    ],
+)
+def test_warning_names_time_and_cause_of_an_alarm(call, repaired, words):
+    mate = SimpleNamespace(name="mate", moves=False)
+    log = replace(log_of(distance=np.ones(10)), callers=(mate,))
+    trial = trial_of(log.scans[0], 0, (np.ones(10, int),))
+    trial.track.report = {"alarms": [(4.5, call, repaired), (7.0, call, repaired)]}
+    (line,) = fit_warnings(log, [trial], Path("log"), Config())
+    assert "from 4.5, 7 s on" in line
+    assert all(word in line for word in words)
 
 
 def test_few_rows_on_the_map_are_no_question_in_a_log_of_few_scans():

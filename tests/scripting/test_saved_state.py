@@ -20,12 +20,12 @@ ROBOT = {
     "range_bounds": [0.5, 20.0],
 }
 PLACES = np.random.default_rng(3).uniform(-8.0, 8.0, (12, 2))
-METHODS = ("known", "nearest", "joint", "marginal")
+METHODS = ("known", "nearest", "marginal")
 OWN = """
 from dataclasses import dataclass
 from typing import NamedTuple
 import numpy as np
-from pipistrelle.estimation.association import Assignment
+from pipistrelle.estimation.beliefs import Assignment
 from pipistrelle.estimation.beliefs import Gaussian, no_landmarks
 from pipistrelle.estimation.motion import Motion
 
@@ -250,7 +250,7 @@ SPOILT = {
     "another estimator's belief": lambda header, data: (header | {"filter": "smoother"}, data),
     "an estimator that is none": lambda header, data: (header | {"filter": "nothing"}, data),
     "an estimator that is a list": lambda header, data: (header | {"filter": ["ekf"]}, data),
-    "another association": lambda header, data: (header | {"association": "joint"}, data),
+    "another association": lambda header, data: (header | {"association": "nearest"}, data),
     "objects": with_node(["array", "float64"], lambda node: node.__setitem__(1, "object")),
     "dates": with_node(["array", "float64"], lambda node: node.__setitem__(1, "datetime64[s]")),
     "single precision": with_node(

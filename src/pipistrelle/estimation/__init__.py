@@ -3,8 +3,8 @@
 `motion` and `measurement` are the models (Bradley & Abaid, Sec. II-E), `rays` the partially
 initialised landmarks of passive sensing (Sec. III-C), `beliefs` the records and protocols of all
 estimators, which `catalogue` lists: `ekf` (Sec. III-A), `fastslam` (Sec. III-B) and `smoother`.
-`session` runs an estimator over control steps and scans, with `data_association` (protocol in
-`association`), input checks (`checking`) and recovery from odometry failures (`recovery`).
+`session` runs an estimator over control steps and scans, with `data_association`, input checks
+(`checking`) and recovery from odometry failures (`recovery`).
 """
 
 from lazy_loader import attach

@@ -1,18 +1,26 @@
-"""Records of estimation results, the base class of beliefs, and the protocol of estimators."""
+"""Records of estimation results, and the protocols of beliefs, estimators and associations.
+
+An `Association` receives the predicted belief and a scan without labels, and returns an
+`Assignment` with labels, and landmarks to remove or merge. Its memory of tentative landmarks is
+passed in and out like a belief. Measurements of the same label are merged, and unlabelled
+measurements are discarded (`pipistrelle.detection.scans.labelled`) before the update.
+"""
 
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from types import MethodType
-from typing import Any, NamedTuple, Protocol, Self, TypeVar, cast, runtime_checkable
+from typing import Any, Generic, NamedTuple, Protocol, Self, TypeVar, cast, runtime_checkable
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from pipistrelle.config import InputError
 from pipistrelle.detection.scans import Scan
+from pipistrelle.jit import kernel
 
 T = TypeVar("T")
+M = TypeVar("M")
 
 MAX_CALLER_STD = 2.0
 """Largest standard deviation [m] of the position of a moving caller that counts as located."""
@@ -150,6 +158,8 @@ class Track:
     """Pose estimates at their time, from a smoother."""
     labels: tuple[Int[np.ndarray, " m"], ...] = ()
     """Final labels of the measurements of each scan by data association."""
+    report: Mapping[str, Any] = field(default_factory=dict)
+    """Further results of data association (`Association.report`)."""
     calibration: Mapping[str, tuple[float, float]] = field(default_factory=dict)
     """Calibrated parameters of the vehicle: value and standard deviation, by name."""
     callers: Mapping[int, Gaussian] = field(default_factory=dict)
@@ -287,3 +297,74 @@ class Estimator(Protocol[B]):
     def update(self, belief: B, scan: Scan, rng: np.random.Generator) -> B:
         """Update a belief with the measurements of a scan, and return it."""
         ...
+
+
+KNOWN = "known"
+"""Method that uses the labels of the scan (Bradley & Abaid, Sec. III-B)."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Assignment:
+    """Result of data association: a label for each measurement of a scan, and map changes."""
+
+    label: Int[np.ndarray, " m"]
+    """Label of each measurement: a mapped landmark, a new number, or UNLABELLED for clutter."""
+    remove: tuple[int, ...] = ()
+    """Landmarks to remove from the map before the update; the session repeats the scans in its
+    memory without their measurements."""
+    merge: tuple[tuple[int, int], ...] = ()
+    """Pairs of duplicate landmarks: the first label replaces the second."""
+    scan: Scan | None = None
+    """The scan with changes by the association, such as callers' labels or a caller's range; the
+    same measurements in the same order."""
+    revised: Mapping[int, Scan | None] = field(default_factory=dict)
+    """Earlier scans, by number from 0: with changes, or labels for measurements without; the
+    session repeats them, and all later scans, before the update. None makes it associate the scan
+    and all later ones again, from the memory before it as changed by ``carried``, and ignore the
+    rest of the assignment."""
+
+
+class Association(ABC, Generic[M]):
+    """A method of data association, which assigns each measurement of a scan to a landmark.
+
+    A class need not inherit from it (`beliefs.completed`).
+    """
+
+    __slots__ = ()
+
+    @abstractmethod
+    def start(self) -> M:
+        """Return the memory of data association, its state between scans, before the first scan."""
+
+    @abstractmethod
+    def associate(self, memory: M, belief: Belief, scan: Scan) -> tuple[M, Assignment]:
+        """Return the new memory and a scan's assignment to landmarks; change no argument."""
+
+    def carried(self, memory: M, later: M) -> M:
+        """Return an earlier memory with the facts that a later one adds, as callers' positions."""
+        raise InputError(
+            f"association: found scans to be associated again, but a {type(self).__name__} has no "
+            "carried(memory, later)"
+        )
+
+    def knowing(self, memory: M, known: Landmarks, callers: Int[np.ndarray, " c"]) -> M:
+        """Return the initial memory, given the landmarks and callers of a known initial map."""
+        return memory
+
+    def tentative(self, memory: M) -> Sequence[int]:
+        """Return the labels of uncertain landmarks, to be left out of the reported map."""
+        return ()
+
+    def report(self, memory: M) -> Mapping[str, Any]:
+        """Return further results for ``summary.json``, by name; none by default."""
+        return {}
+
+
+@kernel
+def is_among(label: Int[np.ndarray, " m"], labels: Int[np.ndarray, " n"]) -> Bool[np.ndarray, " m"]:
+    """Return a mask of the labels that are in a set; faster than `np.isin` for few labels."""
+    among = np.zeros(label.size, np.bool_)
+    for m in range(label.size):
+        for other in labels:
+            among[m] |= label[m] == other
+    return among

@@ -15,9 +15,10 @@ from jaxtyping import Float, Int
 from pipistrelle.config import InputError
 from pipistrelle.detection.noise import ConstantNoise
 from pipistrelle.detection.scans import NO_CALLERS, UNLABELLED, Scan, labelled
-from pipistrelle.estimation.association import Assignment, Association, is_among
 from pipistrelle.estimation.beliefs import (
     AcceptsMap,
+    Assignment,
+    Association,
     B,
     Belief,
     Completed,
@@ -25,6 +26,7 @@ from pipistrelle.estimation.beliefs import (
     Gaussian,
     Landmarks,
     completed,
+    is_among,
     some_of,
 )
 from pipistrelle.estimation.checking import usable_scan
@@ -191,6 +193,10 @@ class Session(Generic[B]):
             return landmarks
         tentative = np.array([*self._association.tentative(self._memory)], np.int64)
         return some_of(landmarks, ~is_among(landmarks.landmark, tentative))
+
+    def report(self) -> Mapping[str, Any]:
+        """Return further results of data association, by name."""
+        return self._association.report(self._memory) if self._association else {}
 
     def state(self) -> SessionState:
         """Return a snapshot of the session, to continue it later."""

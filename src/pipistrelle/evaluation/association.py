@@ -91,6 +91,20 @@ def associated(
     )
 
 
+def births_per_scan(labels: Sequence[Int[np.ndarray, " m"]]) -> float:
+    """Return the number of new labels per scan in the second half of a drive.
+
+    >>> births_per_scan([np.array([1, 2]), np.array([1]), np.array([1, 3]), np.array([3, -1])])
+    0.5
+    """
+    half = len(labels) // 2
+    before, after = (
+        {label for one in part for label in one.tolist()} | {UNLABELLED}
+        for part in (labels[:half], labels[half:])
+    )
+    return len(after - before) / max(len(labels) - half, 1)
+
+
 def pairs_of(
     points: Float[np.ndarray, "n 2"], true: Float[np.ndarray, "k 2"], cutoff: float = CUTOFF
 ) -> tuple[Int[np.ndarray, " m"], Int[np.ndarray, " m"], Float[np.ndarray, " m"]]:

@@ -24,8 +24,7 @@ from pipistrelle.detection.logs.vehicle import NOISY, read_vehicle, vehicle_of
 from pipistrelle.detection.logs.vehicle import Vehicle as VehicleKeys
 from pipistrelle.detection.noise import noise_of
 from pipistrelle.detection.scans import OWN
-from pipistrelle.estimation.association import KNOWN
-from pipistrelle.estimation.beliefs import Belief, Gaussian, Landmarks, completed
+from pipistrelle.estimation.beliefs import KNOWN, Belief, Gaussian, Landmarks, completed
 from pipistrelle.estimation.catalogue import ASSOCIATION, ESTIMATOR, class_of, entry, names_class
 from pipistrelle.estimation.checking import usable_controls
 from pipistrelle.estimation.data_association.sequential import association_of

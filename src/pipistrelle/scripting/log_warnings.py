@@ -26,6 +26,7 @@ from pipistrelle.detection.scans import BEARING, NUMBERS, OWN, RANGE, UNLABELLED
 from pipistrelle.estimation.beliefs import placed
 from pipistrelle.estimation.catalogue import GATE, gate_of, short_name
 from pipistrelle.estimation.data_association.existence import BEFORE, WITHIN
+from pipistrelle.estimation.data_association.watch import POSE
 from pipistrelle.estimation.motion import relative_motions
 from pipistrelle.estimation.session import REMEMBERED
 from pipistrelle.experiments.drives import carried
@@ -161,6 +162,7 @@ def fit_warnings(
         questions += _rejected(trial, recorded, config)
         if trial.track.labels:
             unmapped += _unmapped(trial, recorded)
+            wide += [*_refuted(trial, recorded)]
             wide += wide_sight(trial, recorded, own_config(config, trial.filter))
     if questions or unmapped:
         mistake, fits = misreading(recorded)
@@ -221,6 +223,28 @@ def _strayed(trial: "TrialResult", who: str) -> list[Question]:
         f"are far from the map and path at the end{others} ({who})"
     )
     return [(found, "was it moved, is its label right, or was a loop not closed?")]
+
+
+def _refuted(trial: "TrialResult", recorded: "Log") -> Iterator[Question]:
+    """Yield a warning for each cause of alarms in a trial."""
+    alarms = trial.track.report.get("alarms", ())
+    who = f"{trial.strategy} {short_name(trial.filter)}"
+    for call, repaired in dict.fromkeys(alarm[1:] for alarm in alarms):
+        times = [f"{time:.15g}" for time, *alarm in alarms if alarm == [call, repaired]]
+        since = f"from {', '.join(times[:4])}{', ...' * (len(times) > 4)} s on"
+        then = "" if repaired else "; path and map are not to be trusted from then on"
+        if call == POSE:
+            found = f"{since}, no measurements fit the map from where the odometry leads"
+            asked = "did the vehicle skid or slip, or was it carried?"
+            then = then or "; its pose was found again on the map"
+        elif call == OWN:
+            found = f"{since}, the ranges to the map's landmarks do not fit, other calls' paths do"
+            asked = "was the sensor moved, or another range setting used?"
+        else:
+            found = f"{since}, the measurements by {recorded.callers[call - 1].name!r} do not fit"
+            asked = "was this caller moved, or its name given to another?"
+            then = then or "; it was searched for again"
+        yield f"{found} ({who}){then}", asked
 
 
 def _unmapped(trial: "TrialResult", recorded: "Log") -> list[Question]:

@@ -17,7 +17,7 @@ from pipistrelle.detection.logs.readers import reader_of
 from pipistrelle.detection.logs.recording import Log, LogCaller
 from pipistrelle.detection.noise import unstated
 from pipistrelle.detection.scans import Scan
-from pipistrelle.estimation.association import KNOWN
+from pipistrelle.estimation.beliefs import KNOWN
 from pipistrelle.estimation.catalogue import short_name
 from pipistrelle.experiments.drives import split_at
 from pipistrelle.experiments.hearing.listening import Progress

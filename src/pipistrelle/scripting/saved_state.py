@@ -28,10 +28,9 @@ from jaxtyping import Float, jaxtyped
 
 from pipistrelle.config import InputError, RayConfig, Section
 from pipistrelle.detection.scans import Scan
-from pipistrelle.estimation.association import KNOWN
-from pipistrelle.estimation.beliefs import Gaussian, Innovations, JointGaussian, Landmarks
+from pipistrelle.estimation.beliefs import KNOWN, Gaussian, Innovations, JointGaussian, Landmarks
 from pipistrelle.estimation.catalogue import CATALOGUE, names_class
-from pipistrelle.estimation.data_association.existence import Known
+from pipistrelle.estimation.data_association.existence import WINDOW, Known
 from pipistrelle.estimation.data_association.rows import (
     CallerPlace,
     CallerState,
@@ -40,6 +39,7 @@ from pipistrelle.estimation.data_association.rows import (
     Tracks,
 )
 from pipistrelle.estimation.data_association.sequential import METHODS
+from pipistrelle.estimation.data_association.watch import BINS, Watched
 from pipistrelle.estimation.ekf.filter import EkfBelief
 from pipistrelle.estimation.ekf.gaussian import INVARIANT, LINEAR
 from pipistrelle.estimation.fastslam.block import LANES
@@ -56,8 +56,8 @@ from pipistrelle.version import find_version
 
 HEAD = b"# Of Pipistrelle: a drive to go on from\n"
 """First line of the file; the second is the checksum of the rest."""
-FORM = 3
-"""Version of the file format; 1 was a pickle."""
+FORM = 4
+"""Version of the file format; 1 was a pickle, 2 and 3 had no watch."""
 ROLES = ("filter", "association")
 """Keys of the head with the names of estimator and association."""
 OWN = ":"
@@ -85,7 +85,7 @@ RECORDS: dict[str, Any] = {
         Calibration, CallerPlace, CallerState, EkfBelief, FastSlamBelief, Gaussian,
         History, Innovations, JointGaussian, Known, Landmarks, Memory, NoiseModel, Odometry, Points,
         RayConfig, Scan, ScanRows, SessionState, SmootherBelief, Solution, Stack, StoredScan,
-        Stretch, Tracks,
+        Stretch, Tracks, Watched,
     )
 }  # fmt: skip
 """The records that a file may name."""
@@ -651,7 +651,9 @@ LAWS: dict[Any, Callable[[Any], Any]] = {
     EkfBelief: _ekf,
     FastSlamBelief: _fastslam,
     History: _history,
-    Known: lambda it: np.unique(it.label).size == it.label.size,
+    Known: lambda it: (
+        np.unique(it.label).size == it.label.size and it.past.shape == (*it.source.shape, WINDOW)
+    ),
     Memory: lambda it: (
         it.scan >= 0
         and within(it.known.label, 0, it.labels + 1)
@@ -663,6 +665,12 @@ LAWS: dict[Any, Callable[[Any], Any]] = {
     Stack: lambda it: (
         len(room := {len(array) for array in it.arrays if array.ndim}) == len(it.written) == 1
         and 0 <= it.size <= it.written[0] <= min(room)
+    ),
+    Watched: lambda it: (
+        it.hits.shape[1:] == (BINS,)
+        and bool(np.all((it.hits >= 0.0) & (it.hits <= it.asked)))
+        and it.times.shape == (WINDOW,)
+        and 0 <= it.lost <= it.lost * len(it.alarms)
     ),
     Tracks: lambda it: (
         len(it.rows) == len(it.poses) == len(it.times) == len(it.direct)

@@ -5,8 +5,6 @@ import math
 import numpy as np
 import pytest
 
-from pipistrelle.detection.scans import make_scan
-from pipistrelle.estimation.association import expected
 from pipistrelle.estimation.beliefs import JointGaussian
 from pipistrelle.estimation.data_association.pairs import (
     OWN_CALL,
@@ -28,40 +26,40 @@ def joint_of(seed, std=0.02):
     return JointGaussian(landmark=np.array([2, 3, 4, CALLER]), mean=mean, covariance=root @ root.T)
 
 
-def rows_of(scan, way, std):
-    return Rows(scan.bearing, scan.bearing_std, way, std, np.ones(scan.caller.size))
+def predicted(state, n, caller):
+    """Return bearing, and range or excess path, of the landmark at index n of a joint mean."""
+    here, there = state[:2], state[n : n + 2]
+    east, north = there - here
+    far = math.hypot(east, north)
+    if caller != OWN_CALL:
+        source = state[caller : caller + 2]
+        far += math.dist(there, source) - math.dist(here, source)
+    return np.array([math.atan2(north, east) - state[2], far])
 
 
 @pytest.mark.parametrize("seed", range(5))
 @pytest.mark.parametrize("own", [True, False])
-def test_costs_match_the_joint_innovations(seed, own):
+def test_costs_match_the_innovations_by_finite_differences(seed, own):
     joint, rng = joint_of(seed), np.random.default_rng(seed + 100)
-    way = rng.uniform(1.0, 9.0, 6)
-    columns = (
-        {"range": way, "range_std": 0.1}
-        if own
-        else {"excess_path": way, "excess_path_std": 0.2, "caller": 1}
-    )
-    bearing = rng.uniform(-math.pi, math.pi, 6)
-    scan = make_scan(0.0, np.full(6, -1), bearing, bearing_std=0.05, **columns)
-    std = scan.range_std if own else scan.excess_path_std
+    bearing, way, stds = rng.uniform(-math.pi, math.pi, 6), rng.uniform(1.0, 9.0, 6), (0.05, 0.1)
+    columns = bearing, np.full(6, stds[0]), way, np.full(6, stds[1]), np.ones(6)
     at = 3 + 2 * np.arange(4)
     caller = OWN_CALL if own else int(at[3])
-    found = pair_costs(
-        tuple(rows_of(scan, way, std)), joint.mean, joint.covariance, at, caller, CHANCES
-    )
-    labels = joint.landmark if own else joint.landmark[:3]
-    row, landmark = np.meshgrid(np.arange(6), labels, indexing="ij")
-    callers = np.array([-1, CALLER])
-    pairs = expected(joint, scan, row.ravel(), landmark.ravel(), callers)
-    used = [0, 1] if own else [0, 2]
-    for n, (m, label) in enumerate(zip(row.ravel(), landmark.ravel(), strict=True)):
-        nu = pairs.difference[n, used]
-        S = pairs.covariance[n, :, n][np.ix_(used, used)]
-        squared = nu @ np.linalg.solve(S, nu)
-        cost = squared + math.log(np.linalg.det(2.0 * math.pi * S)) + 2.0 * math.log(0.06 / 0.8)
-        column = joint.landmark.tolist().index(label)
-        assert found[m, column] == pytest.approx(cost, rel=1e-9)
+    found = pair_costs(columns, joint.mean, joint.covariance, at, caller, CHANCES)
+    sides = 1e-5 * np.eye(joint.mean.size)
+    for n, place in enumerate(at[: 4 if own else 3]):
+        ahead, behind = (
+            np.array([predicted(joint.mean + one, place, caller) for one in sign * sides])
+            for sign in (1.0, -1.0)
+        )
+        H = (ahead - behind).T / 2e-5
+        S = H @ joint.covariance @ H.T + np.diag(np.square(stds))
+        for m in range(6):
+            nu = np.array([bearing[m], way[m]]) - predicted(joint.mean, place, caller)
+            nu[0] = math.remainder(nu[0], math.tau)
+            squared = nu @ np.linalg.solve(S, nu)
+            cost = squared + math.log(np.linalg.det(2.0 * math.pi * S)) + 2.0 * math.log(0.06 / 0.8)
+            assert found[m, n] == pytest.approx(cost, rel=1e-6)
     if not own:
         assert np.isinf(found[:, 3]).all(), "a caller is no echo of its own call"
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from pipistrelle.detection.scans import UNLABELLED, make_scan
-from pipistrelle.estimation.association import is_among
+from pipistrelle.estimation.beliefs import is_among
 from pipistrelle.estimation.data_association.pairs import OWN_CALL
 from pipistrelle.estimation.data_association.rows import (
     ASSUMED,

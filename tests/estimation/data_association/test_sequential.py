@@ -57,7 +57,7 @@ def scan_of(places, pose=(0.0, 0.0, 0.0), rng=None, time=0.0, level=40.0, **stds
     return make_scan(time, labels, bearing, range=far, level_db=level, **STDS | stds)
 
 
-@pytest.mark.parametrize("method", ["nearest", "joint", "marginal"])
+@pytest.mark.parametrize("method", ["nearest", "marginal"])
 @pytest.mark.parametrize("name", ["ekf", "iekf", "smoother", "fastslam"])
 def test_separate_landmarks_keep_their_labels_while_the_vehicle_drives(name, method):
     session, rng = session_of(name, method), np.random.default_rng(3)
@@ -332,7 +332,7 @@ def test_no_world_of_four_hundred_landmarks_is_lost(seed):
     assert found.associated_right > 0.94
 
 
-@pytest.mark.parametrize("method", ["nearest", "joint", "marginal"])
+@pytest.mark.parametrize("method", ["nearest", "marginal"])
 def test_a_scan_of_two_thousand_rows_begins_as_many_landmarks(method):
     rng = np.random.default_rng(4)
     places = rng.permutation(2000)[:, None] * np.array([0.0, 0.5]) + np.array([5.0, -500.0])

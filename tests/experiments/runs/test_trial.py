@@ -15,8 +15,7 @@ from pipistrelle.config import (
 )
 from pipistrelle.detection.noise import without_hidden
 from pipistrelle.detection.scans import scan_of, without_labels
-from pipistrelle.estimation.association import Assignment
-from pipistrelle.estimation.beliefs import Gaussian
+from pipistrelle.estimation.beliefs import Assignment, Gaussian
 from pipistrelle.estimation.catalogue import entry
 from pipistrelle.estimation.motion import Motion
 from pipistrelle.experiments.drives import Drive

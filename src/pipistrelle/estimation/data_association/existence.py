@@ -28,9 +28,9 @@ import numpy as np
 from jaxtyping import Bool, Float, Int, UInt8
 
 from pipistrelle.detection.scans import OWN
-from pipistrelle.estimation.association import is_among
-from pipistrelle.estimation.beliefs import JointGaussian
+from pipistrelle.estimation.beliefs import JointGaussian, is_among
 from pipistrelle.estimation.measurement import excess_path_slopes
+from pipistrelle.estimation.session import REMEMBERED
 from pipistrelle.geometry import wrap_angle
 from pipistrelle.jit import Whole, kernel, no_alloc
 
@@ -39,9 +39,10 @@ HEARD, MISSED = 2.0, 1.3
 probability 0.1."""
 MOST, CONFIRMED, GONE = 8.0, 3.0, -2.0
 """Log odds: upper limit, confirmation, removal."""
-LEAST_SCANS, PATIENCE = 3, 25
-"""Detections that confirm a landmark; scans without detection that remove an unconfirmed landmark.
-"""
+PATIENCE = 25
+"""Scans without detection that remove an unconfirmed landmark."""
+LEVEL_STD = 5.0
+"""Standard deviation of levels [dB]."""
 LASTING = 12
 """Detections from which a landmark that the vehicle's own call detected is unconfirmed, but not
 removed. If detected only by other callers, its position depends on theirs and may be wrong."""
@@ -62,6 +63,8 @@ NEAR = 0.3
 """Least distance for spherical spreading [m]."""
 FORGETTING = 0.2
 """Weight of the newest level in the mean."""
+WINDOW = REMEMBERED
+"""Scans of which `Known.past` is kept."""
 OFTEN = 255
 """Largest count of joint detections."""
 
@@ -81,6 +84,8 @@ class Known(NamedTuple):
     """Level at 1 m from the landmark (and from a moving caller), by caller [dB], or NaN."""
     aim: Float[np.ndarray, " l"]
     """Bearing of the landmark at its last echo of the vehicle's own call [rad]."""
+    past: Float[np.ndarray, "l c w"]
+    """Log probability of a miss in each of the last `WINDOW` scans, by caller; 1 if detected."""
     together: UInt8[np.ndarray, "l l"]
     """Number of scans in which both landmarks were detected by the same caller."""
 
@@ -89,7 +94,8 @@ def nobody(callers: int) -> Known:
     """Return empty records of tracked landmarks, for a number of callers."""
     whole, number = np.empty(0, np.int64), np.empty(0)
     none, together = np.empty((0, callers)), np.empty((0, 0), np.uint8)
-    return Known(whole, whole, whole, whole, number, np.empty(0, np.bool_), none, number, together)
+    yes, past = np.empty(0, np.bool_), np.empty((0, callers, WINDOW))
+    return Known(whole, whole, whole, whole, number, yes, none, number, past, together)
 
 
 def with_new(known: Known, labels: list[int], scan: int, callers: int) -> Known:
@@ -107,8 +113,10 @@ def _with_new(
     """Return the records' arrays with entries for new landmarks appended."""
     known, none = Known(*columns), np.zeros(labels.size, np.int64)
     old, size = known.label.size, known.label.size + labels.size
-    source, together = np.full((size, callers), np.nan), np.zeros((size, size), np.uint8)
+    source, past = np.full((size, callers), np.nan), np.zeros((size, callers, WINDOW))
     source[:old, : known.source.shape[1]] = known.source
+    past[:old, : known.source.shape[1]] = known.past
+    together = np.zeros((size, size), np.uint8)
     together[:old, :old] = known.together
     return (
         np.append(known.label, labels),
@@ -119,6 +127,7 @@ def _with_new(
         np.append(known.confirmed, np.zeros(labels.size, np.bool_)),
         source,
         np.append(known.aim, np.full(labels.size, np.nan)),
+        past,
         together,
     )
 
@@ -217,7 +226,7 @@ def _judge(
                 here = _missed(known, n, c, far, bearing, rows, there, near[n], sight)
                 missed = max(missed, here)
             _lower(known, n, MISSED * missed, scan)
-        if known.odds[n] >= CONFIRMED and known.count[n] >= LEAST_SCANS:
+        if known.odds[n] >= CONFIRMED:
             known.confirmed[n] = True
     _count_together(known.together, place, caller)
 

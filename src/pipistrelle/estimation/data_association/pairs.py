@@ -1,4 +1,4 @@
-r"""Match the measurements of a scan with landmarks: pair costs and three matching methods.
+r"""Match the measurements of a scan with landmarks: pair costs and two matching methods.
 
 **Costs** (`pair_costs`). Own calls give bearing and range, another caller's bearing and, with the
 caller on the map, excess path. A measurement and a landmark have the squared distance
@@ -16,17 +16,6 @@ landmark, which may be merged later (`existence.doubles`).
 
 **Nearest** (`nearest`): the assignment of least total cost, each landmark at most once.
 
-**Joint compatibility** (`jointly_compatible`): the largest set of pairs of negative cost that is
-consistent as a whole, as all share the error of the pose. With the joint innovation :math:`\nu` and
-its covariance S = L L^T
-
-.. math:: d^2 = |y|^2, \qquad L y = \nu,
-
-and the set is compatible while :math:`d^2` is within the quantile of :math:`\chi^2`. Each further
-pair appends two rows to L and two numbers to y. The branch-and-bound search tries the likeliest
-landmark of each measurement first and clutter last, and ends after `MOST_NODES` with the best set
-so far. Neira & Tardos, IEEE Transactions on Robotics and Automation 17 (2001).
-
 **Marginal** (`marginal`): pairs of high marginal probability over all assignments, by messages
 between measurements i and landmarks j until convergence. With :math:`w_{ij} = e^{-c_{ij} / 2}`
 
@@ -39,7 +28,6 @@ Transactions on Aerospace and Electronic Systems 50 (2014).
 
 import math
 from collections.abc import Callable
-from functools import cache
 from typing import NamedTuple
 
 import numpy as np
@@ -52,11 +40,7 @@ from pipistrelle.jit import Whole, kernel, no_alloc
 
 NOTHING = -1
 """Index of a measurement without landmark."""
-Innovations = tuple[Float[np.ndarray, " e"], Float[np.ndarray, "e e"], Int[np.ndarray, " p"]]
-"""Innovation of pairs (two numbers each), its covariance, and numbers measured for each pair."""
-Innovate = Callable[[tuple[Int[np.ndarray, " p"], Int[np.ndarray, " p"]]], Innovations]
-"""Function from pairs to their joint innovation (`pair_innovations`)."""
-Match = Callable[[Float[np.ndarray, "m n"], Innovate | None], Int[np.ndarray, " m"]]
+Match = Callable[[Float[np.ndarray, "m n"]], Int[np.ndarray, " m"]]
 """Function from pair costs to the landmark of each measurement, or NOTHING."""
 LIKELY, SURE = 0.9, 0.99
 """Least probability of any landmark, and least share of the best landmark in it."""
@@ -68,9 +52,7 @@ FARTHEST = 1e6
 """Finite substitute for an infinite cost."""
 
 
-def nearest(
-    costs: Float[np.ndarray, "m n"], innovate: Innovate | None = None
-) -> Int[np.ndarray, " m"]:
+def nearest(costs: Float[np.ndarray, "m n"]) -> Int[np.ndarray, " m"]:
     """Return each measurement's landmark by the assignment of least total cost, or NOTHING.
 
     >>> nearest(np.array([[-5.0, -4.0], [-4.5, np.inf], [3.0, np.inf]]))
@@ -87,9 +69,8 @@ def nearest(
     return found
 
 
-def marginal(
-    costs: Float[np.ndarray, "m n"], innovate: Innovate | None = None
-) -> Int[np.ndarray, " m"]:
+@kernel
+def marginal(costs: Float[np.ndarray, "m n"]) -> Int[np.ndarray, " m"]:
     """Return each measurement's landmark if its marginal probability is high, else NOTHING.
 
     >>> marginal(np.array([[-9.0, -9.0], [np.inf, np.inf]]))
@@ -97,12 +78,6 @@ def marginal(
     >>> marginal(np.array([[-9.0, -9.0], [np.inf, -20.0]]))
     array([0, 1])
     """
-    return _what_is_sure(costs)
-
-
-@kernel
-def _what_is_sure(costs: Float[np.ndarray, "m n"]) -> Int[np.ndarray, " m"]:
-    """Return each measurement's landmark if its marginal probability is high, else NOTHING."""
     rows, landmarks, shares = _shares(costs)
     found, first = np.full(costs.shape[0], NOTHING), 0
     while first < rows.size:
@@ -163,135 +138,6 @@ def _sum_up(
     sums[:] = 1.0
     for p in range(rows.size):
         sums[rows[p]] += weight[p] * to_row[p]
-
-
-CONFIDENCE = 0.999
-"""Share of correct sets within the gate."""
-MOST_NODES, MOST_ROWS = 3000, 100
-"""Most pairs tried, and most measurements tested jointly, as the work grows with their cube."""
-
-
-@cache
-def gates(numbers: int) -> Float[np.ndarray, " g"]:
-    """Return the gates on a squared Mahalanobis distance for 0, 1, ... degrees of freedom.
-
-    >>> gates(2).round(2)
-    array([ 0.  , 10.83, 13.82])
-    """
-    from scipy.special import gammaincinv
-
-    return 2.0 * gammaincinv(np.maximum(np.arange(numbers + 1), 1e-9) / 2.0, CONFIDENCE)
-
-
-def jointly_compatible(
-    costs: Float[np.ndarray, "m n"], innovate: Innovate | None
-) -> Int[np.ndarray, " m"]:
-    """Return each measurement's landmark by the largest jointly compatible set, or NOTHING."""
-    found = np.full(len(costs), NOTHING)
-    row, landmark = np.nonzero(costs < 0.0)
-    if not row.size or innovate is None:
-        return found
-    order = np.lexsort((costs[row, landmark], row))
-    row, landmark = row[order], landmark[order]
-    rows, begins, counts = np.unique(row, return_index=True, return_counts=True)
-    likely = np.arange(row.size) - np.repeat(begins, counts) < MOST_NODES // min(
-        rows.size, MOST_ROWS
-    )
-    row, landmark = row[likely], landmark[likely]
-    for first in range(0, rows.size, MOST_ROWS):
-        part = (row >= rows[first]) & (row <= rows[first : first + MOST_ROWS][-1])
-        part &= ~np.isin(landmark, found)  # taken by earlier measurements
-        _match_together(found, row[part], landmark[part], innovate)
-    return found
-
-
-def _match_together(
-    found: Int[np.ndarray, " m"],
-    row: Int[np.ndarray, " p"],
-    landmark: Int[np.ndarray, " p"],
-    innovate: Innovate,
-) -> None:
-    """Write the landmarks of a batch of measurements by the largest jointly compatible set."""
-    options = np.append(np.flatnonzero(np.diff(row, prepend=-1)), row.size)
-    pairs = _search(options, landmark, innovate((row, landmark)), gates(2 * (options.size - 1)))
-    found[row[pairs]] = landmark[pairs]
-
-
-@kernel
-def _search(
-    options: Int[np.ndarray, " o"],
-    landmark: Int[np.ndarray, " p"],
-    innovations: Innovations,
-    gate: Float[np.ndarray, " g"],
-) -> Int[np.ndarray, " c"]:
-    """Return the largest jointly compatible set of pairs, by branch and bound."""
-    levels, numbers = options.size - 1, innovations[2]
-    L, y = np.zeros((2 * levels, 2 * levels)), np.zeros(2 * levels)
-    chosen, best = np.empty(levels, np.int64), np.empty(levels, np.int64)
-    count, used, squared = (
-        np.zeros(levels + 1, np.int64), np.zeros(levels + 1, np.int64), np.zeros(levels + 1)
-    )  # fmt: skip
-    following, level, most, least, nodes = options.copy(), 0, 0, math.inf, 0
-    while level >= 0:
-        k, option = count[level], following[level]
-        if level == levels or option > options[level + 1] or nodes >= MOST_NODES:
-            if level == levels and (k > most or (k == most and squared[level] < least)):
-                most, least = k, squared[level]
-                best[:k] = chosen[:k]
-            level -= 1
-            continue
-        following[level] += 1
-        here = level + 1
-        count[here], used[here], squared[here] = k, used[level], squared[level]
-        if option < options[here]:
-            nodes += 1
-            if _is_taken(landmark, chosen, k, option):
-                continue
-            chosen[k] = option
-            squared[here] += _extended(L, y, chosen, k, innovations)
-            count[here], used[here] = k + 1, used[level] + numbers[option]
-            if squared[here] > gate[used[here]]:
-                continue
-        hoped = count[here] + levels - here
-        if hoped > most or (hoped == most and squared[here] < least):
-            level = here
-            following[level] = options[level]
-    return best[:most].copy()
-
-
-@no_alloc
-def _is_taken(
-    landmark: Int[np.ndarray, " p"], chosen: Int[np.ndarray, " c"], k: Whole, option: Whole
-) -> bool:
-    """Return whether a pair's landmark is already matched in the first k chosen pairs."""
-    taken = False
-    for n in range(k):
-        taken |= landmark[chosen[n]] == landmark[option]
-    return taken
-
-
-@no_alloc
-def _extended(
-    L: Float[np.ndarray, "d d"],
-    y: Float[np.ndarray, " d"],
-    chosen: Int[np.ndarray, " c"],
-    k: Whole,
-    innovations: Innovations,
-) -> float:
-    """Extend innovations' Cholesky factor by a pair; return its part of the squared distance."""
-    nu, S, _ = innovations
-    for a in (2 * k, 2 * k + 1):
-        whole = 2 * chosen[k] + a - 2 * k
-        rest = nu[whole]
-        for b in range(a + 1):
-            value = S[whole, 2 * chosen[b // 2] + b % 2]
-            for c in range(b):
-                value -= L[a, c] * L[b, c]
-            L[a, b] = math.sqrt(max(value, 1e-300)) if b == a else value / L[b, b]
-            if b < a:
-                rest -= L[a, b] * y[b]
-        y[a] = rest / L[a, a]
-    return y[2 * k] ** 2 + y[2 * k + 1] ** 2
 
 
 class Rows(NamedTuple):
@@ -365,45 +211,6 @@ def pair_costs(
             if squared < made.gate and size > 0.0:  # determinant may be lost to rounding
                 costs[m, n] = squared + math.log(size) + 2.0 * math.log(density / made.detection)
     return costs
-
-
-@kernel
-def pair_innovations(
-    rows: tuple[np.ndarray, ...],
-    mean: Float[np.ndarray, " d"],
-    covariance: Float[np.ndarray, "d d"],
-    at: Int[np.ndarray, " n"],
-    caller: Whole,
-    pairs: tuple[Int[np.ndarray, " p"], Int[np.ndarray, " p"]],
-) -> tuple[Float[np.ndarray, " e"], Float[np.ndarray, "e e"], Int[np.ndarray, " p"]]:
-    """Return innovations of measurement-landmark pairs, and the joint covariance of all.
-
-    Each pair has two numbers, and a count of measured numbers; missing numbers are 0 of variance 1.
-    """
-    heard, (row, landmark) = Rows(*rows), pairs
-    nu, S, numbers = np.zeros(2 * row.size), np.zeros((2 * row.size, 2 * row.size)), row.copy()
-    H, index = np.zeros((row.size, 2, 7)), np.zeros((row.size, 7), np.int64)
-    for p in range(row.size):
-        m, k = row[p], 2 * p
-        bearing, way = _expected(mean, at[landmark[p]], caller, H[p], index[p])
-        nu[k], S[k, k] = wrap_angle(heard.bearing[m] - bearing), heard.bearing_std[m] ** 2
-        if math.isnan(heard.way[m]) or caller == UNPLACED:
-            H[p, 1], S[k + 1, k + 1], numbers[p] = 0.0, 1.0, 1
-        else:
-            nu[k + 1], S[k + 1, k + 1] = heard.way[m] - way, heard.way_std[m] ** 2
-            numbers[p] = 2
-        for q in range(p + 1):
-            for a in range(2):
-                for b in range(2):
-                    both = 0.0
-                    for i in range(7):
-                        for j in range(7):
-                            spread = covariance[index[p, i], index[q, j]]
-                            both += H[p, a, i] * spread * H[q, b, j]
-                    S[k + a, 2 * q + b] += both
-                    if q < p:
-                        S[2 * q + b, k + a] += both
-    return nu, S, numbers
 
 
 @no_alloc

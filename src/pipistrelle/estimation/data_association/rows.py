@@ -30,9 +30,8 @@ from pipistrelle.detection.scans import (
     UNLABELLED,
     Scan,
 )
-from pipistrelle.estimation.association import is_among
-from pipistrelle.estimation.beliefs import Gaussian
-from pipistrelle.estimation.data_association.existence import Known, nobody
+from pipistrelle.estimation.beliefs import Gaussian, is_among
+from pipistrelle.estimation.data_association.existence import LEVEL_STD, Known, nobody
 from pipistrelle.estimation.data_association.pairs import (
     NOTHING,
     UNPLACED,
@@ -41,6 +40,7 @@ from pipistrelle.estimation.data_association.pairs import (
     nearest,
     pair_costs,
 )
+from pipistrelle.estimation.data_association.watch import Watched, of_calls
 from pipistrelle.geometry import wrap, wrap_angle
 from pipistrelle.jit import Flag, Whole, kernel, no_alloc
 
@@ -50,8 +50,8 @@ AT_SCAN, AT_BEARING, AT_WAY, AT_BEARING_STD, AT_WAY_STD, AT_LEVEL, AT_X, AT_Y = 
 """Columns of a sighting; the bearing is in the world, and x and y are the vehicle's."""
 SILENT, EVEN = 4, 6
 """Scans without sightings that end a track, and scans over which its change counts as linear."""
-NEW_BEARING_STD, NEW_WAY_STD, GATE, LEVEL_STD = 0.05, 0.3, 12.0, 5.0
-"""Largest stds of a first sighting [rad, m]; gate on the squared distance; std of levels [dB]."""
+NEW_BEARING_STD, NEW_WAY_STD, GATE = 0.05, 0.3, 12.0
+"""Largest stds of a first sighting [rad, m], and gate on the squared distance."""
 Model = tuple[float, float, float, float, float]
 """Stds of the change of a pose's error in a scan [m, rad], stds of a caller's initial velocity
 [m/s] and of its change in a second [m/s], and clutter density over detection probability."""
@@ -421,19 +421,17 @@ class CallerPlace(NamedTuple):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class CallerState:
-    """A caller's state in data association: label, position, tracks, and test of the position."""
+    """A caller's state in data association: label, position and tracks."""
 
     label: int
     place: CallerPlace | None = None
     """Position found by the search."""
     told: bool = False
     tracks: Tracks = field(default_factory=Tracks)
-    trial: tuple[tuple[int, int], ...] = ()
-    """Matched and total counts of its measurements, for each scan since it is on the map."""
-    since: int = 0
-    """Number of the scan in which it was put on the map."""
-    found: int = 0
-    """Number of the scan in which its position was found; later scans test it."""
+    failed: int = 0
+    """Number of the scan since which its former position has failed (`watch`)."""
+    former: tuple[int, ...] = ()
+    """Labels of its former positions."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -450,6 +448,7 @@ class Memory:
     """Predicted pose of the last scan."""
     drift: tuple[float, float] = (0.0, 0.0)
     """Largest stds of the change of a predicted pose's error between two scans [m, rad]."""
+    watch: Watched = field(default_factory=lambda: of_calls(1))
 
 
 def drift_of(memory: Memory, pose: Gaussian) -> tuple[float, float]:

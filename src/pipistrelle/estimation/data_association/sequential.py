@@ -9,8 +9,9 @@ afterwards the session repeats all scans in its memory.
 """
 
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -26,9 +27,18 @@ from pipistrelle.detection.scans import (
     Scan,
     with_callers,
 )
-from pipistrelle.estimation.association import KNOWN, Assignment, Association, is_among
-from pipistrelle.estimation.beliefs import Belief, Gaussian, JointGaussian, Landmarks
+from pipistrelle.estimation.beliefs import (
+    KNOWN,
+    Assignment,
+    Association,
+    Belief,
+    Gaussian,
+    JointGaussian,
+    Landmarks,
+    is_among,
+)
 from pipistrelle.estimation.catalogue import ASSOCIATION, build, class_of, names_class
+from pipistrelle.estimation.data_association import watch
 from pipistrelle.estimation.data_association.caller_search import (
     direct_row,
     may_have_turned,
@@ -37,6 +47,7 @@ from pipistrelle.estimation.data_association.caller_search import (
 )
 from pipistrelle.estimation.data_association.existence import (
     GONE,
+    WINDOW,
     Known,
     asked_of,
     doubles,
@@ -50,15 +61,12 @@ from pipistrelle.estimation.data_association.pairs import (
     OWN_CALL,
     UNPLACED,
     Chances,
-    Innovations,
     Match,
     PlainChances,
     Rows,
-    jointly_compatible,
     marginal,
     nearest,
     pair_costs,
-    pair_innovations,
     with_points,
 )
 from pipistrelle.estimation.data_association.rows import (
@@ -78,14 +86,7 @@ from pipistrelle.estimation.data_association.rows import (
     places_of,
     rows_of_scan,
 )
-
-DIRECT_GATE = 9.0
-"""Gate on the squared distance of a caller's direct call."""
-PROBATION = 40
-"""Scans within which a caller's position may be rejected."""
-TRIAL, SETTLING, LEAST_SHARE, LEAST_ROWS = 9, 3, 0.4, 10
-"""Scans over which a caller's position is tested, and skipped first; least share and number of
-precise measurements that match old landmarks."""
+from pipistrelle.estimation.data_association.watch import Watched
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -143,41 +144,51 @@ class Sequential(Association[Memory]):
         return Memory()
 
     def carried(self, memory: Memory, later: Memory) -> Memory:
-        """Return an earlier memory with the callers' positions that a later memory adds."""
-        known = dict(memory.callers)
+        """Return an earlier memory with callers' positions and failures that a later one adds."""
+        known, labels, failed = dict(memory.callers), memory.labels, later.watch.lost == 1
         for number, caller in sorted(later.callers.items()):
-            before = known.get(number, CallerState(label=memory.labels + 1))
-            if caller.place not in (None, before.place):
-                memory = replace(memory, labels=max(memory.labels, before.label))
-                found = {"place": caller.place, "found": caller.found}
-                known[number] = CallerState(label=before.label, **found)
-        return replace(memory, callers=known)
+            before = known.get(number, CallerState(label=labels + 1))
+            if before.failed < caller.failed <= memory.scan:
+                before, failed = replace(caller, label=labels + 1), True
+            elif caller.place in (None, before.place) or before.failed != caller.failed:
+                continue
+            labels = max(labels, before.label)
+            known[number] = replace(before, place=caller.place, told=False, tracks=Tracks())
+        watched = memory.watch
+        if failed:
+            alarms, lost = later.watch.alarms, later.watch.lost
+            watched = watched._replace(alarms=alarms, lost=1 if lost == 1 else watched.lost)
+        return replace(memory, callers=known, labels=labels, watch=watched)
 
     def knowing(self, memory: Memory, known: Landmarks, callers: Int[np.ndarray, " c"]) -> Memory:
         """Return the memory with the callers on the initial map, which need no search."""
         numbers = {label: number for number, label in enumerate(callers.tolist())}
         rows = zip(known.landmark.tolist(), known.mean.tolist(), strict=True)
         stated = {
-            numbers[label]: CallerState(
-                label=label, place=CallerPlace(x, y), told=True, since=-PROBATION - 1
-            )
+            numbers[label]: CallerState(label=label, place=CallerPlace(x, y), told=True)
             for label, (x, y) in rows
             if label in numbers
         }
         return replace(memory, callers={**memory.callers, **stated})
 
     def tentative(self, memory: Memory) -> list[int]:
-        """Return the labels of landmarks that repeated detection has not yet confirmed."""
-        return memory.known.label[~memory.known.confirmed].tolist()
+        """Return the labels of unconfirmed landmarks, and of callers' former positions."""
+        former = [label for caller in memory.callers.values() for label in caller.former]
+        return memory.known.label[~memory.known.confirmed].tolist() + former
+
+    def report(self, memory: Memory) -> Mapping[str, Any]:
+        """Return each call's share of detected old landmarks, and the alarms about it."""
+        return watch.reported(memory.watch)
 
     def associate(self, memory: Memory, belief: Belief, scan: Scan) -> tuple[Memory, Assignment]:
         """Label a scan's measurements; return the new memory and the assignment."""
         work = _Work(self, memory, belief, scan)
-        found = work.search_callers()
-        for number in sorted({*scan.caller.tolist()}):
-            work.match(number)
+        work.search_callers()
+        work.match_all()
+        work.watch_calls()
         after, assignment = work.finished()
-        return after, replace(assignment, revised={0: None}) if found else assignment
+        again = {} if work.back is None else {work.back: None}
+        return after, replace(assignment, revised=again)
 
 
 class _Work:
@@ -200,11 +211,14 @@ class _Work:
         most = limits.bearing_std, limits.way_std, limits.birth_way_std
         self.rows = rows_of_scan(scan, most, limits.assumed)
         self.new: list[int] = []
+        self.doubted = self.moves | {n for n, caller in self.callers.items() if caller.failed}
+        self.before, self.watch, self.known = self.joint, memory.watch, memory.known
+        self.back: int | None = None
+        self.blind, self.begins = False, not memory.watch.lost
         self.near = np.zeros(self.joint.landmark.size + scan.landmark.size, np.bool_)
 
-    def search_callers(self) -> bool:
-        """Track echoes of unlocated callers; return whether a new position was found."""
-        found = False
+    def search_callers(self) -> None:
+        """Track echoes of unlocated callers, and search for their positions."""
         for number, row in enumerate(self.scan.direct.tolist()):
             if number == OWN or (row < 0 and number not in self.callers):
                 continue
@@ -213,10 +227,10 @@ class _Work:
                 caller = self._followed(number, caller, row)
                 place = place_caller(caller.tracks, number in self.moves, self.model)
                 if place is not None:
-                    caller = replace(caller, place=place, found=self.memory.scan)
-                    found = True
+                    caller = replace(caller, place=place)
+                    if not caller.failed:  # else earlier scans are of its former position
+                        self.back = 0
             self.callers[number] = caller
-        return found
 
     def _followed(self, number: int, caller: CallerState, row: int) -> CallerState:
         """Add this scan's measurements to the tracks of an unlocated caller; return its record."""
@@ -225,6 +239,122 @@ class _Work:
         direct = numbers[:, row] if row >= 0 else np.full(2, math.nan)
         time, pose = self.scan.time, self.pose.mean
         return replace(caller, tracks=followed(caller.tracks, time, pose, direct, rows, self.model))
+
+    def match_all(self) -> None:
+        """Match the measurements of each caller with landmarks, the vehicle's own first."""
+        for number in sorted({*self.scan.caller.tolist()}):
+            self.match(number)
+
+    def watch_calls(self) -> None:
+        """Judge each call by its measurements of old landmarks; repair a failed call or pose."""
+        judged, where = self._calls()
+        watched, counts = watch.of_calls(where.size, self.memory.watch), self._observe(judged)
+        watched = watched._replace(times=np.append(watched.times[1:], self.scan.time))
+        least = np.where(judged, 1, WINDOW + 1)
+        for number in {*self.callers} & {*np.flatnonzero(judged).tolist()}:
+            row = self._direct(number)
+            fits = row >= 0 and self.label[row] == self.callers[number].label
+            least[number] = watch.SPOILT if fits else WINDOW // 2
+        ratio = watch.ratios(self.known, self._old()[0], self.memory.scan)
+        calls, since, pose = watch.failed(watched, ratio, least)
+        if watched.lost and calls:
+            joint, lost = self._placed_again(), watched.lost + 1
+            self.blind = joint is None and lost <= watch.SETTLED
+            watched = watched._replace(lost=lost if joint or self.blind else 0)
+            self.begins = not watched.lost
+            self._match_again(joint or self.before)
+            counts = self._observe(judged) if joint else map(np.zeros_like, counts)
+            self.known.past[:] *= watched.lost > 0
+        elif calls and self.back is None:
+            watched = self._alarmed(watched, calls, since, pose)
+        elif watched.lost and (ratio[judged, -1] < 0.0).any():
+            watched.alarms[-1, 2], watched = 1.0, watched._replace(lost=0)
+            self.known.past[..., :-1] = 0.0
+        sums = [*map(np.add, watched[:4], counts)]
+        self.watch = watched._replace(hits=sums[0], asked=sums[1], heard=sums[2], expected=sums[3])
+
+    def _alarmed(self, watched: Watched, calls: list[int], since: int, pose: bool) -> Watched:
+        """Report a failure of the pose or of calls; set failed callers aside, since its scan."""
+        scan = self.memory.scan + 1 - WINDOW + since
+        if pose:
+            self.back = scan
+            return watch.alarmed(watched, since, watch.POSE, repaired=False)._replace(lost=1)
+        for call in calls:
+            if call != OWN:
+                former = (*self.callers[call].former, self.callers[call].label)
+                aside = CallerState(label=self._another(), failed=scan, former=former)
+                self.callers[call], self.back = aside, scan
+            if call != OWN or OWN not in watched.alarms[:, 1]:
+                watched = watch.alarmed(watched, since, call, repaired=call != OWN)
+        return watched
+
+    def _match_again(self, joint: JointGaussian) -> None:
+        """Match all measurements again by another joint Gaussian of pose and map."""
+        self.joint, self.new, self.near[:] = joint, [], False
+        self.label[:], self.named[:] = UNLABELLED, UNLABELLED
+        self.match_all()
+
+    def _placed_again(self) -> JointGaussian | None:
+        """Return the joint Gaussian with the pose that the scan has on the old map, if any."""
+        (old, at), heard, rows = self._old(), [], self.rows
+        for number in {*self.scan.caller.tolist()}:
+            caller, row = self.callers.get(number), self._direct(number)
+            place = OWN_CALL if number == OWN else self._where(caller.label) if caller else -1
+            if number == OWN or (place >= 0 and row >= 0 and number not in self.moves):
+                used = rows.with_way & (rows.caller == number)
+                used[row] &= number == OWN
+                direct = np.array([rows.bearing[row], rows.bearing_std[row]])
+                heard.append((number, self._some(used), direct, place))
+        watched = watch.of_calls(self._calls()[0].size, self.memory.watch)
+        placed = at[old], self.known.source[old], heard
+        return watch.placed_again(watched, self.before, *placed, self.stage.chances)
+
+    def _observe(self, judged: Bool[np.ndarray, " c"]) -> tuple[np.ndarray, ...]:
+        """Record which old landmarks each call has detected; return changes of the counts."""
+        known = with_new(self.memory.known, [], self.memory.scan, judged.size)
+        rows, (old, at) = self.rows, self._old()
+        watched = watch.of_calls(judged.size, self.memory.watch)
+        p, bins = watch.probabilities(watched, self.joint.mean, at[old], known.source[old])
+        same = known.label[old][:, np.newaxis] == self.label
+        of = rows.caller == np.flatnonzero(judged)[:, np.newaxis]
+        found, strays = np.zeros(p.shape, np.bool_), np.zeros(judged.size)
+        found[judged] = (of[:, np.newaxis] & same).any(axis=-1)
+        strays[judged] = (of & rows.sure & ~same.any(axis=0)).sum(axis=1)
+        asked = judged[:, np.newaxis] & ~self._near(judged[:, np.newaxis] & ~found, at[old])
+        now, counts = watch.observed(watched, (p, bins), (found, asked, strays))
+        past = np.append(known.past[..., 1:], np.zeros((*known.past.shape[:2], 1)), axis=-1)
+        past[old, :, -1], self.known = now.T, known._replace(past=past)
+        return counts
+
+    def _near(
+        self, missed: Bool[np.ndarray, "c n"], there: Int[np.ndarray, " n"]
+    ) -> Bool[np.ndarray, "c n"]:
+        """Return which missed landmarks have a measurement of the call within the gate."""
+        near, chances = np.zeros_like(missed), (*self.stage.chances[:4], math.inf)
+        for c in np.flatnonzero(missed.any(axis=1)).tolist():
+            rows = tuple(self._some(self.rows.usable & (self.rows.caller == c)))
+            at = OWN_CALL if c == OWN else self._where(self.callers[c].label)
+            placed = rows, self.joint.mean, self.joint.covariance, there[missed[c]], at
+            near[c, missed[c]] = np.isfinite(pair_costs(*placed, chances)).any(axis=0)
+        return near
+
+    def _old(self) -> tuple[Bool[np.ndarray, " l"], Int[np.ndarray, " l"]]:
+        """Return whether each known landmark is old, and the landmarks' joint-mean indices."""
+        known = self.memory.known
+        at, _ = places_of(known.label, self.joint.landmark, self.near)
+        return known.confirmed & (at >= 0), at
+
+    def _calls(self) -> tuple[Bool[np.ndarray, " c"], Int[np.ndarray, " c"]]:
+        """Return whether to judge each call by this scan, and callers' joint-mean indices."""
+        scan, source = self.scan, self.memory.known.source
+        size = max(1 + scan.caller.max(initial=0), scan.direct.size, source.shape[1])
+        size = max(size, len(self.memory.watch.hits))
+        where, judged = np.full(size, UNPLACED), np.zeros(size, np.bool_)
+        for number, caller in self.callers.items():
+            where[number] = self._where(caller.label)
+        for number in {*scan.caller.tolist()} - self.moves:
+            judged[number] = number == OWN or where[number] >= 0
+        return judged, where
 
     def match(self, number: int) -> None:
         """Match a caller's measurements with landmarks; begin landmarks where none fits."""
@@ -237,21 +367,15 @@ class _Work:
         rows, chances, known = tuple(self.rows), self.stage.chances, self.memory.known
         joint, telling = self._joint(), 2.0 * self.stage.limits.bearing_std
         used, costs, near = compared(rows, joint, self.moving, self.near, caller, chances, telling)
-
-        def innovate(pairs: tuple[np.ndarray, np.ndarray]) -> Innovations:
-            part, there = part_of(self.rows, used, 0.0), 3 + 2 * np.arange(costs.shape[1])
-            return pair_innovations(part, *joint[1:], there, at, pairs)
-
-        matched = used, self.stage.match(costs, innovate), near
+        matched = used, self.stage.match(costs), near
         confirmed = known.label[known.confirmed]
         begun, count = label_matched(self.label, rows, joint, confirmed, matched, caller, chances)
-        self._judge_caller(number, count)
-        if begun.size and number in self.moves and self._is_elsewhere(number, count):
-            return
-        self._begin(number, begun)
+        strayed = begun.size and number in self.doubted and self._is_elsewhere(number, count)
+        if self.begins and not strayed:
+            self._begin(number, begun)
 
     def _is_elsewhere(self, number: int, count: tuple[int, int]) -> bool:
-        """Return whether a moving caller's estimate is wrong: too few of its echoes match."""
+        """Return whether a caller's position may be wrong: too few of its echoes match."""
         known, own = self.memory.known, self.label[self.scan.caller == OWN]
         heard = known.source[:, number : number + 1]  # without column before its first landmark
         often = int((known.confirmed[:, np.newaxis] & ~np.isnan(heard)).sum()) >= count[1]
@@ -286,20 +410,18 @@ class _Work:
             return self._where(caller.label)
         self.named[number] = caller.label
         at = self._where(caller.label)
-        self._match_direct(number, caller.label, at)
-        return UNPLACED if at < 0 else at
+        fits = self._match_direct(number, caller.label, at)
+        return None if not fits else UNPLACED if at < 0 else at
 
     def finished(self) -> tuple[Memory, Assignment]:
         """Update, delete and merge landmarks by the labelled scan; return memory and assignment."""
         memory, scan, (known, at) = self.memory, self.scan, self._judged()
-        lost = self._lost(known)
-        gone = {*known.label[known.odds < GONE].tolist(), *lost}
-        merge = () if gone else self._doubles(known, at)
-        if gone:
-            left = np.array([*gone])
-            known = some(known, ~is_among(known.label, left))
-            for labels in (self.label, self.named):
-                labels[is_among(labels, left)] = UNLABELLED
+        known = self.known if self.blind else known
+        gone = known.label[known.odds < GONE]
+        merge = () if gone.size else self._doubles(known, at)
+        if gone.size:
+            known = some(known, ~is_among(known.label, gone))
+            self.label[is_among(self.label, gone)] = UNLABELLED
         for kept, other in merge:
             self.label[self.label == other] = kept
         if self.numbers is not scan.numbers:
@@ -313,19 +435,18 @@ class _Work:
             callers=self.callers,
             pose=self.pose,
             drift=self.model[:2],
+            watch=self.watch,
         )
-        remove = tuple(sorted(gone))
+        remove = tuple(sorted(gone.tolist()))
         return after, Assignment(label=self.label, remove=remove, merge=merge, scan=scan)
 
     def _judged(self) -> tuple[Known, Int[np.ndarray, " l"]]:
         """Return all landmark records with updated log odds, and joint-mean indices or -1."""
-        memory, scan, rows = self.memory, self.scan, self.rows
-        size = max(1 + scan.caller.max(initial=0), scan.direct.size, memory.known.source.shape[1])
-        known = with_new(memory.known, self.new, memory.scan, size)
-        callers, moves = np.full(size, UNPLACED), np.zeros(size, np.bool_)
+        memory, rows = self.memory, self.rows
+        _, callers = self._calls()
+        known = with_new(self.known, self.new, memory.scan, callers.size)
+        moves = np.zeros(callers.size, np.bool_)
         moves[[*self.moves]] = True
-        for number, caller in self.callers.items():
-            callers[number] = self._where(caller.label)
         heard = self.label, rows.caller, rows.way, rows.level_db, rows.bearing, rows.surety
         at, near = places_of(known.label, self.joint.landmark, self.near)
         place = self.joint.mean, at, callers, moves
@@ -373,19 +494,19 @@ class _Work:
         self.numbers = self.numbers.copy()
         self.numbers[RANGE, row], self.numbers[RANGE_STD, row] = far, caller.place.std * far
         self.label[row] = self.named[number] = caller.label
-        told = replace(caller, told=True, tracks=Tracks(), since=self.memory.scan)
-        self.callers[number] = told
+        self.callers[number] = replace(caller, told=True, tracks=Tracks())
 
-    def _match_direct(self, number: int, label: int, at: int) -> None:
-        """Label a caller's direct call with its label, unless a fixed caller's gate rejects it."""
+    def _match_direct(self, number: int, label: int, at: int) -> bool:
+        """Label a caller's direct call with its label; return False if a fixed caller's misfits."""
         row = self._direct(number)
         if row < 0:
-            return
+            return True
         if at >= 0 and number not in self.moves:
-            gated = (DIRECT_GATE, *self.stage.chances[1:])
+            gated = (watch.NEAR, *self.stage.chances[1:])
             if not bearing_fits(tuple(self.rows), row, self._joint(), at, gated):
-                return
+                return False
         self.label[row] = label
+        return True
 
     def _begin(self, number: int, begun: Int[np.ndarray, " b"]) -> None:
         """Begin a new landmark with each of the given measurements of a caller."""
@@ -397,29 +518,8 @@ class _Work:
             points = tuple(column[begun] for column in numbers)
             self.joint = with_points(self.joint, labels, points)
 
-    def _judge_caller(self, number: int, count: tuple[int, int]) -> None:
-        """Record how many of a mapped caller's precise measurements match landmarks."""
-        caller = self.callers.get(number)
-        if caller is not None and self._where(caller.label) >= 0:
-            trial = (*caller.trial[1 - TRIAL :], count)
-            self.callers[number] = replace(caller, trial=trial)
 
-    def _lost(self, known: Known) -> list[int]:
-        """Delete misplaced callers; return their labels and the landmarks that depend on them."""
-        lost: list[int] = []
-        for number, caller in [*self.callers.items()]:
-            first, last = caller.found + TRIAL, caller.since + PROBATION
-            if len(caller.trial) < TRIAL or not first <= self.memory.scan <= last:
-                continue
-            right, rows = np.sum(caller.trial[SETTLING:], axis=0)
-            if rows >= LEAST_ROWS and right < LEAST_SHARE * rows:
-                alone = np.isnan(known.source[:, OWN]) & (known.born >= caller.since)
-                lost += [caller.label, *known.label[alone].tolist()]
-                del self.callers[number]
-        return lost
-
-
-METHODS = {"nearest": nearest, "joint": jointly_compatible, "marginal": marginal}
+METHODS = {"nearest": nearest, "marginal": marginal}
 """Matching methods by the name in ``association.method``."""
 GATE = 25.0
 """Gate on the squared distance of a measurement, exceeded by 0.5 to 1 % of correct matches."""

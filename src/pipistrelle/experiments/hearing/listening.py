@@ -231,7 +231,7 @@ def listen(
         Detector of calls and labels of detections, as `find_calls` and `label_detections`.
     labels : bool
         False: frames also hold their measurements without labels, for data association
-        (`pipistrelle.estimation.association`).
+        (`pipistrelle.estimation.data_association`).
     keep : callable, optional
         Receives each frame's number, from 1 on, its arrivals, and its block sums or real samples,
         which the next frame overwrites.

@@ -2,8 +2,8 @@
 
 The paper assumes that the landmark of each measurement is known. The label is therefore assigned
 after detection by the true arrivals, by delay and bearing, as a gate in bearing only would match
-most clutter to a landmark. Without the oracle an association (`pipistrelle.estimation.association`)
-labels the scans; it receives beliefs and scans, never the truth.
+most clutter to a landmark. Without the oracle `estimation.data_association` labels the scans; it
+receives beliefs and scans, never the truth.
 """
 
 from typing import NamedTuple

@@ -26,6 +26,7 @@ from pydantic import BaseModel
 from pipistrelle.config import InputError
 from pipistrelle.estimation.beliefs import Track
 from pipistrelle.estimation.catalogue import short_name
+from pipistrelle.evaluation.association import births_per_scan
 from pipistrelle.experiments.drives import Truth
 from pipistrelle.experiments.results.scores import OF_ASSOCIATION, TrialResult, judged
 from pipistrelle.experiments.results.tables import (
@@ -304,6 +305,8 @@ def run_entry(trial: TrialResult, ignored_rows: Mapping[str, int]) -> dict[str, 
             **{f"unsure_{name}".removesuffix("_std"): n.size for name, n in trial.left_out.items()},
         },
         "wall_s": trial.wall_s,
+        **({"births_per_scan": births_per_scan(labels)} if (labels := trial.track.labels) else {}),
+        **trial.track.report,
     }
     return run if trial.online is None else run | {"online": _finite(trial.online)}
 

@@ -17,7 +17,7 @@ from pipistrelle.config import (
     ScenarioConfig,
 )
 from pipistrelle.detection.scans import OWN, UNLABELLED, Scan, make_scan
-from pipistrelle.estimation.association import KNOWN
+from pipistrelle.estimation.beliefs import KNOWN
 from pipistrelle.estimation.catalogue import CATALOGUE
 from pipistrelle.estimation.data_association.sequential import METHODS
 from pipistrelle.experiments.drives import Drive

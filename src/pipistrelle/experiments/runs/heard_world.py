@@ -24,8 +24,7 @@ from pipistrelle.detection.front_end import FrameMeasurements
 from pipistrelle.detection.logs.recording import Log
 from pipistrelle.detection.noise import noise_of, without_hidden
 from pipistrelle.detection.scans import Scan, scan_of
-from pipistrelle.estimation.association import KNOWN
-from pipistrelle.estimation.beliefs import Gaussian
+from pipistrelle.estimation.beliefs import KNOWN, Gaussian
 from pipistrelle.evaluation.association import Causes, causes_of
 from pipistrelle.evaluation.bound import bound_of_drawn_start
 from pipistrelle.experiments.drives import Drive, Truth

@@ -34,8 +34,7 @@ from pipistrelle.detection.scans import (
     without_excess_paths,
     without_labels,
 )
-from pipistrelle.estimation.association import KNOWN
-from pipistrelle.estimation.beliefs import Gaussian, Landmarks
+from pipistrelle.estimation.beliefs import KNOWN, Gaussian, Landmarks
 from pipistrelle.estimation.catalogue import CATALOGUE, short_name
 from pipistrelle.estimation.data_association.sequential import METHODS, left_out
 from pipistrelle.estimation.motion import Motion

@@ -20,9 +20,10 @@ from pipistrelle.arithmetic.random_stream import stream_key
 from pipistrelle.config import Config, InputError, Strategy
 from pipistrelle.detection.noise import ConstantNoise, noise_of
 from pipistrelle.detection.scans import Scan, rows_of
-from pipistrelle.estimation.association import KNOWN, Association
 from pipistrelle.estimation.beliefs import (
+    KNOWN,
     NO_INNOVATIONS,
+    Association,
     B,
     Belief,
     Estimator,
@@ -338,7 +339,8 @@ def run_filter(
     track = _track_of(session.belief, time, path, callers)
     if association is None:
         return track
-    return replace(track, landmarks=session.landmarks(), labels=tuple(session.labels))
+    found = {"labels": tuple(session.labels), "report": session.report()}
+    return replace(track, landmarks=session.landmarks(), **found)
 
 
 def _steps_of(scans: Sequence[Scan], time: Float[np.ndarray, " t"]) -> list[int]:

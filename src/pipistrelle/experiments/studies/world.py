@@ -26,8 +26,7 @@ from jaxtyping import Bool, Float, Int
 from pipistrelle import kernel_clock
 from pipistrelle.acoustics.emitter import beamwidth_of
 from pipistrelle.config import Config, InputError
-from pipistrelle.estimation.association import KNOWN
-from pipistrelle.estimation.beliefs import Track, revises_path
+from pipistrelle.estimation.beliefs import KNOWN, Track, revises_path
 from pipistrelle.estimation.catalogue import SECTIONS
 from pipistrelle.estimation.smoother.preintegration import numbers_of
 from pipistrelle.evaluation.accuracy import (

@@ -1,0 +1,226 @@
+"""The watch over a drive without labels: alarms, their causes, and the pose found again."""
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from pipistrelle.config import Config
+from pipistrelle.detection.scans import make_scan
+from pipistrelle.estimation.beliefs import Gaussian, JointGaussian
+from pipistrelle.estimation.catalogue import entry
+from pipistrelle.estimation.data_association.existence import WINDOW, nobody, with_new
+from pipistrelle.estimation.data_association.pairs import OWN_CALL, Rows
+from pipistrelle.estimation.data_association.sequential import association_of
+from pipistrelle.estimation.data_association.watch import (
+    BOUND,
+    CHANCE,
+    POSE,
+    failed,
+    observed,
+    of_calls,
+    placed_again,
+    ratios,
+    reported,
+)
+from pipistrelle.estimation.motion import Motion
+from pipistrelle.estimation.session import Session
+
+CHANCES = (25.0, 0.06, 1.2, 0.8, 0.02)
+PLACES = 3 + 2 * np.arange(12), np.full((12, 1), np.nan)
+CALLER = 9.0 - 4.0j
+
+
+@pytest.fixture
+def rng():
+    return np.random.default_rng(5)
+
+
+def test_scan_records_log_probability_of_misses_as_far_as_strays_may_be_of_them():
+    """Of three landmarks of equal probability one is detected, one missed, and one not judged."""
+    watch, p = of_calls(1), 0.75
+    old = np.full((1, 3), p), np.zeros((1, 3), np.int64)
+    found, judged = np.array([[True, False, False]]), np.array([[True, True, False]])
+    for strays, share in ((0, 0.0), (1, 1.0), (4, 1.0)):
+        column, counts = observed(watch, old, (found, judged, np.full(1, strays)))
+        assert column[0] == pytest.approx([1.0, share * math.log(1.0 - p), 0.0])
+        assert [part.sum() for part in counts] == pytest.approx([1, 2, 1, 2 * p])
+
+
+def known_of(past, born):
+    """Return records of landmarks with a past of detections by one call."""
+    size = len(past)
+    known = with_new(nobody(1), list(range(1, 1 + size)), 0, 1)
+    recent = np.zeros((size, 1, WINDOW))
+    recent[:, 0, WINDOW - np.shape(past)[1] :] = past
+    return known._replace(past=recent, born=np.array(born), confirmed=np.ones(size, np.bool_))
+
+
+def test_ratio_counts_each_landmark_once_and_by_scans_after_its_first():
+    """Two scans: missed twice, missed then detected, detected then missed, first in the latter."""
+    miss, q, now = math.log(0.2), CHANCE, 90
+    past = [[miss, miss], [miss, 1.0], [1.0, miss], [0.0, miss]]
+    known = known_of(past, [3, 3, 3, now - 1])
+    found = ratios(known, np.ones(4, np.bool_), now)[0, -2:]
+
+    def missed(m):
+        return math.log((1 - q + q * m) / (q + (1 - q) * m))
+
+    detected = math.log(q / (1 - q))
+    assert found[0] == pytest.approx(missed(0.04) + 2 * detected)
+    assert found[1] == pytest.approx(3 * missed(0.2) + detected)
+
+
+def drawn_past(rng, share, scans):
+    """Return the past of 15 landmarks of probability 0.9, each still detected with a share."""
+    heard = (rng.random((15, scans)) < 0.9) & (rng.random((15, 1)) < share)
+    return np.where(heard, 1.0, math.log(0.1))
+
+
+def test_alarm_follows_only_a_loss_of_detections(rng):
+    """One landmark in ten is hidden: no alarm in a thousand drives; else one in three scans."""
+    judged, old = np.ones(1, np.int64), np.ones(15, np.bool_)
+    for _ in range(1000):
+        known = known_of(drawn_past(rng, 0.9, WINDOW), [0] * 15)
+        assert not failed(of_calls(1), ratios(known, old, 90), judged)[0]
+    for _ in range(50):
+        past = np.hstack([drawn_past(rng, 1.0, WINDOW - 3), drawn_past(rng, 0.0, 3)])
+        calls, since, pose = failed(of_calls(1), ratios(known_of(past, [0] * 15), old, 90), judged)
+        assert (calls, pose) == ([0], True)
+        assert WINDOW - 4 <= since <= WINDOW - 2
+
+
+@pytest.mark.parametrize(
+    ("ratio", "least", "expected"),
+    [
+        ((-4.0, BOUND), (1, 1), ([1], False)),
+        ((BOUND, BOUND), (1, 1), ([0, 1], True)),
+        ((0.0, BOUND), (1, 1), ([1], True)),
+        ((-4.0, BOUND - 1.0), (1, 1), ([], False)),
+        ((-4.0, BOUND), (WINDOW + 1, 1), ([1], True)),
+        ((-4.0, BOUND), (1, 2), ([], False)),
+    ],
+)
+def test_cause_is_caller_if_other_calls_fit(ratio, least, expected):
+    """Only the present scan tells; a call that is not judged is no witness."""
+    table = np.full((2, WINDOW), -9.0)
+    table[:, -1] = ratio
+    calls, _, pose = failed(of_calls(2), table, np.array(least))
+    assert (calls, pose) == expected
+
+
+@pytest.mark.parametrize(("lost", "expected"), [(0, ([], False)), (2, ([0], True))])
+def test_lost_vehicle_searches_pose_at_any_doubt(lost, expected):
+    table = np.array([[5.0], [-1.0]]) * np.ones(WINDOW)
+    calls, _, pose = failed(of_calls(2)._replace(lost=lost), table, np.ones(2, np.int64))
+    assert (calls, pose) == expected
+
+
+def scan_from(rng, pose, landmarks, caller):
+    """Return echoes of some landmarks, exact to a hundredth, and clutter; rows, direct bearing."""
+    at, heading = complex(*pose[:2]), pose[2]
+    far = landmarks[:7] - at
+    way = abs(far) if caller is None else abs(far) + abs(landmarks[:7] - caller) - abs(caller - at)
+    bearing = np.angle(far * np.exp(-1j * heading)) + 0.01 * rng.standard_normal(7)
+    way = np.append(way + 0.01 * rng.standard_normal(7), rng.uniform(1.0, 9.0, 3))
+    bearing = np.append(bearing, rng.uniform(-1.5, 1.5, 3))
+    std = np.full(10, 0.01)
+    towards = 0.0 if caller is None else np.angle((caller - at) * np.exp(-1j * heading))
+    return Rows(bearing, std, way, std, np.ones(10)), np.array([towards, 0.01])
+
+
+@pytest.mark.parametrize("caller", [None, CALLER])
+@pytest.mark.parametrize("off", [(0.0, 0.0, 0.7), (1.5, -1.0, 0.0), (-3.0, 2.0, 2.5)])
+def test_pose_is_found_again_on_map(rng, caller, off):
+    landmarks = rng.uniform(-9.0, 9.0, 12) + 1j * rng.uniform(-9.0, 9.0, 12)
+    places = np.append(landmarks, CALLER)
+    pose = np.array([0.5, -0.4, 0.3])
+    mean = np.concatenate([pose - off, np.stack([places.real, places.imag]).T.ravel()])
+    joint = JointGaussian(landmark=np.arange(1, 14), mean=mean, covariance=1e-4 * np.eye(mean.size))
+    at = OWN_CALL if caller is None else mean.size - 2
+    heard = (0, *scan_from(rng, pose, landmarks, caller), at)
+    found = placed_again(of_calls(1), joint, *PLACES, [heard], CHANCES)
+    assert found is not None
+    assert found.mean[:3] == pytest.approx(pose, abs=0.15)
+    assert np.array_equal(found.mean[3:], mean[3:])
+
+
+def test_pose_is_not_found_in_clutter(rng):
+    landmarks = rng.uniform(-9.0, 9.0, 12) + 1j * rng.uniform(-9.0, 9.0, 12)
+    mean = np.concatenate([np.zeros(3), np.stack([landmarks.real, landmarks.imag]).T.ravel()])
+    joint = JointGaussian(landmark=np.arange(12), mean=mean, covariance=1e-4 * np.eye(27))
+    std = np.full(6, 0.01)
+    watch = of_calls(1)
+    watch.hits[:], watch.asked[:] = 9, 10
+    for _ in range(20):
+        rows = Rows(rng.uniform(-1.5, 1.5, 6), std, rng.uniform(1.0, 9.0, 6), std, np.ones(6))
+        heard = [(0, rows, np.zeros(2), OWN_CALL)]
+        assert placed_again(watch, joint, *PLACES, heard, CHANCES) is None
+
+
+def drive(rng, scans, event, turn=0.0, callers=()):
+    """Return a session after a drive on a circle, and the true pose.
+
+    At a scan the vehicle turns unreported, and callers exchange their names.
+    """
+    landmarks = 9.0 * np.sqrt(rng.uniform(0.1, 1.0, 14)) * np.exp(2j * np.pi * rng.random(14))
+    config = Config.model_validate(
+        {"association": {"method": "marginal"}, "filter": {"gate": 0.999}}
+    )
+    motion = Motion(model="unicycle", control_std=(0.02, 0.02))
+    start = Gaussian(mean=np.array([4.0, 0.0, np.pi / 2]), covariance=1e-6 * np.eye(3))
+    session = Session(
+        entry("iekf").build(config, motion), start, rng, association=association_of(config)
+    )
+    at, heading = 4.0 + 0.0j, np.pi / 2
+    for scan in range(scans):
+        heading += 0.0625 + turn * (scan == event)
+        at += 0.25 * np.exp(1j * (heading - 0.03125))
+        session.move(np.array([[0.5, 0.125]]), np.array([0.5]))
+        seen = landmarks[abs(landmarks - at) < 9.0]
+        points, number, way = [seen], [np.zeros(seen.size, np.int64)], [abs(seen - at)]
+        for n, place in enumerate(callers if scan < event else callers[::-1], start=1):
+            points.append(np.append(place, seen))
+            number.append(np.full(seen.size + 1, n))
+            way.append(abs(points[-1] - at) + abs(points[-1] - place) - abs(place - at))
+        bearing = np.angle((np.concatenate(points) - at) * np.exp(-1j * heading))
+        bearing, number = bearing + 0.01 * rng.standard_normal(bearing.size), np.concatenate(number)
+        measured = np.concatenate(way) + 0.02 * rng.standard_normal(bearing.size)
+        direct = np.array([-1, *(np.flatnonzero(number == n + 1)[0] for n in range(len(callers)))])
+        measured[direct[1:]], own = np.nan, number == 0
+        columns = {"range": np.where(own, measured, np.nan), "caller": number}
+        columns["excess_path"] = np.where(own, np.nan, measured)
+        stds = {"bearing_std": 0.01, "range_std": 0.02, "excess_path_std": 0.02}
+        heard = make_scan(0.5 * scan, np.full(number.size, -1), bearing, **columns, **stds)
+        session.hear(replace(heard, direct=direct) if callers else heard)
+    return session, np.array([at.real, at.imag, heading])
+
+
+def check_pose(session, truth):
+    off = session.belief.pose().mean - truth
+    assert np.hypot(*off[:2]) < 0.1
+    assert abs(math.remainder(off[2], math.tau)) < 0.03
+
+
+@pytest.mark.parametrize("turn", [0.0, 0.6])
+def test_unreported_turn_leaves_map_unchanged(rng, turn):
+    session, truth = drive(rng, 60, 40, turn=turn)
+    check_pose(session, truth)
+    assert len(session.landmarks().landmark) <= 14
+    alarms = [(20.0, POSE, True)] if turn else []
+    assert session.report()["alarms"] == alarms
+
+
+def test_callers_that_exchange_names_are_set_aside_and_found_again(rng):
+    session, truth = drive(rng, 110, 60, callers=(9.0 - 4.0j, -6.0 + 8.0j))
+    check_pose(session, truth)
+    assert [*map(tuple, session.report()["alarms"])] == [(30.0, 1, True), (30.0, 2, True)]
+    assert len(session.landmarks().landmark) <= 14 + 2, "former positions are left out"
+    assert session.report()["trusted_until_s"] is None
+
+
+def test_memories_keep_their_alarms():
+    first = of_calls(1)._replace(alarms=np.array([[3.0, POSE, 0.0]]), lost=2)
+    of_calls(2, first).alarms[0, 2] = 1.0
+    assert reported(first)["trusted_until_s"] == 3.0
