@@ -502,8 +502,7 @@ class _Work:
         if row < 0:
             return True
         if at >= 0 and number not in self.moves:
-            gated = (watch.NEAR, *self.stage.chances[1:])
-            if not bearing_fits(tuple(self.rows), row, self._joint(), at, gated):
+            if not bearing_fits(tuple(self.rows), row, self._joint(), at, self.stage.chances):
                 return False
         self.label[row] = label
         return True

@@ -61,7 +61,7 @@ POSE = -1
 NEAREST, TRIED = 100, 1000
 """Most landmarks compared, of the nearest, and most poses tried."""
 NEAR = 9.0
-"""Gate on the squared distance of a direct call's bearing, and of two points' distance."""
+"""Gate on the squared distance of two points and two landmarks."""
 
 Pairs = tuple[Complex[np.ndarray, "2 p"], Complex[np.ndarray, "2 p"], Float[np.ndarray, " p"]]
 """Pairs of points in the vehicle's frame, of landmarks [m], and sums of the points' variances."""
