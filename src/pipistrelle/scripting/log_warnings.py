@@ -232,19 +232,20 @@ def _refuted(trial: "TrialResult", recorded: "Log") -> Iterator[Question]:
     for call, repaired in dict.fromkeys(alarm[1:] for alarm in alarms):
         times = [f"{time:.15g}" for time, *alarm in alarms if alarm == [call, repaired]]
         since = f"from {', '.join(times[:4])}{', ...' * (len(times) > 4)} s on"
-        then = "" if repaired else "; path and map are not to be trusted from then on"
         if call == POSE:
-            found = f"{since}, no measurements fit the map from where the odometry leads"
-            asked = "did the vehicle skid or slip, or was it carried?"
-            then = then or "; its pose was found again on the map"
+            found = "no measurements fit the map from where the odometry leads"
+            then, asked = (
+                "its pose was found again on the map",
+                "did it skid, slip, or was it moved?",
+            )
         elif call == OWN:
-            found = f"{since}, the ranges to the map's landmarks do not fit, other calls' paths do"
-            asked = "was the sensor moved, or another range setting used?"
+            found = "the ranges to the map's landmarks do not fit, other calls' paths do"
+            then, asked = "", "was the sensor moved, or another range setting used?"
         else:
-            found = f"{since}, the measurements by {recorded.callers[call - 1].name!r} do not fit"
-            asked = "was this caller moved, or its name given to another?"
-            then = then or "; it was searched for again"
-        yield f"{found} ({who}){then}", asked
+            found = f"the measurements by {recorded.callers[call - 1].name!r} do not fit"
+            then, asked = "it was searched for again", "was it moved, or its name given to another?"
+        then = then if repaired else "path and map are not to be trusted from then on"
+        yield f"{since}, {found} ({who}); {then}", asked
 
 
 def _unmapped(trial: "TrialResult", recorded: "Log") -> list[Question]:

@@ -90,7 +90,7 @@ class Results:
             mission = self.mission
             ignored = {} if mission.log is None else mission.log.ignored_rows
             rows = [run_entry(trial, ignored) for trial in mission.trials]
-        nested = ("ignored_rows", "online")
+        nested = ("ignored_rows", "online", "watch", "alarms")
         flat = [{name: row[name] for name in row if name not in nested} for row in rows]
         return pl.DataFrame(flat, infer_schema_length=None)
 

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from pipistrelle.config import Config
-from pipistrelle.detection.scans import make_scan
+from pipistrelle.detection.scans import UNLABELLED, make_scan
 from pipistrelle.estimation.beliefs import Gaussian, JointGaussian
 from pipistrelle.estimation.catalogue import entry
 from pipistrelle.estimation.data_association.existence import WINDOW, nobody, with_new
@@ -37,17 +37,6 @@ def rng():
     return np.random.default_rng(5)
 
 
-def test_scan_records_log_probability_of_misses_as_far_as_strays_may_be_of_them():
-    """Of three landmarks of equal probability one is detected, one missed, and one not judged."""
-    watch, p = of_calls(1), 0.75
-    old = np.full((1, 3), p), np.zeros((1, 3), np.int64)
-    found, judged = np.array([[True, False, False]]), np.array([[True, True, False]])
-    for strays, share in ((0, 0.0), (1, 1.0), (4, 1.0)):
-        column, counts = observed(watch, old, (found, judged, np.full(1, strays)))
-        assert column[0] == pytest.approx([1.0, share * math.log(1.0 - p), 0.0])
-        assert [part.sum() for part in counts] == pytest.approx([1, 2, 1, 2 * p])
-
-
 def known_of(past, born):
     """Return records of landmarks with a past of detections by one call."""
     size = len(past)
@@ -57,12 +46,38 @@ def known_of(past, born):
     return known._replace(past=recent, born=np.array(born), confirmed=np.ones(size, np.bool_))
 
 
+def test_scan_records_log_probability_of_misses_as_far_as_strays_may_be_of_them():
+    """Of five landmarks one is detected, two are missed, one is near a row, one unconfirmed."""
+    places = np.array([[3.0, 0.0], [3.0, 1.0], [3.0, -1.0], [2.0, 2.0], [5.0, 0.0]])
+    mean, known = np.append(np.zeros(3), places), known_of(np.zeros((5, 1)), [0] * 5)
+    sums = of_calls(1)[:4]
+    hits, asked, p = 8.0, 9.0, 0.8
+    for strays, share in ((0, 0.0), (1, 1.0 / 1.6), (4, 1.0)):
+        hits_, asked_, found, expected = (part.copy() for part in sums)
+        hits_[:], asked_[:] = hits, asked
+        bearing, way = np.append([0.0, 0.785], np.full(strays, 2.0)), np.full(2 + strays, 9.0)
+        way[:2] = 3.0, 2.83
+        label = np.array([1, *[UNLABELLED] * (1 + strays)])
+        std, number = np.full(way.size, 0.01), np.zeros(way.size, np.int64)
+        sure = np.arange(way.size) >= 2
+        heard = label, number, sure, bearing, std, way, std, np.ones(way.size)
+        at = np.array([3, 5, 7, 9, -1])
+        calls = np.ones(1, np.bool_), np.full(1, OWN_CALL)
+        joint = mean, 1e-6 * np.eye(13)
+        updated = hits_, asked_, found, expected
+        past = observed(tuple(known), updated, joint, at, calls, heard, CHANCES)[:, 0, -1]
+        miss = share * math.log(1.0 - p)
+        assert past == pytest.approx([1.0, miss, miss, 0.0, 0.0])
+        assert (hits_.sum() - hits * hits_.size, asked_.sum() - asked * asked_.size) == (1, 3)
+        assert [*found, *expected] == pytest.approx([1.0, 3 * p])
+
+
 def test_ratio_counts_each_landmark_once_and_by_scans_after_its_first():
     """Two scans: missed twice, missed then detected, detected then missed, first in the latter."""
     miss, q, now = math.log(0.2), CHANCE, 90
     past = [[miss, miss], [miss, 1.0], [1.0, miss], [0.0, miss]]
     known = known_of(past, [3, 3, 3, now - 1])
-    found = ratios(known, np.ones(4, np.bool_), now)[0, -2:]
+    found = ratios(tuple(known), np.arange(4), now)[0, -2:]
 
     def missed(m):
         return math.log((1 - q + q * m) / (q + (1 - q) * m))
@@ -80,13 +95,15 @@ def drawn_past(rng, share, scans):
 
 def test_alarm_follows_only_a_loss_of_detections(rng):
     """One landmark in ten is hidden: no alarm in a thousand drives; else one in three scans."""
-    judged, old = np.ones(1, np.int64), np.ones(15, np.bool_)
+    judged, old = np.ones(1, np.int64), np.arange(15)
     for _ in range(1000):
         known = known_of(drawn_past(rng, 0.9, WINDOW), [0] * 15)
-        assert not failed(of_calls(1), ratios(known, old, 90), judged)[0]
+        assert not failed(of_calls(1), ratios(tuple(known), old, 90), judged)[0]
     for _ in range(50):
         past = np.hstack([drawn_past(rng, 1.0, WINDOW - 3), drawn_past(rng, 0.0, 3)])
-        calls, since, pose = failed(of_calls(1), ratios(known_of(past, [0] * 15), old, 90), judged)
+        calls, since, pose = failed(
+            of_calls(1), ratios(tuple(known_of(past, [0] * 15)), old, 90), judged
+        )
         assert (calls, pose) == ([0], True)
         assert WINDOW - 4 <= since <= WINDOW - 2
 

@@ -308,20 +308,6 @@ def compared(
 
 
 @kernel
-def bearing_fits(
-    rows: tuple[np.ndarray, ...],
-    row: Whole,
-    joint: Joint,
-    at: Whole,
-    chances: PlainChances,
-) -> bool:
-    """Return whether the bearing of a measurement is within the gate of a landmark."""
-    (_, mean, covariance), part = joint, part_of(ScanRows(*rows), np.full(1, row), 0.0)
-    costs = pair_costs(part, mean, covariance, np.full(1, at), UNPLACED, chances)
-    return math.isfinite(costs[0, 0])
-
-
-@kernel
 def part_of(heard: ScanRows, rows: Int[np.ndarray, " r"], spread: float) -> tuple[np.ndarray, ...]:
     """Return selected measurements as columns of `pairs.Rows`; ``spread``: added range std [m]."""
     way_std = heard.way_std[rows]

@@ -38,24 +38,8 @@ from pipistrelle.estimation.beliefs import (
     is_among,
 )
 from pipistrelle.estimation.catalogue import ASSOCIATION, build, class_of, names_class
-from pipistrelle.estimation.data_association import watch
-from pipistrelle.estimation.data_association.caller_search import (
-    direct_row,
-    may_have_turned,
-    place_caller,
-    turned,
-)
-from pipistrelle.estimation.data_association.existence import (
-    GONE,
-    WINDOW,
-    Known,
-    asked_of,
-    doubles,
-    judged,
-    merged,
-    some,
-    with_new,
-)
+from pipistrelle.estimation.data_association import caller_search, existence, watch
+from pipistrelle.estimation.data_association.existence import WINDOW, Known
 from pipistrelle.estimation.data_association.pairs import (
     BARELY,
     OWN_CALL,
@@ -76,7 +60,6 @@ from pipistrelle.estimation.data_association.rows import (
     Memory,
     Model,
     Tracks,
-    bearing_fits,
     compared,
     drift_of,
     followed,
@@ -225,7 +208,7 @@ class _Work:
             caller = self.callers.get(number) or CallerState(label=self._another())
             if caller.place is None:
                 caller = self._followed(number, caller, row)
-                place = place_caller(caller.tracks, number in self.moves, self.model)
+                place = caller_search.place_caller(caller.tracks, number in self.moves, self.model)
                 if place is not None:
                     caller = replace(caller, place=place)
                     if not caller.failed:  # else earlier scans are of its former position
@@ -248,30 +231,30 @@ class _Work:
     def watch_calls(self) -> None:
         """Judge each call by its measurements of old landmarks; repair a failed call or pose."""
         judged, where = self._calls()
-        watched, counts = watch.of_calls(where.size, self.memory.watch), self._observe(judged)
+        watched = self._observed(judged, where)
         watched = watched._replace(times=np.append(watched.times[1:], self.scan.time))
         least = np.where(judged, 1, WINDOW + 1)
         for number in {*self.callers} & {*np.flatnonzero(judged).tolist()}:
             row = self._direct(number)
             fits = row >= 0 and self.label[row] == self.callers[number].label
             least[number] = watch.SPOILT if fits else WINDOW // 2
-        ratio = watch.ratios(self.known, self._old()[0], self.memory.scan)
+        ratio = watch.ratios(tuple(self.known), self._old(), self.memory.scan)
         calls, since, pose = watch.failed(watched, ratio, least)
         if watched.lost and calls:
-            joint, lost = self._placed_again(), watched.lost + 1
+            joint, times, lost = self._placed_again(), watched.times, watched.lost + 1
             self.blind = joint is None and lost <= watch.SETTLED
-            watched = watched._replace(lost=lost if joint or self.blind else 0)
-            self.begins = not watched.lost
+            self.begins = joint is None and not self.blind
             self._match_again(joint or self.before)
-            counts = self._observe(judged) if joint else map(np.zeros_like, counts)
-            self.known.past[:] *= watched.lost > 0
+            watched = watch.of_calls(where.size, self.memory.watch)
+            watched = self._observed(judged, where) if joint else watched
+            watched = watched._replace(times=times, lost=0 if self.begins else lost)
+            self.known.past[:] *= not self.begins
         elif calls and self.back is None:
             watched = self._alarmed(watched, calls, since, pose)
         elif watched.lost and (ratio[judged, -1] < 0.0).any():
             watched.alarms[-1, 2], watched = 1.0, watched._replace(lost=0)
             self.known.past[..., :-1] = 0.0
-        sums = [*map(np.add, watched[:4], counts)]
-        self.watch = watched._replace(hits=sums[0], asked=sums[1], heard=sums[2], expected=sums[3])
+        self.watch = watched
 
     def _alarmed(self, watched: Watched, calls: list[int], since: int, pose: bool) -> Watched:
         """Report a failure of the pose or of calls; set failed callers aside, since its scan."""
@@ -296,53 +279,35 @@ class _Work:
 
     def _placed_again(self) -> JointGaussian | None:
         """Return the joint Gaussian with the pose that the scan has on the old map, if any."""
-        (old, at), heard, rows = self._old(), [], self.rows
-        for number in {*self.scan.caller.tolist()}:
-            caller, row = self.callers.get(number), self._direct(number)
-            place = OWN_CALL if number == OWN else self._where(caller.label) if caller else -1
-            if number == OWN or (place >= 0 and row >= 0 and number not in self.moves):
+        (judged, where), at, rows, heard = self._calls(), self._old(), self.rows, []
+        for number in np.flatnonzero(judged).tolist():
+            row = self._direct(number)
+            if number == OWN or row >= 0:
                 used = rows.with_way & (rows.caller == number)
                 used[row] &= number == OWN
                 direct = np.array([rows.bearing[row], rows.bearing_std[row]])
-                heard.append((number, self._some(used), direct, place))
-        watched = watch.of_calls(self._calls()[0].size, self.memory.watch)
+                heard.append((number, self._some(used), direct, int(where[number])))
+        watched, old = watch.of_calls(where.size, self.memory.watch), at >= 0
         placed = at[old], self.known.source[old], heard
         return watch.placed_again(watched, self.before, *placed, self.stage.chances)
 
-    def _observe(self, judged: Bool[np.ndarray, " c"]) -> tuple[np.ndarray, ...]:
-        """Record which old landmarks each call has detected; return changes of the counts."""
-        known = with_new(self.memory.known, [], self.memory.scan, judged.size)
-        rows, (old, at) = self.rows, self._old()
+    def _observed(self, judged: Bool[np.ndarray, " c"], where: Int[np.ndarray, " c"]) -> Watched:
+        """Record which old landmarks each call has detected; return the watch with the counts."""
+        known = existence.with_new(self.memory.known, [], self.memory.scan, judged.size)
+        rows = self.rows
         watched = watch.of_calls(judged.size, self.memory.watch)
-        p, bins = watch.probabilities(watched, self.joint.mean, at[old], known.source[old])
-        same = known.label[old][:, np.newaxis] == self.label
-        of = rows.caller == np.flatnonzero(judged)[:, np.newaxis]
-        found, strays = np.zeros(p.shape, np.bool_), np.zeros(judged.size)
-        found[judged] = (of[:, np.newaxis] & same).any(axis=-1)
-        strays[judged] = (of & rows.sure & ~same.any(axis=0)).sum(axis=1)
-        asked = judged[:, np.newaxis] & ~self._near(judged[:, np.newaxis] & ~found, at[old])
-        now, counts = watch.observed(watched, (p, bins), (found, asked, strays))
-        past = np.append(known.past[..., 1:], np.zeros((*known.past.shape[:2], 1)), axis=-1)
-        past[old, :, -1], self.known = now.T, known._replace(past=past)
-        return counts
+        std = np.where(rows.usable, rows.bearing_std, math.nan)
+        heard = self.label, rows.caller, rows.sure, rows.bearing, std, *rows[3:5], rows.clutter
+        chances, joint = (*self.stage.chances[:4], math.inf), self._joint()[1:]
+        placed = joint, self._old(), (judged, where), heard, chances
+        self.known = known._replace(past=watch.observed(tuple(known), watched[:4], *placed))
+        return watched
 
-    def _near(
-        self, missed: Bool[np.ndarray, "c n"], there: Int[np.ndarray, " n"]
-    ) -> Bool[np.ndarray, "c n"]:
-        """Return which missed landmarks have a measurement of the call within the gate."""
-        near, chances = np.zeros_like(missed), (*self.stage.chances[:4], math.inf)
-        for c in np.flatnonzero(missed.any(axis=1)).tolist():
-            rows = tuple(self._some(self.rows.usable & (self.rows.caller == c)))
-            at = OWN_CALL if c == OWN else self._where(self.callers[c].label)
-            placed = rows, self.joint.mean, self.joint.covariance, there[missed[c]], at
-            near[c, missed[c]] = np.isfinite(pair_costs(*placed, chances)).any(axis=0)
-        return near
-
-    def _old(self) -> tuple[Bool[np.ndarray, " l"], Int[np.ndarray, " l"]]:
-        """Return whether each known landmark is old, and the landmarks' joint-mean indices."""
+    def _old(self) -> Int[np.ndarray, " l"]:
+        """Return the confirmed landmarks' joint-mean indices; -1 for others."""
         known = self.memory.known
         at, _ = places_of(known.label, self.joint.landmark, self.near)
-        return known.confirmed & (at >= 0), at
+        return np.where(known.confirmed, at, -1)
 
     def _calls(self) -> tuple[Bool[np.ndarray, " c"], Int[np.ndarray, " c"]]:
         """Return whether to judge each call by this scan, and callers' joint-mean indices."""
@@ -350,6 +315,7 @@ class _Work:
         size = max(1 + scan.caller.max(initial=0), scan.direct.size, source.shape[1])
         size = max(size, len(self.memory.watch.hits))
         where, judged = np.full(size, UNPLACED), np.zeros(size, np.bool_)
+        where[OWN] = OWN_CALL
         for number, caller in self.callers.items():
             where[number] = self._where(caller.label)
         for number in {*scan.caller.tolist()} - self.moves:
@@ -379,7 +345,7 @@ class _Work:
         known, own = self.memory.known, self.label[self.scan.caller == OWN]
         heard = known.source[:, number : number + 1]  # without column before its first landmark
         often = int((known.confirmed[:, np.newaxis] & ~np.isnan(heard)).sum()) >= count[1]
-        return often and may_have_turned(*count) and bool((own != UNLABELLED).any())
+        return often and caller_search.may_have_turned(*count) and bool((own != UNLABELLED).any())
 
     def _follow_turn(self, number: int, at: int) -> None:
         """Move a moving caller to where its echoes match the map, if it may have turned."""
@@ -393,7 +359,7 @@ class _Work:
         def costs(mean: Float[np.ndarray, " d"]) -> Float[np.ndarray, "r n"]:
             return pair_costs(columns, mean, joint.covariance, there, at, self.stage.chances)
 
-        self.joint = turned(joint, at, float(self.scan.bearing[direct]), costs)
+        self.joint = caller_search.turned(joint, at, float(self.scan.bearing[direct]), costs)
 
     def _heard_from(self, number: int) -> int | None:
         """Return a caller's index in the joint mean; None if its measurements are unusable."""
@@ -417,10 +383,10 @@ class _Work:
         """Update, delete and merge landmarks by the labelled scan; return memory and assignment."""
         memory, scan, (known, at) = self.memory, self.scan, self._judged()
         known = self.known if self.blind else known
-        gone = known.label[known.odds < GONE]
+        gone = known.label[known.odds < existence.GONE]
         merge = () if gone.size else self._doubles(known, at)
         if gone.size:
-            known = some(known, ~is_among(known.label, gone))
+            known = existence.some(known, ~is_among(known.label, gone))
             self.label[is_among(self.label, gone)] = UNLABELLED
         for kept, other in merge:
             self.label[self.label == other] = kept
@@ -431,7 +397,7 @@ class _Work:
         after = Memory(
             scan=memory.scan + 1,
             labels=self.labels,
-            known=merged(known, merge),
+            known=existence.merged(known, merge),
             callers=self.callers,
             pose=self.pose,
             drift=self.model[:2],
@@ -444,21 +410,22 @@ class _Work:
         """Return all landmark records with updated log odds, and joint-mean indices or -1."""
         memory, rows = self.memory, self.rows
         _, callers = self._calls()
-        known = with_new(self.known, self.new, memory.scan, callers.size)
+        known = existence.with_new(self.known, self.new, memory.scan, callers.size)
         moves = np.zeros(callers.size, np.bool_)
         moves[[*self.moves]] = True
         heard = self.label, rows.caller, rows.way, rows.level_db, rows.bearing, rows.surety
         at, near = places_of(known.label, self.joint.landmark, self.near)
         place = self.joint.mean, at, callers, moves
-        return judged(known, heard, place, near, memory.scan, self.stage.limits.sight), at
+        return existence.judged(known, heard, place, near, memory.scan, self.stage.limits.sight), at
 
     def _doubles(self, known: Known, at: Int[np.ndarray, " l"]) -> tuple[tuple[int, int], ...]:
         """Return the pairs of duplicate landmarks to merge now, as (older, newer) labels."""
-        old, apart, asked = asked_of(tuple(known), at, self.memory.scan)
+        old, apart, asked = existence.asked_of(tuple(known), at, self.memory.scan)
         if not asked.size:
             return ()
         label = known.label[old].tolist()
-        return tuple((label[a], label[b]) for a, b in doubles(self.joint, at[old], apart, asked))
+        pairs = existence.doubles(self.joint, at[old], apart, asked)
+        return tuple((label[a], label[b]) for a, b in pairs)
 
     def _another(self) -> int:
         """Return the next unused label for a landmark or a caller."""
@@ -474,7 +441,7 @@ class _Work:
 
     def _direct(self, number: int) -> int:
         """Return the index of a caller's direct call in this scan, or -1 without."""
-        return direct_row(self.scan.direct, number)
+        return caller_search.direct_row(self.scan.direct, number)
 
     def _joint(self) -> Joint:
         """Return the joint Gaussian's labels, mean and covariance, for compiled functions."""
@@ -502,7 +469,9 @@ class _Work:
         if row < 0:
             return True
         if at >= 0 and number not in self.moves:
-            if not bearing_fits(tuple(self.rows), row, self._joint(), at, self.stage.chances):
+            part, there = part_of(self.rows, np.array([row]), 0.0), np.array([at])
+            costs = pair_costs(part, *self._joint()[1:], there, UNPLACED, self.stage.chances)
+            if costs[0, 0] == math.inf:
                 return False
         self.label[row] = label
         return True

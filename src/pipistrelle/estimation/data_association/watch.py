@@ -42,7 +42,8 @@ from pipistrelle.estimation.beliefs import JointGaussian
 from pipistrelle.estimation.catalogue import GATE as CONFIDENCE
 from pipistrelle.estimation.data_association.existence import FAINTEST, LEVEL_STD, WINDOW, Known
 from pipistrelle.estimation.data_association.pairs import OWN_CALL, PlainChances, Rows, pair_costs
-from pipistrelle.geometry import wrap
+from pipistrelle.geometry import wrap_angle
+from pipistrelle.jit import Whole, kernel
 
 BOUND = math.log(1e5)
 """Log likelihood ratio of an alarm: less than 1 false alarm in 100,000 scans."""
@@ -95,58 +96,101 @@ def of_calls(calls: int, before: Watched | None = None) -> Watched:
     return new._replace(times=before.times, alarms=before.alarms.copy(), lost=before.lost)
 
 
+@kernel
 def probabilities(
-    watch: Watched,
+    hits: Float[np.ndarray, "c b"],
+    asked: Float[np.ndarray, "c b"],
     mean: Float[np.ndarray, " d"],
     at: Int[np.ndarray, " n"],
     source: Float[np.ndarray, "n c"],
-) -> tuple[Float[np.ndarray, "c n"], Int[np.ndarray, "c n"]]:
+) -> tuple[Float[np.ndarray, "n c"], Int[np.ndarray, "n c"]]:
     """Return each call's detection probability of landmarks at joint-mean indices, and bins.
 
     ``source``: levels at 1 m, as in `existence.Known`. A call with levels is judged by landmarks
     with levels above `FAINTEST`; others get the probability 0 and the bin -1.
     """
-    dx, dy = mean[at] - mean[0], mean[at + 1] - mean[1]
-    far = np.maximum(np.hypot(dx, dy), 1.0)
-    lost = np.where(np.arange(len(watch.hits)) == OWN, 40.0, 20.0)[:, np.newaxis]
-    steps = (source.T - lost * np.log10(far) - FAINTEST) / LEVEL_STD
-    heard, faint = ~np.isnan(steps), steps < 0.0
-    steps = np.where(heard, steps, 2.0 * np.log2(far)).clip(0, RINGS - 1).astype(np.int64)
-    sector = np.minimum(SECTORS * abs(wrap(np.arctan2(dy, dx) - mean[2])) / math.pi, SECTORS - 1)
-    bins = SECTORS * steps + sector.astype(np.int64)
-    bins[faint | (~heard & heard.any(axis=1, keepdims=True))] = -1
-    p = np.take_along_axis(watch.hits / (watch.asked + 1.0), np.maximum(bins, 0), axis=1)
-    return np.where(bins < 0, 0.0, p), bins
+    p, bins = np.zeros((at.size, len(hits))), np.full((at.size, len(hits)), -1)
+    for n in range(at.size):
+        dx, dy = mean[at[n]] - mean[0], mean[at[n] + 1] - mean[1]
+        far, bearing = max(math.hypot(dx, dy), 1.0), wrap_angle(math.atan2(dy, dx) - mean[2])
+        sector = min(int(SECTORS * abs(bearing) / math.pi), SECTORS - 1)
+        for c in range(len(hits)):
+            ring, level = 2.0 * math.log2(far), source[n, c]
+            if not np.isnan(source[:, c]).all():
+                lost = (40.0 if c == OWN else 20.0) * math.log10(far)
+                ring = (level - lost - FAINTEST) / LEVEL_STD
+            if ring >= 0.0:
+                bins[n, c] = SECTORS * min(int(ring), RINGS - 1) + sector
+                p[n, c] = hits[c, bins[n, c]] / (asked[c, bins[n, c]] + 1.0)
+    return p, bins
 
 
+@kernel
 def observed(
-    watch: Watched,
-    old: tuple[Float[np.ndarray, "c n"], Int[np.ndarray, "c n"]],
-    heard: tuple[Bool[np.ndarray, "c n"], Bool[np.ndarray, "c n"], Int[np.ndarray, " c"]],
-) -> tuple[Float[np.ndarray, "c n"], tuple[np.ndarray, ...]]:
-    """Return a scan's column of `existence.Known.past` for old landmarks, and changes of counts.
+    columns: tuple[np.ndarray, ...],
+    sums: tuple[np.ndarray, ...],
+    joint: tuple[Float[np.ndarray, " d"], Float[np.ndarray, "d d"]],
+    at: Int[np.ndarray, " l"],
+    calls: tuple[Bool[np.ndarray, " c"], Int[np.ndarray, " c"]],
+    heard: tuple[np.ndarray, ...],
+    chances: PlainChances,
+) -> Float[np.ndarray, "l c w"]:
+    """Add a scan's detections of old landmarks to sums; return the later `existence.Known.past`.
 
-    By call: ``old``, probabilities and bins (`probabilities`); ``heard``, which landmarks are
-    detected, which are judged, and how many precise measurements are unexplained.
+    ``sums``: the first four columns of `Watched`; ``calls``: whether each is judged, and its
+    caller's index in the joint mean; ``heard``: label and caller of measurements, whether they are
+    precise, then the columns of `pairs.Rows`.
     """
-    (p, bins), (found, judged, strays) = old, heard
-    missed, changes = np.where(judged & ~found, p, 0.0), np.zeros((2, *watch.hits.shape))
-    share = np.minimum(strays / np.maximum(missed.sum(axis=1), 1e-9), 1.0)[:, np.newaxis]
-    for table, which in zip(changes, (found, found | judged), strict=True):
-        call, n = np.nonzero(which & (bins >= 0))
-        np.add.at(table, (call, bins[call, n]), 1.0)
-    counts = *changes, found.sum(axis=1), np.where(found | judged, p, 0.0).sum(axis=1)
-    return np.where(found, 1.0, share * np.log1p(-missed)), counts
+    known, (hits, asked, found, expected), (mean, covariance) = Known(*columns), sums, joint
+    label, caller, sure, bearing, bearing_std, way, way_std, clutter = heard
+    past, old = np.zeros_like(known.past), np.flatnonzero(at >= 0)
+    past[..., :-1] = known.past[..., 1:]
+    p, bins = probabilities(hits, asked, mean, at[old], known.source[old])
+    for c in np.flatnonzero(calls[0]):
+        rows, strays, missed = np.flatnonzero(caller == c), 0.0, np.zeros(old.size)
+        part = bearing[rows], bearing_std[rows], way[rows], way_std[rows], clutter[rows]
+        for m in rows:
+            strays += 1.0 if sure[m] and label[m] not in known.label[old] else 0.0
+        for k in range(old.size):
+            n, here = old[k], bins[k, c]
+            if known.label[n] in label[rows]:
+                past[n, c, -1] = 1.0
+                found[c] += 1.0
+            elif here >= 0:
+                costs = pair_costs(part, mean, covariance, at[n : n + 1], calls[1][c], chances)
+                if (costs < np.inf).any():
+                    continue
+                missed[k] = p[k, c]
+            if here >= 0:
+                expected[c] += p[k, c]
+                asked[c, here] += 1.0
+                hits[c, here] += 1.0 if past[n, c, -1] > 0.0 else 0.0
+        share = min(strays / max(missed.sum(), 1e-9), 1.0)
+        for k in np.flatnonzero(missed):
+            past[old[k], c, -1] = share * math.log1p(-missed[k])
+    return past
 
 
-def ratios(known: Known, old: Bool[np.ndarray, " l"], now: int) -> Float[np.ndarray, "c w"]:
+@kernel
+def ratios(
+    columns: tuple[np.ndarray, ...], at: Int[np.ndarray, " l"], now: Whole
+) -> Float[np.ndarray, "c w"]:
     """Return the log likelihood ratio of a failure of each call in each of the last scans."""
-    past = known.past[old][..., ::-1]
-    m = np.exp(np.cumsum(np.minimum(past, 0.0), axis=-1, dtype=float))
-    each = np.log((1.0 - CHANCE + CHANCE * m) / (CHANCE + (1.0 - CHANCE) * m))
-    each[np.maximum.accumulate(past, axis=-1) > 0.0] = math.log(CHANCE / (1.0 - CHANCE))
-    before = known.born[old][:, np.newaxis] < now - np.arange(WINDOW)
-    return np.where(before[:, np.newaxis], each, 0.0).sum(axis=0)[:, ::-1]
+    known, q = Known(*columns), CHANCE
+    total = np.zeros(known.past.shape[1:])
+    for n in np.flatnonzero(at >= 0):
+        for c in range(len(total)):
+            silent, each = 0.0, 0.0
+            for k in range(WINDOW - 1, max(WINDOW - now + known.born[n], 0) - 1, -1):
+                value = known.past[n, c, k]
+                if value > 0.0:
+                    silent, each = -math.inf, math.log(q / (1.0 - q))
+                elif value < 0.0 and silent > -math.inf:
+                    silent += value
+                    m = math.exp(silent)
+                    each = math.log((1.0 - q + q * m) / (q + (1.0 - q) * m))
+                total[c, k] += each
+    return total
 
 
 def failed(
@@ -162,11 +206,9 @@ def failed(
         return calls, WINDOW, bool(calls)
     told = np.arange(WINDOW) <= WINDOW - least[:, np.newaxis]
     largest = np.where(told, ratio, -math.inf)
-    calls = np.flatnonzero(largest.max(axis=1) >= BOUND)
-    if not calls.size:
-        return [], WINDOW, False
-    since = int(largest[calls].argmax(axis=1).min())
-    return calls.tolist(), since, not (judged & (ratio[:, since] < 0.0)).any()
+    calls = np.flatnonzero(largest.max(axis=1) >= BOUND).tolist()
+    since = int(largest[calls].argmax(axis=1).min(initial=WINDOW - 1))
+    return calls, since, bool(calls) and not (judged & (ratio[:, since] < 0.0)).any()
 
 
 def alarmed(watch: Watched, since: int, number: int, repaired: bool) -> Watched:
@@ -178,12 +220,11 @@ def alarmed(watch: Watched, since: int, number: int, repaired: bool) -> Watched:
 
 
 def reported(watch: Watched) -> dict[str, Any]:
-    """Return a watch's results by their names in ``summary.json``, calls by number."""
+    """Return a watch's results by their names in ``summary.json``."""
     alarms = [(time, int(call), bool(repaired)) for time, call, repaired in watch.alarms.tolist()]
     counts = zip(watch.heard.tolist(), watch.expected.tolist(), strict=True)
-    shares = (heard / expected if expected else None for heard, expected in counts)
     return {
-        "watch": dict(enumerate(shares)),
+        "watch": [heard / expected if expected else None for heard, expected in counts],
         "trusted_until_s": min((time for time, _, good in alarms if not good), default=None),
         "alarms": alarms,
     }
@@ -214,7 +255,7 @@ def placed_again(
     def cost() -> float:
         compared = mean, covariance, there
         each = (pair_costs(tuple(rows), *compared, at, chances) for _, rows, _, at in heard)
-        expected = probabilities(watch, mean, there, source)[0][calls].sum()
+        expected = probabilities(*watch[:2], mean, there, source)[0][:, calls].sum()
         return sum(costs.min(axis=1, initial=0.0).sum() for costs in each) + 2.0 * expected
 
     poses, variances = poses_of(
