@@ -128,7 +128,8 @@ class Sequential(Association[Memory]):
 
     def carried(self, memory: Memory, later: Memory) -> Memory:
         """Return an earlier memory with callers' positions and failures that a later one adds."""
-        known, labels, failed = dict(memory.callers), memory.labels, later.watch.lost == 1
+        known, labels, watched = dict(memory.callers), memory.labels, memory.watch
+        failed = lost = later.watch.lost == 1 and len(later.watch.alarms) > len(watched.alarms)
         for number, caller in sorted(later.callers.items()):
             before = known.get(number, CallerState(label=labels + 1))
             if before.failed < caller.failed <= memory.scan:
@@ -137,10 +138,8 @@ class Sequential(Association[Memory]):
                 continue
             labels = max(labels, before.label)
             known[number] = replace(before, place=caller.place, told=False, tracks=Tracks())
-        watched = memory.watch
         if failed:
-            alarms, lost = later.watch.alarms, later.watch.lost
-            watched = watched._replace(alarms=alarms, lost=1 if lost == 1 else watched.lost)
+            watched = watched._replace(alarms=later.watch.alarms, lost=int(lost) or watched.lost)
         return replace(memory, callers=known, labels=labels, watch=watched)
 
     def knowing(self, memory: Memory, known: Landmarks, callers: Int[np.ndarray, " c"]) -> Memory:
@@ -240,7 +239,8 @@ class _Work:
             least[number] = watch.SPOILT if fits else WINDOW // 2
         ratio = watch.ratios(tuple(self.known), self._old(), self.memory.scan)
         calls, since, pose = watch.failed(watched, ratio, least)
-        if watched.lost and calls:
+        fits = bool((ratio[judged, -1] < 0.0).any()) and not calls
+        if watched.lost and self.scan.landmark.size and not fits:
             joint, times, lost = self._placed_again(), watched.times, watched.lost + 1
             self.blind = joint is None and lost <= watch.SETTLED
             self.begins = joint is None and not self.blind
@@ -251,8 +251,9 @@ class _Work:
             self.known.past[:] *= not self.begins
         elif calls and self.back is None:
             watched = self._alarmed(watched, calls, since, pose)
-        elif watched.lost and (ratio[judged, -1] < 0.0).any():
-            watched.alarms[-1, 2], watched = 1.0, watched._replace(lost=0)
+        elif watched.lost and ratio[:, -watched.lost :].sum(axis=0).min() <= -watch.BOUND:
+            pose = np.flatnonzero(watched.alarms[:, 1] == watch.POSE)[-1]
+            watched.alarms[pose, 2], watched = 1.0, watched._replace(lost=0)
             self.known.past[..., :-1] = 0.0
         self.watch = watched
 
@@ -282,7 +283,7 @@ class _Work:
         (judged, where), at, rows, heard = self._calls(), self._old(), self.rows, []
         for number in np.flatnonzero(judged).tolist():
             row = self._direct(number)
-            if number == OWN or row >= 0:
+            if number == OWN or (row >= 0 and where[number] < self.before.mean.size):
                 used = rows.with_way & (rows.caller == number)
                 used[row] &= number == OWN
                 direct = np.array([rows.bearing[row], rows.bearing_std[row]])
@@ -305,15 +306,14 @@ class _Work:
 
     def _old(self) -> Int[np.ndarray, " l"]:
         """Return the confirmed landmarks' joint-mean indices; -1 for others."""
-        known = self.memory.known
-        at, _ = places_of(known.label, self.joint.landmark, self.near)
-        return np.where(known.confirmed, at, -1)
+        at, _ = places_of(self.memory.known.label, self.joint.landmark, self.near)
+        return np.where(self.memory.known.confirmed, at, -1)
 
     def _calls(self) -> tuple[Bool[np.ndarray, " c"], Int[np.ndarray, " c"]]:
         """Return whether to judge each call by this scan, and callers' joint-mean indices."""
         scan, source = self.scan, self.memory.known.source
         size = max(1 + scan.caller.max(initial=0), scan.direct.size, source.shape[1])
-        size = max(size, len(self.memory.watch.hits))
+        size = max(size, len(self.memory.watch.hits), 1 + max(self.callers, default=0))
         where, judged = np.full(size, UNPLACED), np.zeros(size, np.bool_)
         where[OWN] = OWN_CALL
         for number, caller in self.callers.items():

@@ -208,7 +208,7 @@ def failed(
     largest = np.where(told, ratio, -math.inf)
     calls = np.flatnonzero(largest.max(axis=1) >= BOUND).tolist()
     since = int(largest[calls].argmax(axis=1).min(initial=WINDOW - 1))
-    return calls, since, bool(calls) and not (judged & (ratio[:, since] < 0.0)).any()
+    return calls, since, bool(calls) and not (ratio[:, since] < 0.0).any()
 
 
 def alarmed(watch: Watched, since: int, number: int, repaired: bool) -> Watched:
@@ -221,7 +221,7 @@ def alarmed(watch: Watched, since: int, number: int, repaired: bool) -> Watched:
 
 def reported(watch: Watched) -> dict[str, Any]:
     """Return a watch's results by their names in ``summary.json``."""
-    alarms = [(time, int(call), bool(repaired)) for time, call, repaired in watch.alarms.tolist()]
+    alarms = sorted((time, int(call), bool(good)) for time, call, good in watch.alarms.tolist())
     counts = zip(watch.heard.tolist(), watch.expected.tolist(), strict=True)
     return {
         "watch": [heard / expected if expected else None for heard, expected in counts],
