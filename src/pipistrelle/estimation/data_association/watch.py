@@ -110,15 +110,15 @@ def probabilities(
     with levels above `FAINTEST`; others get the probability 0 and the bin -1.
     """
     p, bins = np.zeros((at.size, len(hits))), np.full((at.size, len(hits)), -1)
+    bare = np.array([np.isnan(source[:, c]).all() for c in range(len(hits))])
     for n in range(at.size):
         dx, dy = mean[at[n]] - mean[0], mean[at[n] + 1] - mean[1]
         far, bearing = max(math.hypot(dx, dy), 1.0), wrap_angle(math.atan2(dy, dx) - mean[2])
         sector = min(int(SECTORS * abs(bearing) / math.pi), SECTORS - 1)
         for c in range(len(hits)):
-            ring, level = 2.0 * math.log2(far), source[n, c]
-            if not np.isnan(source[:, c]).all():
-                lost = (40.0 if c == OWN else 20.0) * math.log10(far)
-                ring = (level - lost - FAINTEST) / LEVEL_STD
+            lost = (40.0 if c == OWN else 20.0) * math.log10(far)
+            level = (source[n, c] - lost - FAINTEST) / LEVEL_STD
+            ring = 2.0 * math.log2(far) if bare[c] else level
             if ring >= 0.0:
                 bins[n, c] = SECTORS * min(int(ring), RINGS - 1) + sector
                 p[n, c] = hits[c, bins[n, c]] / (asked[c, bins[n, c]] + 1.0)
