@@ -55,9 +55,7 @@ range_bounds = [0.5, 12.0]
 
 [association]
 detection = 0.9
-clutter = 0.06
-max_range = 6.0
-field_of_view = 2.79""",
+clutter = 0.06""",
     "odometry.csv": "\n".join(["time,velocity,angular_rate", *told]),
     "measurements.csv": "\n".join(["time,landmark,bearing,range", *measured]),
 }

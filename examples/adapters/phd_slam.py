@@ -66,8 +66,6 @@ def log(files: Path, folder: Path, seed: Path | None = None) -> None:
         association={
             "detection": DETECTION,
             "clutter": CLUTTER / (FARTHEST * pi),
-            "max_range": FARTHEST,
-            "field_of_view": pi,
         },
     )
     write_log(folder, drive)

@@ -64,8 +64,6 @@ def log(files: Path, folder: Path) -> None:
         association={
             "detection": 0.9,
             "clutter": 3.0 / (FARTHEST * VIEW),
-            "max_range": FARTHEST,
-            "field_of_view": VIEW,
         },
     )
     write_log(folder, drive)

@@ -496,10 +496,6 @@ class AssociationConfig(Section):
     way_std: Positive = 0.35
     """Largest standard deviation of a range or an excess path; less precise ones are discarded
     [m]."""
-    max_range: Positive | None = None
-    """Largest range of a sensor without levels [m]; by default no landmark counts as missed."""
-    field_of_view: Annotated[Positive, Field(le=2.0 * math.pi)] = 2.0 * math.pi
-    """Full angle of view of a sensor without levels, around its heading [rad]."""
 
 
 class ListeningConfig(Section):

@@ -7,14 +7,12 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from pipistrelle.config import AssociationConfig, Config
+from pipistrelle.config import Config
 from pipistrelle.detection.logs.folder import read_log, write_log
 from pipistrelle.detection.scans import make_scan
-from pipistrelle.estimation.beliefs import Gaussian
-from pipistrelle.estimation.motion import Motion, motion_step
 from pipistrelle.experiments.drives import NO_TRUTH
-from pipistrelle.geometry import range_and_bearing, wrap
-from pipistrelle.scripting.log_warnings import fit_warnings, log_warnings, misreading, wide_sight
+from pipistrelle.geometry import wrap
+from pipistrelle.scripting.log_warnings import fit_warnings, log_warnings, misreading
 from reference.missions import map_with, scan_with
 from reference.spoilt_logs import DEGREES, SPOILED, noisy_log
 
@@ -228,53 +226,3 @@ def test_bearings_are_kept_as_recorded_before_they_are_wrapped(tmp_path):
     log = read_log(tmp_path)
     assert log.recorded_bearings()[0] == 7.5
     assert log.scans[0].bearing[0] == wrap(7.5)
-
-
-def sight_of(field_of_view, max_range):
-    """Questions of a stated sight; the map is right, and rows are heard within 1.57 rad and 8 m."""
-    log = noisy_log(labels=True, steps=1200, turn_rate=0.1)
-    pose, poses = np.zeros(3), [np.zeros(3)]
-    motion = Motion(model="unicycle", control_std=(0.05, 0.05))
-    for control in log.controls:
-        pose = motion_step(motion, pose, control, 0.1)
-        poses.append(pose)
-    rng = np.random.default_rng(2)
-    places = rng.uniform(-12.0, 12.0, (40, 2)) + np.array([0.0, 5.0])
-    scans, labels = [], []
-    for k in range(5, 1200, 5):
-        r, b = range_and_bearing(poses[k], places)
-        heard = np.flatnonzero((np.abs(b) < 0.5 * np.pi) & (r < 8.0) & (rng.random(40) < 0.85))
-        scans.append(make_scan(k * 0.1, np.full(heard.size, -1), b[heard], range=r[heard]))
-        labels.append(heard)
-    landmarks = map_with(np.arange(40), places)
-    track = SimpleNamespace(
-        pose=Gaussian(mean=np.array(poses), covariance=np.zeros((1201, 3, 3))),
-        time=log.time,
-        landmarks=landmarks,
-        labels=tuple(labels),
-    )
-    association = AssociationConfig(
-        method="marginal", field_of_view=field_of_view, max_range=max_range
-    )
-    trial = SimpleNamespace(track=track, heard=scans)
-    return wide_sight(trial, log, Config(association=association))
-
-
-@pytest.mark.parametrize(
-    ("sight", "asked"),
-    [
-        ((np.pi, 8.0), []),
-        ((3.0, 7.5), []),
-        ((np.pi, None), []),
-        ((2.0 * np.pi, 8.0), ["field_of_view"]),
-        ((np.pi, 16.0), ["max_range"]),
-        ((2.0 * np.pi, 16.0), ["field_of_view", "max_range"]),
-    ],
-)
-def test_a_sight_is_questioned_that_is_stated_wider_than_the_rows_of_a_log(sight, asked):
-    questions = sight_of(*sight)
-    assert [found.split()[0] for found, _ in questions] == [f"association.{name}" for name in asked]
-    fits = {"field_of_view": 2.0 * 0.5 * np.pi, "max_range": 8.0}
-    for name, (_, question) in zip(asked, questions, strict=True):
-        value = float(question.split("does ")[1].split()[0])
-        assert value == pytest.approx(fits[name], rel=0.03)

@@ -18,21 +18,17 @@ from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
-from scipy.special import bdtr, bdtrc
+from jaxtyping import Float, Int
+from scipy.special import bdtrc
 
 from pipistrelle.config import Config
-from pipistrelle.detection.scans import BEARING, NUMBERS, OWN, RANGE, UNLABELLED, WIDEST
-from pipistrelle.estimation.beliefs import placed
+from pipistrelle.detection.scans import OWN, UNLABELLED, WIDEST
 from pipistrelle.estimation.catalogue import GATE, gate_of, short_name
-from pipistrelle.estimation.data_association.existence import BEFORE, WITHIN
 from pipistrelle.estimation.data_association.watch import POSE
 from pipistrelle.estimation.motion import relative_motions
-from pipistrelle.estimation.session import REMEMBERED
-from pipistrelle.experiments.drives import carried
 from pipistrelle.experiments.named_settings import own_config
 from pipistrelle.experiments.runs.replay import log_motion
-from pipistrelle.geometry import range_and_bearing, wrap
+from pipistrelle.geometry import wrap
 from pipistrelle.scripting.arguments import has_excess_paths
 
 if TYPE_CHECKING:
@@ -58,9 +54,6 @@ LAGS = 2 ** np.arange(10)
 """Distances to the earlier scans, in scans."""
 CHANCE = 0.01
 """Probability of naming a mistake by chance."""
-REACH, QUESTIONED = 0.99, 1e-3
-"""Quantile of the rows that the sensor's field of view and range reach at least, and probability of
-questioning a correct setting by chance."""
 Question = tuple[str, str]
 """An observation, and the question or advice that follows."""
 
@@ -163,7 +156,6 @@ def fit_warnings(
         if trial.track.labels:
             unmapped += _unmapped(trial, recorded)
             wide += [*_refuted(trial, recorded)]
-            wide += wide_sight(trial, recorded, own_config(config, trial.filter))
     if questions or unmapped:
         mistake, fits = misreading(recorded)
         questions += [] if fits else unmapped
@@ -581,59 +573,3 @@ def _log_ratio(
     mean = np.where(partner, density, 0.0).sum(axis=1) / np.maximum(partners, 1)
     comparable = (partners > 0) & ~np.isnan(bearing)
     return np.where(comparable, np.log(0.5 + 0.5 * mean / max(turns, 1.0)), 0.0)
-
-
-def wide_sight(trial: "TrialResult", recorded: "Log", config: Config) -> list[Question]:
-    """Return warnings if the stated field of view or range of the sensor seems too wide.
-
-    Landmarks expected beyond the quantile `REACH` of the rows but within the stated limit must be
-    detected with the probability ``association.detection``. The limit is questioned if the
-    binomial probability of so few detections is `QUESTIONED` at most. Only every `REMEMBERED`-th
-    scan counts, as an obstacle may hide a landmark in successive scans.
-    """
-    stated = config.association
-    if stated.max_range is None:
-        return []
-    far, bearing, heard = _expected_rows(trial, recorded)
-    own = [scan.numbers[:, (scan.caller == OWN) & np.isnan(scan.level_db)] for scan in trial.heard]
-    rows = np.concatenate([np.empty((NUMBERS, 0)), *own], axis=1)
-    rows = rows[:, ~np.isnan(rows[RANGE])]
-    if not rows.size:
-        return []
-    half, farthest = 0.5 * stated.field_of_view - BEFORE, WITHIN * stated.max_range
-    wide, long = np.quantile(np.abs(rows[BEARING]), REACH), np.quantile(rows[RANGE], REACH)
-    off = np.abs(bearing)
-    aside = (far <= long) & (wide < off) & (off <= half)
-    ahead = (off <= wide) & (long < far) & (far <= farthest)
-    asked = (
-        ("field_of_view", "bearings", aside, 2.0 * wide, "rad"),
-        ("max_range", "ranges", ahead, long, "m"),
-    )
-    return [
-        (
-            f"association.{name} is {getattr(stated, name):.3g} {unit}, but {REACH:.0%} of the "
-            f"{what} are within {value:.3g} {unit}, and of {beyond.sum()} times that landmarks "
-            f"were expected beyond, they were heard {(beyond & heard).sum()} times",
-            f"the map loses landmarks by that; does {value:.3g} fit?",
-        )
-        for name, what, beyond, value, unit in asked
-        if bdtr((beyond & heard).sum(), beyond.sum(), stated.detection) <= QUESTIONED
-    ]
-
-
-def _expected_rows(
-    trial: "TrialResult", recorded: "Log"
-) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"], Bool[np.ndarray, " n"]]:
-    """Return expected range and bearing of landmarks in some scans, and which were detected."""
-    track, landmarks = trial.track, trial.track.landmarks
-    mask = placed(landmarks)
-    points, label = landmarks.mean[mask], landmarks.landmark[mask]
-    poses = carried(track.pose, recorded.sensor_pose).mean
-    columns: list[np.ndarray] = [np.empty((3, 0))]
-    for n in range(0, len(track.labels), REMEMBERED):
-        scan, labels = trial.heard[n], track.labels[n]
-        step = np.searchsorted(track.time, scan.time)
-        far, bearing = range_and_bearing(poses[step], points)
-        columns.append(np.vstack((far, bearing, np.isin(label, labels))))
-    far, bearing, heard = np.concatenate(columns, axis=1)
-    return far, bearing, heard > 0.0

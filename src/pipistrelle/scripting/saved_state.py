@@ -56,7 +56,7 @@ from pipistrelle.version import find_version
 
 HEAD = b"# Of Pipistrelle: a drive to go on from\n"
 """First line of the file; the second is the checksum of the rest."""
-FORM = 4
+FORM = 5
 """Version of the file format; 1 was a pickle, 2 and 3 had no watch."""
 ROLES = ("filter", "association")
 """Keys of the head with the names of estimator and association."""

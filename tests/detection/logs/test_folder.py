@@ -100,12 +100,12 @@ def test_a_bicycle_log_has_a_wheelbase_speed_and_steering(tmp_path):
 
 def test_optional_settings_are_read_and_may_be_whole_numbers(tmp_path):
     more = "gate = 0.99\nnoise_at_rest = false\nsensor_pose = [3.8, 0.5, 0.1]\n"
-    more += "[association]\nmax_range = 50\nclutter = 0.01\n"
+    more += "[association]\ndetection = 1\nclutter = 0.01\n"
     settings = UNICYCLE.replace("range_std = 0.2", "range_std = 2") + more
     log = read_log(recorded(tmp_path, settings))
     assert (log.gate, log.noise_at_rest, log.range_std) == (0.99, False, 2.0)
     assert log.sensor_pose == (3.8, 0.5, 0.1)
-    assert log.association == {"max_range": 50.0, "clutter": 0.01}
+    assert log.association == {"detection": 1.0, "clutter": 0.01}
 
 
 def test_rows_of_one_time_are_one_scan_and_an_empty_range_is_passive(folder):
@@ -389,13 +389,8 @@ def test_one_row_of_odometry_is_no_log(tmp_path):
         ("range_std = 0.2", "range_std = 0.2\ngate = 1.5", ("'gate': found 1.5", "equal to 1")),
         (
             "[0.5, 20.0]",
-            "[0.5, 20.0]\n[association]\nfield_of_view = 180.0",
-            ("'association.field_of_view': found 180.0", "6.28"),
-        ),
-        (
-            "[0.5, 20.0]",
             "[0.5, 20.0]\n[association]\nrange = 7.0",
-            ("unknown key 'association.range'", "max_range"),
+            ("unknown key 'association.range'", "clutter"),
         ),
         ("range_std = 0.2", "range_std = ", ("TOML", "line 7")),
         (

@@ -50,8 +50,8 @@ def test_a_row_next_to_a_louder_row_begins_no_landmark(apart, begun):
     scan = make_scan(0.0, np.full(2, -1), np.zeros(2), range=way, level_db=level, **stds)
     rows, joint = rows_of_scan(scan, LIMITS, ()), (np.empty(0, int), np.zeros(3), np.eye(3))
     caller, none = (0, -1, OWN_CALL), np.empty(0, int)
-    near, label = np.zeros(2, bool), np.full(2, UNLABELLED)
-    used, costs, close = compared(tuple(rows), joint, none, near, caller, CHANCES, 0.1)
+    label = np.full(2, UNLABELLED)
+    used, costs, close = compared(tuple(rows), joint, none, caller, CHANCES)
     assert used.tolist() == [0, 1]
     assert costs.shape == (2, 0)
     assert not close.any()

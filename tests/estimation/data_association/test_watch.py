@@ -10,12 +10,18 @@ from pipistrelle.config import Config
 from pipistrelle.detection.scans import UNLABELLED, make_scan
 from pipistrelle.estimation.beliefs import Gaussian, JointGaussian
 from pipistrelle.estimation.catalogue import entry
-from pipistrelle.estimation.data_association.existence import WINDOW, nobody, with_new
+from pipistrelle.estimation.data_association.existence import (
+    CHANCE,
+    LASTING,
+    PERSISTENCE,
+    WINDOW,
+    nobody,
+    with_new,
+)
 from pipistrelle.estimation.data_association.pairs import OWN_CALL, Rows
 from pipistrelle.estimation.data_association.sequential import association_of
 from pipistrelle.estimation.data_association.watch import (
     BOUND,
-    CHANCE,
     POSE,
     failed,
     observed,
@@ -50,6 +56,7 @@ def test_scan_records_log_probability_of_misses_as_far_as_strays_may_be_of_them(
     """Of five landmarks one is detected, two are missed, one is near a row, one unconfirmed."""
     places = np.array([[3.0, 0.0], [3.0, 1.0], [3.0, -1.0], [2.0, 2.0], [5.0, 0.0]])
     mean, known = np.append(np.zeros(3), places), known_of(np.zeros((5, 1)), [0] * 5)
+    known.count[[0, 1, 2, 4]] = LASTING, LASTING, LASTING, LASTING
     sums = of_calls(1)[:4]
     hits, asked, p = 8.0, 9.0, 0.8
     for strays, share in ((0, 0.0), (1, 1.0 / 1.6), (4, 1.0)):
@@ -62,12 +69,13 @@ def test_scan_records_log_probability_of_misses_as_far_as_strays_may_be_of_them(
         sure = np.arange(way.size) >= 2
         heard = label, number, sure, bearing, std, way, std, np.ones(way.size)
         at = np.array([3, 5, 7, 9, -1])
-        calls = np.ones(1, np.bool_), np.full(1, OWN_CALL)
-        joint = mean, 1e-6 * np.eye(13)
-        updated = hits_, asked_, found, expected
-        past = observed(tuple(known), updated, joint, at, calls, heard, CHANCES)[:, 0, -1]
+        place = mean, at, np.full(1, OWN_CALL), np.zeros(1, np.bool_)
+        updated, judged = (hits_, asked_, found, expected), np.ones(1, np.bool_)
+        scan = 1e-6 * np.eye(13), place, judged, heard, CHANCES
+        past, missed = observed(tuple(known), updated, *scan)
         miss = share * math.log(1.0 - p)
-        assert past == pytest.approx([1.0, miss, miss, 0.0, 0.0])
+        assert past[:, 0, -1] == pytest.approx([1.0, miss, miss, 0.0, 0.0])
+        assert missed == pytest.approx([1.0, *[(1.0 - p) ** (1.0 / PERSISTENCE)] * 3, 1.0])
         assert (hits_.sum() - hits * hits_.size, asked_.sum() - asked * asked_.size) == (1, 3)
         assert [*found, *expected] == pytest.approx([1.0, 3 * p])
 

@@ -550,9 +550,9 @@ def test_odometry_calibration_with_an_offset_sensor_is_refused(asked):
 
 
 def test_a_logs_sensor_settings_are_defaults():
-    log = replace(a_log(), association={"clutter": 0.01, "max_range": 50.0})
+    log = replace(a_log(), association={"clutter": 0.01, "detection": 0.7})
     settled, _ = with_log({}, log, Path("log"))
-    assert (settled.association.clutter, settled.association.max_range) == (0.01, 50.0)
+    assert (settled.association.clutter, settled.association.detection) == (0.01, 0.7)
     asked, _ = with_log(from_flags({"association": {"clutter": 0.5}}), log, Path("log"))
     assert asked.association.clutter == 0.5
 

@@ -1,7 +1,7 @@
 """The keys of ``log.toml``: motion model, initial pose, noise, sensor and callers."""
 
 from collections.abc import Mapping
-from math import inf, pi
+from math import inf
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -29,7 +29,6 @@ from pipistrelle.text_tables import FORMER_NAMES, Schema
 _Triple = Annotated[tuple[Real, Real, Real], Field(strict=False)]
 _Triple_std = Annotated[tuple[NonNegative, NonNegative, NonNegative], Field(strict=False)]
 _Bounds = Annotated[tuple[Positive, Positive], Field(strict=False)]
-_Turn = Annotated[Positive, Field(le=2.0 * pi)]
 
 NOISY = {
     "unicycle": ("velocity", "angular_rate"),
@@ -63,8 +62,6 @@ class _Association(Section):
     detection: Probability | None = None
     clutter: Positive | None = None
     bearing_std: Positive | None = None
-    max_range: Positive | None = None
-    field_of_view: _Turn | None = None
 
 
 class Vehicle(Section):

@@ -257,14 +257,13 @@ def place_of(label: Whole, landmark: Int[np.ndarray, " n"]) -> int:
 
 @kernel
 def places_of(
-    labels: Int[np.ndarray, " l"], landmark: Int[np.ndarray, " n"], near: Bool[np.ndarray, " k"]
-) -> tuple[Int[np.ndarray, " l"], Bool[np.ndarray, " l"]]:
-    """Return landmarks' joint-mean indices (-1: absent), and whether each is near a measurement."""
-    at, close = np.empty(labels.size, np.int64), np.zeros(labels.size, np.bool_)
+    labels: Int[np.ndarray, " l"], landmark: Int[np.ndarray, " n"]
+) -> Int[np.ndarray, " l"]:
+    """Return landmarks' joint-mean indices, or -1 if absent."""
+    at = np.empty(labels.size, np.int64)
     for n in range(labels.size):
         at[n] = place_of(labels[n], landmark)
-        close[n] = at[n] >= 0 and near[(at[n] - 3) // 2]
-    return at, close
+    return at
 
 
 @kernel
@@ -272,16 +271,13 @@ def compared(
     rows: tuple[np.ndarray, ...],
     joint: Joint,
     moving: Int[np.ndarray, " v"],
-    near: Bool[np.ndarray, " k"],
     caller: tuple[Whole, Whole, Whole],
     chances: PlainChances,
-    telling: float,
 ) -> tuple[Int[np.ndarray, " r"], Float[np.ndarray, "r n"], Bool[np.ndarray, " r"]]:
     """Compare a caller's measurements with all landmarks: return costs, and which are within gates.
 
-    ``moving``: labels excluded from matching; ``near``: set for landmarks near a measurement with a
-    bearing std up to ``telling``; ``caller``: number, index of its direct call, and of its
-    position.
+    ``moving``: labels excluded from matching; ``caller``: number, index of its direct call, and of
+    its position.
     """
     heard, (landmark, mean, covariance), (number, direct, at) = ScanRows(*rows), joint, caller
     used = np.flatnonzero(heard.caller == number)
@@ -294,15 +290,9 @@ def compared(
         usable = heard.with_way
     size, close = 0, np.zeros(used.size, np.bool_)
     for k in range(used.size):
-        m, any_near = used[k], False
-        tells = heard.bearing_std[m] <= telling
-        for n in range(landmark.size):
-            costs[size, n] = costs[k, n]
-            if costs[k, n] < math.inf:
-                any_near = True
-                near[n] |= tells
-        used[size], close[size] = m, any_near
-        if usable[m]:
+        costs[size] = costs[k]
+        used[size], close[size] = used[k], (costs[k] < np.inf).any()
+        if usable[used[k]]:
             size += 1
     return used[:size], costs[:size], close[:size]
 

@@ -84,8 +84,6 @@ class Limits:
     """Range or excess path of a measurement that begins a landmark [m]."""
     assumed: tuple[float, ...] = ()
     """Default standard deviations, exempt from all limits."""
-    sight: tuple[float, float] = (0.0, 0.0)
-    """Range and field of view of a sensor without levels (`existence.Sight`)."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -197,7 +195,6 @@ class _Work:
         self.before, self.watch, self.known = self.joint, memory.watch, memory.known
         self.back: int | None = None
         self.blind, self.begins = False, not memory.watch.lost
-        self.near = np.zeros(self.joint.landmark.size + scan.landmark.size, np.bool_)
 
     def search_callers(self) -> None:
         """Track echoes of unlocated callers, and search for their positions."""
@@ -230,16 +227,17 @@ class _Work:
     def watch_calls(self) -> None:
         """Judge each call by its measurements of old landmarks; repair a failed call or pose."""
         judged, where = self._calls()
-        watched = self._observed(judged, where)
+        fixed, watched = judged & ~self._moves(judged.size), self._observed(judged, where)
         watched = watched._replace(times=np.append(watched.times[1:], self.scan.time))
-        least = np.where(judged, 1, WINDOW + 1)
-        for number in {*self.callers} & {*np.flatnonzero(judged).tolist()}:
+        least = np.where(fixed, 1, WINDOW + 1)
+        for number in {*self.callers} & {*np.flatnonzero(fixed).tolist()}:
             row = self._direct(number)
             fits = row >= 0 and self.label[row] == self.callers[number].label
             least[number] = watch.SPOILT if fits else WINDOW // 2
         ratio = watch.ratios(tuple(self.known), self._old(), self.memory.scan)
+        ratio[self._moves(judged.size)] = 0.0
         calls, since, pose = watch.failed(watched, ratio, least)
-        fits = bool((ratio[judged, -1] < 0.0).any()) and not calls
+        fits = bool((ratio[fixed, -1] < 0.0).any()) and not calls
         if watched.lost and self.scan.landmark.size and not fits:
             joint, times, lost = self._placed_again(), watched.times, watched.lost + 1
             self.blind = joint is None and lost <= watch.SETTLED
@@ -274,14 +272,14 @@ class _Work:
 
     def _match_again(self, joint: JointGaussian) -> None:
         """Match all measurements again by another joint Gaussian of pose and map."""
-        self.joint, self.new, self.near[:] = joint, [], False
+        self.joint, self.new = joint, []
         self.label[:], self.named[:] = UNLABELLED, UNLABELLED
         self.match_all()
 
     def _placed_again(self) -> JointGaussian | None:
         """Return the joint Gaussian with the pose that the scan has on the old map, if any."""
         (judged, where), at, rows, heard = self._calls(), self._old(), self.rows, []
-        for number in np.flatnonzero(judged).tolist():
+        for number in np.flatnonzero(judged & ~self._moves(judged.size)).tolist():
             row = self._direct(number)
             if number == OWN or (row >= 0 and where[number] < self.before.mean.size):
                 used = rows.with_way & (rows.caller == number)
@@ -299,14 +297,15 @@ class _Work:
         watched = watch.of_calls(judged.size, self.memory.watch)
         std = np.where(rows.usable, rows.bearing_std, math.nan)
         heard = self.label, rows.caller, rows.sure, rows.bearing, std, *rows[3:5], rows.clutter
-        chances, joint = (*self.stage.chances[:4], math.inf), self._joint()[1:]
-        placed = joint, self._old(), (judged, where), heard, chances
-        self.known = known._replace(past=watch.observed(tuple(known), watched[:4], *placed))
+        chances, place = (*self.stage.chances[:4], math.inf), self._place(known.label, where)
+        placed = self.joint.covariance, place, judged, heard, chances
+        past, self.missed = watch.observed(tuple(known), watched[:4], *placed)
+        self.known = known._replace(past=past)
         return watched
 
     def _old(self) -> Int[np.ndarray, " l"]:
         """Return the confirmed landmarks' joint-mean indices; -1 for others."""
-        at, _ = places_of(self.memory.known.label, self.joint.landmark, self.near)
+        at = places_of(self.memory.known.label, self.joint.landmark)
         return np.where(self.memory.known.confirmed, at, -1)
 
     def _calls(self) -> tuple[Bool[np.ndarray, " c"], Int[np.ndarray, " c"]]:
@@ -318,7 +317,7 @@ class _Work:
         where[OWN] = OWN_CALL
         for number, caller in self.callers.items():
             where[number] = self._where(caller.label)
-        for number in {*scan.caller.tolist()} - self.moves:
+        for number in {*scan.caller.tolist()}:
             judged[number] = number == OWN or where[number] >= 0
         return judged, where
 
@@ -331,8 +330,8 @@ class _Work:
         if number in self.moves and at >= 0:
             self._follow_turn(number, at)
         rows, chances, known = tuple(self.rows), self.stage.chances, self.memory.known
-        joint, telling = self._joint(), 2.0 * self.stage.limits.bearing_std
-        used, costs, near = compared(rows, joint, self.moving, self.near, caller, chances, telling)
+        joint = self._joint()
+        used, costs, near = compared(rows, joint, self.moving, caller, chances)
         matched = used, self.stage.match(costs), near
         confirmed = known.label[known.confirmed]
         begun, count = label_matched(self.label, rows, joint, confirmed, matched, caller, chances)
@@ -408,15 +407,26 @@ class _Work:
 
     def _judged(self) -> tuple[Known, Int[np.ndarray, " l"]]:
         """Return all landmark records with updated log odds, and joint-mean indices or -1."""
-        memory, rows = self.memory, self.rows
+        scan, rows = self.memory.scan, self.rows
         _, callers = self._calls()
-        known = existence.with_new(self.known, self.new, memory.scan, callers.size)
-        moves = np.zeros(callers.size, np.bool_)
+        known = existence.with_new(self.known, self.new, scan, callers.size)
+        missed = np.append(self.missed, np.ones(known.label.size - self.missed.size))
+        heard = self.label, rows.caller, rows.level_db, rows.surety
+        place = self._place(known.label, callers)
+        return existence.judged(known, heard, place, missed, scan), place[1]
+
+    def _place(
+        self, label: Int[np.ndarray, " l"], callers: Int[np.ndarray, " c"]
+    ) -> existence.Place:
+        """Return the joint mean, and indices in it of landmarks and callers."""
+        at = places_of(label, self.joint.landmark)
+        return self.joint.mean, at, callers, self._moves(callers.size)
+
+    def _moves(self, calls: int) -> Bool[np.ndarray, " c"]:
+        """Return whether each caller moves."""
+        moves = np.zeros(calls, np.bool_)
         moves[[*self.moves]] = True
-        heard = self.label, rows.caller, rows.way, rows.level_db, rows.bearing, rows.surety
-        at, near = places_of(known.label, self.joint.landmark, self.near)
-        place = self.joint.mean, at, callers, moves
-        return existence.judged(known, heard, place, near, memory.scan, self.stage.limits.sight), at
+        return moves
 
     def _doubles(self, known: Known, at: Int[np.ndarray, " l"]) -> tuple[tuple[int, int], ...]:
         """Return the pairs of duplicate landmarks to merge now, as (older, newer) labels."""
@@ -547,7 +557,6 @@ def association_of(config: Config) -> Association | None:
             bearing_std=settings.bearing_std,
             way_std=settings.way_std,
             assumed=_assumed(config),
-            sight=(settings.max_range or 0.0, settings.field_of_view),
         )
         motion = told.caller_speed_std, told.caller_walk_std
         return Sequential(match=METHODS[name], chances=tuple(chances), limits=limits, motion=motion)

@@ -1,11 +1,9 @@
 r"""Watch over a drive without labels: alarms if old landmarks are no longer detected as before.
 
 **Alarm** (`ratios`). Old landmarks are confirmed, and were first detected before the failure. A
-call detects one with the probability p of its level (without levels: its range) and bearing,
-learned from the drive: h detections in n scans with such a landmark give h / (n + 1). Such a
-landmark goes on to be detected with the probability 1 - q, after a failure (a moved caller, a wrong
-pose) with q, by chance. If the call failed in a scan k, all scans since then have the log
-likelihood ratio
+call detects them with probabilities p (`existence`). Such a landmark goes on to be detected with
+the probability 1 - q, after a failure (a moved caller, a wrong pose) with q, by chance. If the call
+failed in a scan k, all scans since then have the log likelihood ratio
 
 .. math:: G_k = \sum_{missed} \ln \frac{1 - q + q m}{q + (1 - q) m}
                 + \sum_{detected} \ln \frac{q}{1 - q}, \qquad m = \prod (1 - p)
@@ -37,22 +35,29 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Bool, Complex, Float, Int
 
-from pipistrelle.detection.scans import OWN
 from pipistrelle.estimation.beliefs import JointGaussian
 from pipistrelle.estimation.catalogue import GATE as CONFIDENCE
-from pipistrelle.estimation.data_association.existence import FAINTEST, LEVEL_STD, WINDOW, Known
-from pipistrelle.estimation.data_association.pairs import OWN_CALL, PlainChances, Rows, pair_costs
-from pipistrelle.geometry import wrap_angle
+from pipistrelle.estimation.data_association.existence import (
+    BINS,
+    LASTING,
+    PERSISTENCE,
+    WINDOW,
+    Known,
+    Place,
+    log_ratio,
+    probabilities,
+)
+from pipistrelle.estimation.data_association.pairs import (
+    OWN_CALL,
+    UNPLACED,
+    PlainChances,
+    Rows,
+    pair_costs,
+)
 from pipistrelle.jit import Whole, kernel
 
 BOUND = math.log(1e5)
 """Log likelihood ratio of an alarm: less than 1 false alarm in 100,000 scans."""
-RINGS, SECTORS = 12, 8
-"""Bins of detection probabilities: levels, `LEVEL_STD` wide, else ranges from 1 m by factors of the
-root of 2, and bearings."""
-BINS = RINGS * SECTORS
-CHANCE = 0.1
-"""Probability q that a landmark is still detected after a failure, and hidden without failure."""
 SPOILT = 3
 """Least scans of a caller in a failure: an echo may have been taken for its direct call."""
 SETTLED = 12
@@ -97,78 +102,50 @@ def of_calls(calls: int, before: Watched | None = None) -> Watched:
 
 
 @kernel
-def probabilities(
-    hits: Float[np.ndarray, "c b"],
-    asked: Float[np.ndarray, "c b"],
-    mean: Float[np.ndarray, " d"],
-    at: Int[np.ndarray, " n"],
-    source: Float[np.ndarray, "n c"],
-) -> tuple[Float[np.ndarray, "n c"], Int[np.ndarray, "n c"]]:
-    """Return each call's detection probability of landmarks at joint-mean indices, and bins.
-
-    ``source``: levels at 1 m, as in `existence.Known`. A call with levels is judged by landmarks
-    with levels above `FAINTEST`; others get the probability 0 and the bin -1.
-    """
-    p, bins = np.zeros((at.size, len(hits))), np.full((at.size, len(hits)), -1)
-    bare = np.array([np.isnan(source[:, c]).all() for c in range(len(hits))])
-    for n in range(at.size):
-        dx, dy = mean[at[n]] - mean[0], mean[at[n] + 1] - mean[1]
-        far, bearing = max(math.hypot(dx, dy), 1.0), wrap_angle(math.atan2(dy, dx) - mean[2])
-        sector = min(int(SECTORS * abs(bearing) / math.pi), SECTORS - 1)
-        for c in range(len(hits)):
-            lost = (40.0 if c == OWN else 20.0) * math.log10(far)
-            level = (source[n, c] - lost - FAINTEST) / LEVEL_STD
-            ring = 2.0 * math.log2(far) if bare[c] else level
-            if ring >= 0.0:
-                bins[n, c] = SECTORS * min(int(ring), RINGS - 1) + sector
-                p[n, c] = hits[c, bins[n, c]] / (asked[c, bins[n, c]] + 1.0)
-    return p, bins
-
-
-@kernel
 def observed(
     columns: tuple[np.ndarray, ...],
     sums: tuple[np.ndarray, ...],
-    joint: tuple[Float[np.ndarray, " d"], Float[np.ndarray, "d d"]],
-    at: Int[np.ndarray, " l"],
-    calls: tuple[Bool[np.ndarray, " c"], Int[np.ndarray, " c"]],
+    covariance: Float[np.ndarray, "d d"],
+    place: Place,
+    judged: Bool[np.ndarray, " c"],
     heard: tuple[np.ndarray, ...],
     chances: PlainChances,
-) -> Float[np.ndarray, "l c w"]:
-    """Add a scan's detections of old landmarks to sums; return the later `existence.Known.past`.
+) -> tuple[Float[np.ndarray, "l c w"], Float[np.ndarray, " l"]]:
+    """Add a scan's detections of old landmarks to sums, the first four columns of `Watched`.
 
-    ``sums``: the first four columns of `Watched`; ``calls``: whether each is judged, and its
-    caller's index in the joint mean; ``heard``: label and caller of measurements, whether they are
-    precise, then the columns of `pairs.Rows`.
+    Returns the later `existence.Known.past`, and the probability of a miss of all landmarks.
+    ``heard``: label and caller of measurements, whether they are precise, then the columns of
+    `pairs.Rows`.
     """
-    known, (hits, asked, found, expected), (mean, covariance) = Known(*columns), sums, joint
+    known, (hits, asked, found, expected), (mean, at, callers, _) = Known(*columns), sums, place
     label, caller, sure, bearing, bearing_std, way, way_std, clutter = heard
-    past, old = np.zeros_like(known.past), np.flatnonzero(at >= 0)
+    past, missed, old = np.zeros_like(known.past), np.ones(at.size), known.confirmed & (at >= 0)
     past[..., :-1] = known.past[..., 1:]
-    p, bins = probabilities(hits, asked, mean, at[old], known.source[old])
-    for c in np.flatnonzero(calls[0]):
-        rows, strays, missed = np.flatnonzero(caller == c), 0.0, np.zeros(old.size)
+    p, bins = probabilities(hits, asked, known.source, place)
+    for c in np.flatnonzero(judged):
+        rows, strays, silent = np.flatnonzero(caller == c), 0.0, np.zeros(at.size)
         part = bearing[rows], bearing_std[rows], way[rows], way_std[rows], clutter[rows]
         for m in rows:
             strays += 1.0 if sure[m] and label[m] not in known.label[old] else 0.0
-        for k in range(old.size):
-            n, here = old[k], bins[k, c]
-            if known.label[n] in label[rows]:
+        for n in np.flatnonzero(at >= 0):
+            here, seen = bins[n, c], known.label[n] in label[rows]
+            if here >= 0 and known.count[n] >= LASTING:
+                asked[c, here] += 1.0
+                hits[c, here] += 1.0 if seen else 0.0
+            if seen and old[n]:
                 past[n, c, -1] = 1.0
                 found[c] += 1.0
-            elif here >= 0:
-                costs = pair_costs(part, mean, covariance, at[n : n + 1], calls[1][c], chances)
-                if (costs < np.inf).any():
-                    continue
-                missed[k] = p[k, c]
-            if here >= 0:
-                expected[c] += p[k, c]
-                asked[c, here] += 1.0
-                hits[c, here] += 1.0 if past[n, c, -1] > 0.0 else 0.0
-        share = min(strays / max(missed.sum(), 1e-9), 1.0)
-        for k in np.flatnonzero(missed):
-            past[old[k], c, -1] = share * math.log1p(-missed[k])
-    return past
+                expected[c] += p[n, c]
+            elif not seen and p[n, c] > 0.0:
+                missed[n] *= (1.0 - p[n, c]) ** (1.0 / PERSISTENCE)
+                costs = pair_costs(part, mean, covariance, at[n : n + 1], callers[c], chances)
+                if old[n] and not (costs < np.inf).any():
+                    expected[c] += p[n, c]
+                    silent[n] = p[n, c]
+        share = min(strays / max(silent.sum(), 1e-9), 1.0)
+        for n in np.flatnonzero(silent):
+            past[n, c, -1] = share * math.log1p(-silent[n])
+    return past, missed
 
 
 @kernel
@@ -176,7 +153,7 @@ def ratios(
     columns: tuple[np.ndarray, ...], at: Int[np.ndarray, " l"], now: Whole
 ) -> Float[np.ndarray, "c w"]:
     """Return the log likelihood ratio of a failure of each call in each of the last scans."""
-    known, q = Known(*columns), CHANCE
+    known = Known(*columns)
     total = np.zeros(known.past.shape[1:])
     for n in np.flatnonzero(at >= 0):
         for c in range(len(total)):
@@ -184,11 +161,10 @@ def ratios(
             for k in range(WINDOW - 1, max(WINDOW - now + known.born[n], 0) - 1, -1):
                 value = known.past[n, c, k]
                 if value > 0.0:
-                    silent, each = -math.inf, math.log(q / (1.0 - q))
+                    silent, each = -math.inf, -log_ratio(0.0)
                 elif value < 0.0 and silent > -math.inf:
                     silent += value
-                    m = math.exp(silent)
-                    each = math.log((1.0 - q + q * m) / (q + (1.0 - q) * m))
+                    each = log_ratio(math.exp(silent))
                 total[c, k] += each
     return total
 
@@ -250,12 +226,13 @@ def placed_again(
     far = np.hypot(mean[there] - mean[0], mean[there + 1] - mean[1])
     near = np.argsort(far, kind="stable")[:NEAREST]
     there, source = there[near], source[near]
+    stand = np.full(len(watch.hits), UNPLACED), np.zeros(len(watch.hits), np.bool_)
     points, calls = mean[there] + 1j * mean[there + 1], [call for call, *_ in heard]
 
     def cost() -> float:
         compared = mean, covariance, there
         each = (pair_costs(tuple(rows), *compared, at, chances) for _, rows, _, at in heard)
-        expected = probabilities(*watch[:2], mean, there, source)[0][:, calls].sum()
+        expected = probabilities(*watch[:2], source, (mean, there, *stand))[0][:, calls].sum()
         return sum(costs.min(axis=1, initial=0.0).sum() for costs in each) + 2.0 * expected
 
     poses, variances = poses_of(
