@@ -82,6 +82,9 @@ def table_refusal(
         if isinstance(part, int):
             key += f".{part + 1}" if tables else f"[{part}]"
             continue
+        if not tables:  # in a table with keys of the user
+            key += f".{part}".removesuffix(".[key]")
+            continue
         key, known = f"{key}.{part}".removeprefix("."), tables[0].model_fields
         field = known.get(part)
         kinds = () if field is None else (field.annotation, *get_args(field.annotation))

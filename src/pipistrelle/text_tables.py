@@ -76,7 +76,7 @@ FORMER_NAMES = MappingProxyType({"detour": "excess_path", "detour_std": "excess_
 """Former names of columns and keys of logs, and their present names."""
 _LABEL_IT = (
     "number what your sensor tells apart, the same whenever it is seen, and clutter -1; or leave "
-    "the field empty in every row, for --association.method to decide"
+    "the field empty, for --association.method to decide"
 )
 
 
@@ -230,7 +230,7 @@ def _values(
             numbers = pl.Series(column).cast(pl.Float64, strict=False).to_numpy()
             values[name] = np.where(filled, numbers, np.nan)
             wrong[name] = filled & ~np.isfinite(numbers)
-        if name not in optional and name != "landmark":
+        if name not in optional:
             wrong[name] |= ~filled
     if (rows := np.any([*wrong.values()], axis=0)).any():
         row = int(np.argmax(rows))
@@ -248,17 +248,17 @@ def check_columns(table: Table) -> None:
         if values.dtype.kind == "U":
             continue
         column = TEXT_COLUMNS.get(name, Column("", ""))
-        if name == "landmark" and np.isnan(values).all():
-            values[:] = column.low
+        unknown = np.isnan(values) & (name == "landmark")
         if name == "time":
             wrong = np.diff(values, prepend=-np.inf) < 0
         else:
             wrong = (values < column.low) | (values > column.high)
             wrong |= column.whole & (values != np.rint(values))
-        if wrong.any():
+        if (wrong := wrong & ~unknown).any():
             raise _out_of_bounds(table, name, int(np.argmax(wrong)))
-        if column.whole:
-            table.column[name] = values.astype(np.int64)
+        if column.whole:  # beside labels, -1 is clutter, and unknown landmarks are -2
+            empty = column.low - (not unknown.all())
+            table.column[name] = np.where(unknown, empty, values).astype(np.int64)
 
 
 def _out_of_bounds(table: Table, name: str, row: int) -> Exception:

@@ -313,7 +313,7 @@ class Assignment:
     """Landmarks to remove from the map before the update; the session repeats the scans in its
     memory without their measurements."""
     merge: tuple[tuple[int, int], ...] = ()
-    """Pairs of duplicate landmarks: the first label replaces the second."""
+    """Pairs of duplicate landmarks: the first label, perhaps new, replaces the second."""
     scan: Scan | None = None
     """The scan with changes by the association, such as callers' labels or a caller's range; the
     same measurements in the same order."""

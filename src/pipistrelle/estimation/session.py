@@ -270,7 +270,10 @@ class Session(Generic[B]):
                     continue
             merge, since = past[n].merge, 0
             if n + 1 < undecided:  # a repetition, without absent landmarks
-                merge = tuple(pair for pair in merge if len(_present(self.belief, pair)) == 2)
+                before = past[n].belief
+                merge = tuple(
+                    pair for pair in merge if _present(self.belief, pair) == _present(before, pair)
+                )
                 since = past[first].number - self._first
             past[n] = replace(past[n], belief=self.belief, merge=merge)
             used, n = self._use(past[n], since), n + 1

@@ -294,7 +294,7 @@ class Slam:
         bearing : (m) [rad]
             From the heading, counter-clockwise; NaN or None in rows with only an excess path.
         landmark : (m), optional
-            Labels; without them they are associated by ``association__method``.
+            Labels; rows without (None) are associated by ``association__method``.
         range, excess_path : (m) [m], optional
             NaN or None in rows without.
         caller : (m) of str, optional
@@ -322,7 +322,7 @@ class Slam:
         table = table_of(columns, self._log.callers, labelled=known)
         if not table.line.size:
             return table.column["landmark"]
-        scan = scan_at(self._time, table, self._log.callers)
+        scan = scan_at(self._time, table, self._log.callers, known=known)
         names = ("landmark", CALLER, "bearing", "range", "excess_path")
         numbers_of = (np.nan_to_num(table.column[name], nan=-1.0).tolist() for name in names)
         rows = zip(*numbers_of, strict=True)
@@ -561,8 +561,6 @@ def table_of(columns: Mapping[str, Any], callers: Sequence[LogCaller], *, labell
         fix = f"did you mean {near!r}?" if near else "leave it out"
         raise refusal("hear", repr(unknown[0]), f"some of {', '.join(COLUMNS)}", fix)
     given = {name: values for name, values in columns.items() if values is not None}
-    if labelled and "landmark" not in given:
-        raise refusal("hear", "no landmark", LABELS, 'give association__method="marginal"')
     if CALLER in given:
         names, known = given[CALLER], [caller.name for caller in callers]
         whole = [names] if names is None or isinstance(names, str) else names
@@ -579,4 +577,6 @@ def table_of(columns: Mapping[str, Any], callers: Sequence[LogCaller], *, labell
         raise refusal("hear", f"columns of the shapes {shapes}", "one row each", "correct them")
     (size,) = next(iter(shapes.values()), (0,))
     column = {name: column.get(name, np.full(size, nan)) for name in COLUMNS}
+    if labelled and np.isnan(column["landmark"]).any():
+        raise refusal("hear", "no landmark", LABELS, 'give association__method="marginal"')
     return Table(path="hear", line=np.arange(1, size + 1), unit="row", column=column)

@@ -315,7 +315,6 @@ def test_measurements_without_a_usable_row_are_refused(tmp_path):
 ROWS = {
     "no clutter": ("landmark -2,", "from 0 to 9007199254740991, or -1 for", "0.1,-2,0.5,1"),
     "large label": ("landmark 9007199254740992,", "to 9007", "0.1,9007199254740992,0.5,1"),
-    "no label": ("landmark ''", "clutter -1; or leave the field empty", "0.1,,0.5,1"),
     "no range": ("range 0.0", "above 0 m", "0.1,7,0.5,0"),
     "swapped": ("range -2.0", "exchange bearing and range", "0.1,7,4.0,-2"),
     "nan range": ("range 'NaN'", "leave it empty", "0.1,7,0.5,NaN"),
@@ -339,6 +338,16 @@ def test_a_log_without_any_label_keeps_all_its_rows(tmp_path, label):
     log = read_log(recorded(tmp_path / "bare", measurements=rows))
     assert [scan.landmark.tolist() for scan in log.scans] == [[-1, -1], [-1]]
     assert log.ignored_rows == {}
+
+
+def test_rows_without_label_are_kept_in_a_log_with_labels(tmp_path):
+    rows = ("0.1,7,0.5,4,,,", "0.1,-1,0.2,3,,,", "0.1,,0.4,,0,,boat", "0.1,52,0.3,,,,mate")
+    log = read_log(timed(tmp_path / "some", *rows, "0.25,7,0.1,2,,,"))
+    first, second = log.scans
+    assert (first.landmark.tolist(), first.direct.tolist()) == ([7, -1, 52], [-1, 1, 2])
+    assert (second.landmark.tolist(), log.ignored_rows) == ([7], {"clutter": 1})
+    write_log(tmp_path / "again" / "some", log)
+    assert same(read_log(tmp_path / "again" / "some"), replace(log, ignored_rows={}))
 
 
 @pytest.mark.parametrize("case", ROWS)
@@ -469,6 +478,7 @@ def written_log(kind, folder):
     if kind == "every setting":
         log = replace(read_log(recorded(folder)), gate=0.97, noise_at_rest=False)
         log = replace(log, initial_pose=(0.1, 1e-7, 3.0), sensor_pose=(0.1, 0.2, -3.0))
+        log = replace(log, landmarks={7: (1.0, -2.0), 12: (0.0, 3.0)}, landmark_std=0.1)
         return replace(log, association={"detection": 0.5})
     if kind == "a car":
         log = read_log(recorded(folder, CAR, STEERED.format(-1.0)))
@@ -663,6 +673,9 @@ def test_a_caller_of_a_log_without_callers_is_refused_with_where_to_name_it(tmp_
         ("place_std = [0.1, 0.2]", "place_std = [-1, 0]", ("'callers.2.place_std[0]'",)),
         ("place_std = [0.1, 0.2]", "moves = 1", ("'callers.2.moves'",)),
         ("place = [1, 2.5]", "moves = true\nplace = [1, 2.5]", ("place of a caller that moves",)),
+        (CALLERS, "[landmarks]\npost = [1, 2]", ("'landmarks.post'", "a valid integer")),
+        (CALLERS, "[landmarks]\n7 = [1]", ("'landmarks.7'", "found 1 values, expected 2")),
+        (CALLERS, "[landmarks]\n7 = [1, nan]", ("'landmarks.7[1]'",)),
         (CALLERS, "callers = 3", ("'callers'", "found 3")),
         (CALLERS, "callers = [3]", ("callers",)),
         (CALLERS, "[callers]\nname = 'boat'\nlandmark = 3", ("'callers'",)),
@@ -670,7 +683,7 @@ def test_a_caller_of_a_log_without_callers_is_refused_with_where_to_name_it(tmp_
          ("callers", "8", "7")),
     ],
 )  # fmt: skip
-def test_a_bad_caller_of_a_log_is_refused_by_its_key(tmp_path, old, new, parts):
+def test_a_bad_caller_or_landmark_of_a_log_is_refused_by_its_key(tmp_path, old, new, parts):
     settings = (UNICYCLE + CALLERS).replace(old, new)
     assert settings != UNICYCLE + CALLERS
     refused(timed(tmp_path, "0.1,7,0.5,4.0,3.5,,boat", settings=settings), "log.toml", *parts)

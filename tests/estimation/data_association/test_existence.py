@@ -10,10 +10,13 @@ from pipistrelle.estimation.data_association.existence import (
     MOST,
     PATIENCE,
     SECTORS,
+    asked_of,
     judged,
     log_ratio,
+    merged,
     nobody,
     probabilities,
+    stated,
     with_new,
 )
 
@@ -120,3 +123,21 @@ def test_judging_does_not_change_its_inputs():
     judged(known, row(), THERE, SEEN, 2)
     for one, other in zip(known, before, strict=True):
         np.testing.assert_array_equal(one, other)
+
+
+def test_a_stated_landmark_keeps_its_odds_in_silence():
+    known = stated(with_new(nobody(1), [1], 0, 1), np.array([1]))
+    for scan in range(2 * PATIENCE):
+        known = judged(known, row() if scan < 2 else NONE, THERE, UNSEEN, scan)
+    assert (known.odds[0], known.confirmed[0], known.count[0]) == (np.inf, True, 2)
+
+
+def test_stated_landmarks_are_distinct_and_replace_their_duplicates():
+    known = stated(with_new(nobody(1), [1, 2, 5, 6], 0, 1), np.array([5, 6]))
+    known = known._replace(count=np.array([4, 7, 0, 0]), heard=np.ones(4, np.int64))
+    old, apart, asked = asked_of(tuple(known), np.arange(3, 11, 2), 1)
+    assert (known.label[old].tolist(), old[asked].tolist()) == ([5, 6, 1, 2], [0])
+    assert np.argwhere(np.triu(apart, 1)).tolist() == [[0, 1]]
+    after = merged(known, [(5, 1)])
+    assert (after.label.tolist(), after.count.tolist()) == ([5, 2, 6], [4, 7, 0])
+    assert np.isinf(after.odds).tolist() == [True, False, True]

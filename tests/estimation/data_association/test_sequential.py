@@ -6,7 +6,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from pipistrelle.config import AssociationConfig, Config
+from pipistrelle.config import AssociationConfig, Config, InputError
 from pipistrelle.detection.scans import UNLABELLED, make_scan
 from pipistrelle.estimation.beliefs import Gaussian, JointGaussian, placed
 from pipistrelle.estimation.catalogue import entry
@@ -17,6 +17,7 @@ from pipistrelle.estimation.motion import Motion
 from pipistrelle.estimation.session import Session
 from pipistrelle.experiments.runs.trial import run_mission
 from pipistrelle.figures.mission import _ties
+from reference.missions import map_with
 
 MOTION = Motion(model="unicycle", control_std=(0.02, 0.01))
 STDS = {"bearing_std": 0.01, "range_std": 0.02}
@@ -30,14 +31,15 @@ BEST = {
 }
 
 
-def session_of(name="iekf", method="marginal", **assumed):
+def session_of(name="iekf", method="marginal", known=None, **assumed):
     """Return a session of a vehicle at rest at the origin that is told no labels."""
     config = Config.model_validate(
         {"association": {"method": method}, "filter": {"noise": "measured", **assumed}}
     )
     start = Gaussian(mean=np.zeros(3), covariance=1e-8 * np.eye(3))
     slam = entry(name).build(config, MOTION)
-    return Session(slam, start, np.random.default_rng(7), association=association_of(config))
+    rng, association = np.random.default_rng(7), association_of(config)
+    return Session(slam, start, rng, known=known, association=association)
 
 
 def arc(k):
@@ -106,6 +108,44 @@ def test_a_vanished_landmark_is_removed_and_a_new_landmark_added():
     for _ in range(4):
         session.hear(scan_of(np.vstack([PLACES, [[-3.0, -4.0]]])))
     assert len(session.landmarks().landmark) == 5
+
+
+@pytest.mark.parametrize("name", ["iekf", "smoother", "fastslam"])
+def test_known_landmarks_stay_and_no_other_has_their_labels(name):
+    session = session_of(name, known=map_with([1, 7], PLACES[:2], [1e-6 * np.eye(2)] * 2))
+    for _ in range(4):
+        session.hear(scan_of(PLACES))
+    assert session.labels[-1].tolist() == [1, 7, 8, 9]
+    for _ in range(2 * PATIENCE):
+        session.hear(scan_of(PLACES[1:2]))
+    assert session.landmarks().landmark.tolist() == [1, 7]
+
+
+@pytest.mark.parametrize("name", ["iekf", "smoother", "fastslam"])
+def test_stated_labels_are_kept_and_name_landmarks_mapped_before(name):
+    session = session_of(name)
+    for given in ([-1] * 4, [-1] * 4, [40, -1, -1, 41], [-1] * 4, [-1, -1, 42, 40]):
+        used = replace(scan_of(PLACES), landmark=np.array(given))
+        session.hear(used)
+    assert [labels.tolist() for labels in session.labels[:4]] == [[40, 2, 3, 41]] * 4
+    assert session.labels[-1].tolist() == [-1, -1, 42, 40], "most stated rows misfit"
+    assert 1 not in session.belief.labels()
+
+
+def test_a_second_row_of_a_stated_rows_landmark_is_unlabelled():
+    session = session_of()
+    for given in ([-1] * 4, [7, -1, -1, -1], [-1] * 4):
+        session.hear(replace(scan_of(PLACES), landmark=np.array(given)))
+    near = np.vstack([PLACES[:2], PLACES[:1] + 0.01])
+    session.hear(replace(scan_of(near), landmark=np.array([7, -1, -1])))
+    assert session.labels[-1].tolist() == [7, 2, -1]
+
+
+def test_a_stated_label_of_an_unstated_landmark_is_refused():
+    session = session_of()
+    session.hear(scan_of(PLACES))
+    with pytest.raises(InputError, match=r"found the label 2, .* add a number to yours"):
+        session.hear(replace(scan_of(PLACES), landmark=np.array([-1, 2, -1, -1])))
 
 
 @pytest.mark.parametrize("name", ["iekf", "smoother", "fastslam"])

@@ -234,8 +234,8 @@ def as_logged(scan: Scan, name: str) -> np.ndarray:
     """Return a scan's column as written in a log, where a direct call has an excess path of 0."""
     values = getattr(scan, name)
     if name == "excess_path" and scan.direct.size:
-        values = values.copy()
-        values[scan.direct[scan.direct >= 0]] = 0.0
+        values, straight = values.copy(), scan.direct[scan.direct >= 0]
+        values[straight[scan.landmark[straight] == UNLABELLED]] = 0.0
     return values
 
 
@@ -270,6 +270,8 @@ def _measurement_columns(log: Log) -> dict[str, np.ndarray]:
     whose = np.concatenate([np.empty(0, dtype=np.int64), *(scan.caller for scan in log.scans)])
     if log.callers and whose.any():
         column[CALLER] = np.array(["", *(caller.name for caller in log.callers)])[whose]
+    if (told := column["landmark"] != UNLABELLED).any():
+        column["landmark"] = np.where(told, column["landmark"].astype(str), "")
     return column
 
 

@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from pydantic import AfterValidator, ConfigDict, Field, ValidationInfo, field_validator
 
 from pipistrelle.config import LONGEST_STEP, NonNegative, Real, Section
@@ -40,10 +40,10 @@ CALLER = "caller"
 """Column of the caller's number, from 1; absent or NaN for the vehicle's own call."""
 MEASUREMENTS = Schema(
     file="measurements.csv",
-    row="a row is a measurement; landmark -1: clutter; no bearing: a further excess path",
+    row="landmark -1: clutter, empty: unknown; a row without bearing: a further excess path",
     columns=("time", "landmark", "bearing", "range"),
     optional=(*STATED, CALLER),
-    empty=("bearing", "range"),
+    empty=("landmark", "bearing", "range"),
 )
 
 MAX_TIME = 1e11
@@ -77,7 +77,7 @@ class LogCaller(Section):
     """Whether it moves: it is then not a landmark of the map, but estimators may track it."""
     place: Annotated[tuple[Real, Real], Field(strict=False)] | None = None
     place_std: Annotated[tuple[NonNegative, NonNegative], Field(strict=False)] | None = None
-    """`place` and `place_std`: its position and standard deviation [m], by default 1e-3 m."""
+    """`place` and `place_std`: its position and standard deviation [m], else `landmark_std`."""
 
     @field_validator("place", "place_std")
     @classmethod
@@ -129,6 +129,9 @@ class Log:
     """Nearest and farthest range of a passive landmark [m]."""
     callers: tuple[LogCaller, ...] = ()
     """The other callers; the first is number 1 of the scans' callers."""
+    landmarks: Mapping[int, tuple[float, float]] = field(default_factory=dict)
+    """Known positions of landmarks, by label [m]; ``landmark_std``: their standard deviation."""
+    landmark_std: float = 1e-3
     association: Mapping[str, float] = field(default_factory=dict)
     """Settings of `association` that the log states for its sensor."""
     gate: float | None = None
@@ -193,8 +196,8 @@ def assemble(
     if labelled:
         measurements = rows_kept(measurements, ~clutter)
     measurements = _of_callers(measurements, callers)
-    if labelled:
-        check_unique(measurements, "time", "landmark", besides=CALLER)
+    told = measurements.column["landmark"] > UNLABELLED
+    check_unique(rows_kept(measurements, told), "time", "landmark", besides=CALLER)
     stamp = measurements.column["time"]
     inside = (stamp >= time[0]) & (stamp <= time[-1])
     ignored = Counter(ignored_rows or {})
@@ -217,7 +220,9 @@ def assemble(
         time=time,
         controls=controls,
         dt=np.diff(time),
-        scans=_scans(time, measured, 0.0 if step is None else _RESOLUTION, callers),
+        scans=_scans(
+            time, measured, 0.0 if step is None else _RESOLUTION, callers, bool(told.all())
+        ),
         ignored_rows={reason: count for reason, count in ignored.items() if count},
         doubts=doubts,
         bearings=measured["bearing"],
@@ -225,18 +230,18 @@ def assemble(
     )
 
 
-def scan_at(time: float, rows: Table, callers: tuple[LogCaller, ...]) -> Scan:
-    """Build a scan from measurements with the same time.
+def scan_at(time: float, rows: Table, callers: tuple[LogCaller, ...], *, known: bool) -> Scan:
+    """Build a scan from measurements with the same time; ``known``: all labels are stated.
 
     `rows` have ``landmark``, ``bearing``, ``range``, ``caller``, perhaps other columns of a log.
     Raises InputError if a row is not valid in a log.
     """
     check_columns(rows)
     rows = _of_callers(rows, callers)
-    labelled = rows_kept(rows, rows.column["landmark"] != UNLABELLED)
+    labelled = rows_kept(rows, rows.column["landmark"] > UNLABELLED)
     check_unique(labelled, "landmark", besides=CALLER)
     measured = rows.column | {"time": np.full(len(rows.line), time)}
-    (scan,) = _scans(np.array([time]), _in_order(measured), 0.0, callers)
+    (scan,) = _scans(np.array([time]), _in_order(measured), 0.0, callers, known)
     return scan
 
 
@@ -370,13 +375,13 @@ def _scans(
     measured: dict[str, np.ndarray],
     resolution: float,
     callers: tuple[LogCaller, ...],
+    known: bool,
 ) -> tuple[Scan, ...]:
     """Return a scan per time of the sorted measurements, dated at the end of its control step."""
-    labels = (
-        np.array([UNLABELLED, *(caller.landmark for caller in callers)]) if callers else NO_CALLERS
-    )
-    stamp, bearing = measured["time"], measured["bearing"]
+    labels = np.array([UNLABELLED, *(caller.landmark for caller in callers)])
+    stamp, bearing, landmark = measured["time"], measured["bearing"], measured["landmark"]
     said = measured | {
+        "landmark": np.maximum(landmark, UNLABELLED),
         "time": time[np.searchsorted(time, stamp - resolution)],
         "bearing": np.where(~(np.abs(bearing) >= np.pi), bearing, wrap(bearing)),
     }
@@ -384,15 +389,16 @@ def _scans(
     parts = zip(*(np.split(column, cuts) for column in said.values()), strict=True)
     rows = (dict(zip(said, part, strict=True)) for part in parts)
     scans = (make_scan(**row | {"time": float(row["time"][0])}) for row in rows if row["time"].size)
-    if (measured["landmark"] == UNLABELLED).all():
-        return tuple(_direct_calls_marked(scan, 1 + len(callers)) for scan in scans)
-    return tuple(replace(scan, callers=labels) for scan in scans)
+    named = labels if callers and (landmark > UNLABELLED).any() else NO_CALLERS
+    scans = (replace(scan, callers=named) for scan in scans)
+    return tuple(scan if known else _direct_calls_marked(scan, labels) for scan in scans)
 
 
-def _direct_calls_marked(scan: Scan, count: int) -> Scan:
-    """Mark the direct call of each of `count` callers, which has an excess path of 0."""
-    direct, straight = np.full(count, UNLABELLED), scan.excess_path == 0.0
-    rows = np.flatnonzero(straight)[::-1]  # the first is used
+def _direct_calls_marked(scan: Scan, labels: Int[np.ndarray, " c"]) -> Scan:
+    """Mark the direct call of each caller, which has an excess path of 0, or its label."""
+    named = (scan.landmark > UNLABELLED) & (scan.landmark == labels[scan.caller])
+    direct, straight = np.full(labels.size, UNLABELLED), scan.excess_path == 0.0
+    rows = np.flatnonzero(straight | named)[::-1]  # the first is used
     direct[scan.caller[rows]] = rows
     excess = np.where(straight, np.nan, scan.excess_path)
     return replace(with_columns(scan, excess_path=excess), direct=direct)

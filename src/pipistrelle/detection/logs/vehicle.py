@@ -29,6 +29,7 @@ from pipistrelle.text_tables import FORMER_NAMES, Schema
 _Triple = Annotated[tuple[Real, Real, Real], Field(strict=False)]
 _Triple_std = Annotated[tuple[NonNegative, NonNegative, NonNegative], Field(strict=False)]
 _Bounds = Annotated[tuple[Positive, Positive], Field(strict=False)]
+_Label = Annotated[int, Field(strict=False, ge=0, lt=2**53)]
 
 NOISY = {
     "unicycle": ("velocity", "angular_rate"),
@@ -84,6 +85,8 @@ class Vehicle(Section):
     time_offset: Annotated[Real, Field(ge=-LATEST, le=LATEST)] = 0.0
     association: _Association = _Association()
     callers: Annotated[tuple[LogCaller, ...], Field(strict=False, max_length=MAX_OTHERS)] = ()
+    landmarks: Mapping[_Label, Annotated[tuple[Real, Real], Field(strict=False)]] = {}
+    landmark_std: NonNegative = 1e-3
 
     @field_validator("callers")
     @classmethod

@@ -75,6 +75,7 @@ class Known(NamedTuple):
     count: Int[np.ndarray, " l"]
     """Number of scans with a detection."""
     odds: Float[np.ndarray, " l"]
+    """Log odds of existence; infinite if it is stated: such landmarks are distinct, and stay."""
     confirmed: Bool[np.ndarray, " l"]
     source: Float[np.ndarray, "l c"]
     """Level at 1 m from the landmark (and from a moving caller), by caller [dB], or NaN."""
@@ -131,14 +132,22 @@ def some(known: Known, kept: Bool[np.ndarray, " l"]) -> Known:
     return left._replace(together=left.together[:, kept])
 
 
+def stated(known: Known, labels: Int[np.ndarray, " n"]) -> Known:
+    """Return the records with some landmarks marked as stated."""
+    told = is_among(known.label, labels)
+    odds = np.where(told, math.inf, known.odds)
+    return known._replace(odds=odds, confirmed=known.confirmed | told)
+
+
 def merged(known: Known, pairs: Sequence[tuple[int, int]]) -> Known:
-    """Return the records with duplicates merged: of each pair, the first label remains."""
+    """Return the records with duplicates merged: the first label, and the older record, remain."""
     if not pairs:
         return known
     after = Known(*(column.copy() for column in known))
     place = {label: n for n, label in enumerate(known.label.tolist())}
     for kept, gone in pairs:
-        a, b = place[kept], place[gone]
+        a, b = sorted((place[kept], place[gone]))
+        after.label[a], after.label[b], place[kept] = kept, gone, a
         after.count[a] += after.count[b]
         for column in (after.odds, after.heard, after.confirmed):
             column[a] = max(column[a], column[b])
@@ -198,7 +207,7 @@ def _judge(
             mean_source = before + FORGETTING * (source - before)
             known.source[n, caller[m]] = source if math.isnan(before) else mean_source
         if rise > 0.0:
-            known.odds[n] = min(known.odds[n] + rise, MOST)
+            known.odds[n] = max(min(known.odds[n] + rise, MOST), known.odds[n])
             known.count[n] += 1
             known.heard[n] = scan
         else:
@@ -311,9 +320,10 @@ Pairs = list[tuple[int, int]]
 def asked_of(
     columns: tuple[np.ndarray, ...], at: Int[np.ndarray, " l"], now: Whole
 ) -> tuple[Int[np.ndarray, " o"], Bool[np.ndarray, "o o"], Int[np.ndarray, " a"]]:
-    """Return the mapped landmarks, their distinct pairs, and which to test for duplicates now."""
+    """Return mapped landmarks, stated first, distinct pairs, and which to test for duplicates."""
     known = Known(*columns)
-    old = np.flatnonzero((at >= 0) & (known.born < now))
+    old, told = (at >= 0) & (known.born < now), np.isinf(known.odds)
+    old = np.append(np.flatnonzero(old & told), np.flatnonzero(old & ~told))
     asked = np.zeros(old.size, np.bool_)
     for i, a in enumerate(old):
         asked[i] = known.heard[a] == now and known.count[a] in ASKED
@@ -322,7 +332,8 @@ def asked_of(
         for j in range(i):
             a, b = old[i], old[j]
             rarer = min(known.count[a], known.count[b])
-            apart[i, j] = apart[j, i] = known.together[a, b] > BOTH * rarer
+            both = known.together[a, b] > BOTH * rarer or (told[a] and told[b])
+            apart[i, j] = apart[j, i] = both
     return old, apart, np.flatnonzero(asked)
 
 

@@ -119,17 +119,21 @@ class Sequential(Association[Memory]):
     limits: Limits = Limits()
     motion: tuple[float, float] = (1.0, 0.2)
     """Stds of a moving caller's initial velocity [m/s] and of its change in a second [m/s]."""
+    labels: int = 0
+    """Largest label that scans may state; new landmarks have larger labels."""
 
     def start(self) -> Memory:
         """Return the empty memory of data association before the first scan."""
-        return Memory()
+        return Memory(labels=self.labels)
 
     def carried(self, memory: Memory, later: Memory) -> Memory:
         """Return an earlier memory with callers' positions and failures that a later one adds."""
-        known, labels, watched = dict(memory.callers), memory.labels, memory.watch
+        stated, watched = later.known.label[np.isinf(later.known.odds)], memory.watch
+        known, labels = dict(memory.callers), max(memory.labels, int(stated.max(initial=0)))
         failed = lost = later.watch.lost == 1 and len(later.watch.alarms) > len(watched.alarms)
         for number, caller in sorted(later.callers.items()):
-            before = known.get(number, CallerState(label=labels + 1))
+            label = caller.label if caller.label <= self.labels else labels + 1
+            before = known.get(number, CallerState(label=label))
             if before.failed < caller.failed <= memory.scan:
                 before, failed = replace(caller, label=labels + 1), True
             elif caller.place in (None, before.place) or before.failed != caller.failed:
@@ -141,15 +145,19 @@ class Sequential(Association[Memory]):
         return replace(memory, callers=known, labels=labels, watch=watched)
 
     def knowing(self, memory: Memory, known: Landmarks, callers: Int[np.ndarray, " c"]) -> Memory:
-        """Return the memory with the callers on the initial map, which need no search."""
+        """Return the memory with the initial map: callers need no search, landmarks stay."""
         numbers = {label: number for number, label in enumerate(callers.tolist())}
         rows = zip(known.landmark.tolist(), known.mean.tolist(), strict=True)
-        stated = {
+        found = dict(memory.callers) | {
             numbers[label]: CallerState(label=label, place=CallerPlace(x, y), told=True)
             for label, (x, y) in rows
             if label in numbers
         }
-        return replace(memory, callers={**memory.callers, **stated})
+        others = known.landmark[~is_among(known.landmark, callers)]
+        records = existence.with_new(memory.known, others.tolist(), memory.scan, 1)
+        labels = max(memory.labels, int(others.max(initial=0)))
+        stated = existence.stated(records, others)
+        return replace(memory, callers=found, known=stated, labels=labels)
 
     def tentative(self, memory: Memory) -> list[int]:
         """Return the labels of unconfirmed landmarks, and of callers' former positions."""
@@ -182,8 +190,16 @@ class _Work:
         )
         drift, limits = drift_of(memory, self.pose), stage.limits
         self.model: Model = (*drift, *stage.motion, stage.chances[1] / stage.chances[3])
-        self.label = np.full(scan.landmark.size, UNLABELLED)
-        self.labels, self.callers = memory.labels, dict(memory.callers)
+        self.given = scan.landmark.copy()
+        self.given[scan.direct[scan.direct >= 0]] = UNLABELLED
+        issued = memory.known.label[np.isfinite(memory.known.odds)]
+        if (taken := is_among(self.given, issued)).any():
+            found = f"association at {scan.time} s: found the label {self.given[taken][0]}"
+            expected = "expected one that is not given to another landmark already"
+            raise InputError(f"{found}, {expected}; add a number to yours, such as 1000000")
+        self.label, self.merge, self.fits = self.given.copy(), [], self.given == UNLABELLED
+        self.labels = max(memory.labels, int(self.given.max(initial=0)))
+        self.callers = dict(memory.callers)
         self.numbers, self.named = scan.numbers, np.full(scan.direct.size, UNLABELLED)
         self.moves = {*scan.moving_callers.tolist()}
         moving = [self.callers[number].label for number in self.moves & self.callers.keys()]
@@ -201,8 +217,12 @@ class _Work:
         for number, row in enumerate(self.scan.direct.tolist()):
             if number == OWN or (row < 0 and number not in self.callers):
                 continue
-            caller = self.callers.get(number) or CallerState(label=self._another())
-            if caller.place is None:
+            stated = self.scan.callers[number : number + 1].tolist()
+            caller = self.callers.get(number) or CallerState(label=(stated or [self._another()])[0])
+            if caller.place is None and (at := self._where(caller.label)) >= 0:
+                place = CallerPlace(*self.joint.mean[at : at + 2].tolist())
+                caller = replace(caller, place=place, told=True, tracks=Tracks())
+            elif caller.place is None:
                 caller = self._followed(number, caller, row)
                 place = caller_search.place_caller(caller.tracks, number in self.moves, self.model)
                 if place is not None:
@@ -273,7 +293,8 @@ class _Work:
     def _match_again(self, joint: JointGaussian) -> None:
         """Match all measurements again by another joint Gaussian of pose and map."""
         self.joint, self.new = joint, []
-        self.label[:], self.named[:] = UNLABELLED, UNLABELLED
+        self.fits = self.given == UNLABELLED
+        self.label[:], self.named[:] = self.given, UNLABELLED
         self.match_all()
 
     def _placed_again(self) -> JointGaussian | None:
@@ -296,7 +317,8 @@ class _Work:
         rows = self.rows
         watched = watch.of_calls(judged.size, self.memory.watch)
         std = np.where(rows.usable, rows.bearing_std, math.nan)
-        heard = self.label, rows.caller, rows.sure, rows.bearing, std, *rows[3:5], rows.clutter
+        label = np.where(self.fits, self.label, UNLABELLED)
+        heard = label, rows.caller, rows.sure, rows.bearing, std, *rows[3:5], rows.clutter
         chances, place = (*self.stage.chances[:4], math.inf), self._place(known.label, where)
         placed = self.joint.covariance, place, judged, heard, chances
         past, self.missed = watch.observed(tuple(known), watched[:4], *placed)
@@ -332,12 +354,45 @@ class _Work:
         rows, chances, known = tuple(self.rows), self.stage.chances, self.memory.known
         joint = self._joint()
         used, costs, near = compared(rows, joint, self.moving, caller, chances)
+        stated = used[self.given[used] != UNLABELLED]
+        wrong = stated.size > 0 and self._refuted(costs, used)
         matched = used, self.stage.match(costs), near
         confirmed = known.label[known.confirmed]
         begun, count = label_matched(self.label, rows, joint, confirmed, matched, caller, chances)
+        if stated.size:
+            begun = begun[(self.given[begun] == UNLABELLED) & (not wrong)]
+            begun = np.append(begun, self._stated(stated))
         strayed = begun.size and number in self.doubted and self._is_elsewhere(number, count)
         if self.begins and not strayed:
             self._begin(number, begun)
+
+    def _refuted(self, costs: Float[np.ndarray, "r n"], used: Int[np.ndarray, " r"]) -> bool:
+        """Match stated rows to landmarks without stated label only; return whether most misfit."""
+        landmark, given, known = self.joint.landmark, self.given[used], self.memory.known
+        named = np.append(known.label[np.isinf(known.odds)], self._callers_labels())
+        same = given[:, np.newaxis] == landmark
+        self.fits[used] |= (same & np.isfinite(costs)).any(axis=1)
+        mapped = same.any(axis=1)
+        wrong = np.count_nonzero(mapped & ~self.fits[used])
+        refuted = bool(2 * wrong > np.count_nonzero(mapped))  # the pose or the caller is wrong
+        costs[:, same.any(axis=0) | refuted] = costs[mapped] = math.inf
+        costs[np.ix_(given != UNLABELLED, is_among(landmark, named))] = math.inf
+        return refuted
+
+    def _stated(self, rows: Int[np.ndarray, " r"]) -> Int[np.ndarray, " n"]:
+        """Give landmarks the labels of matched stated rows; return the rows of new landmarks."""
+        former, self.label[rows] = self.label[rows], self.given[rows]
+        landmark = self.joint.landmark.copy()
+        new = ~is_among(self.given[rows], np.append(landmark, self.memory.known.label))
+        for label, found in zip(self.given[rows].tolist(), former.tolist(), strict=True):
+            if found != UNLABELLED and label not in landmark and self.begins:
+                self.label[self.label == found] = landmark[landmark == found] = label
+                if found in self.new:
+                    self.new.remove(found)
+                else:
+                    self.merge.append((label, found))
+        self.joint = replace(self.joint, landmark=landmark)
+        return rows[new & ~is_among(self.given[rows], landmark)]
 
     def _is_elsewhere(self, number: int, count: tuple[int, int]) -> bool:
         """Return whether a caller's position may be wrong: too few of its echoes match."""
@@ -403,17 +458,22 @@ class _Work:
             watch=self.watch,
         )
         remove = tuple(sorted(gone.tolist()))
+        merge = (*self.merge, *merge)
         return after, Assignment(label=self.label, remove=remove, merge=merge, scan=scan)
 
     def _judged(self) -> tuple[Known, Int[np.ndarray, " l"]]:
         """Return all landmark records with updated log odds, and joint-mean indices or -1."""
         scan, rows = self.memory.scan, self.rows
         _, callers = self._calls()
-        known = existence.with_new(self.known, self.new, scan, callers.size)
-        missed = np.append(self.missed, np.ones(known.label.size - self.missed.size))
+        given = self.given[~is_among(self.given, np.append(self._callers_labels(), UNLABELLED))]
+        new = self.new + sorted({*given.tolist()} - {*self.known.label.tolist()})
+        known = existence.with_new(self.known, new, scan, callers.size)
+        known = existence.stated(existence.merged(known, self.merge), given)
+        missed = dict(zip(self.known.label.tolist(), self.missed.tolist(), strict=True))
+        chances = np.array([missed.get(label, 1.0) for label in known.label.tolist()])
         heard = self.label, rows.caller, rows.level_db, rows.surety
         place = self._place(known.label, callers)
-        return existence.judged(known, heard, place, missed, scan), place[1]
+        return existence.judged(known, heard, place, chances, scan), place[1]
 
     def _place(
         self, label: Int[np.ndarray, " l"], callers: Int[np.ndarray, " c"]
@@ -436,6 +496,10 @@ class _Work:
         label = known.label[old].tolist()
         pairs = existence.doubles(self.joint, at[old], apart, asked)
         return tuple((label[a], label[b]) for a, b in pairs)
+
+    def _callers_labels(self) -> Int[np.ndarray, " c"]:
+        """Return the labels of all callers."""
+        return np.array([caller.label for caller in self.callers.values()], np.int64)
 
     def _another(self) -> int:
         """Return the next unused label for a landmark or a caller."""
@@ -488,9 +552,10 @@ class _Work:
 
     def _begin(self, number: int, begun: Int[np.ndarray, " b"]) -> None:
         """Begin a new landmark with each of the given measurements of a caller."""
-        labels, rows = [self._another() for _ in begun], self.rows
+        given, rows = self.given[begun].tolist(), self.rows
+        labels = [self._another() if label == UNLABELLED else label for label in given]
         self.label[begun] = labels
-        self.new += labels
+        self.new += [label for label in labels if label not in given]
         if number == OWN and labels:
             numbers = (rows.bearing, rows.way, rows.bearing_std, rows.way_std)
             points = tuple(column[begun] for column in numbers)
@@ -521,7 +586,7 @@ def left_out(config: Config, scans: Iterable[Scan]) -> dict[str, Float[np.ndarra
             ("way_std", (math.inf, settings.way_std, math.inf)),
         ):
             rows = rows_of_scan(scan, limits, _assumed(config))
-            found[name].append(getattr(rows, name)[~rows.usable])
+            found[name].append(getattr(rows, name)[~rows.usable & (scan.landmark == UNLABELLED)])
     joined = {name: np.concatenate([np.empty(0), *parts]) for name, parts in found.items()}
     return {name: stds for name, stds in joined.items() if stds.size}
 
@@ -532,9 +597,10 @@ def _assumed(config: Config) -> tuple[float, float, float]:
     return told.bearing_std, told.range_std, told.excess_path_std
 
 
-def association_of(config: Config) -> Association | None:
+def association_of(config: Config, labels: int = 0) -> Association | None:
     """Build the data association that ``association.method`` names; None for known labels.
 
+    ``labels``: the largest label that scans state.
     A class from outside, ``module:Class``, is built by its ``from_config(config)``, or as a
     dataclass with an optional field ``config`` for all settings. Raises InputError if it is
     missing, is no `Association` or cannot be built.
@@ -559,7 +625,8 @@ def association_of(config: Config) -> Association | None:
             assumed=_assumed(config),
         )
         motion = told.caller_speed_std, told.caller_walk_std
-        return Sequential(match=METHODS[name], chances=tuple(chances), limits=limits, motion=motion)
+        numbers = {"chances": tuple(chances), "limits": limits, "motion": motion, "labels": labels}
+        return Sequential(match=METHODS[name], **numbers)
     if not names_class(name):
         expected = ", ".join(map(repr, [KNOWN, *METHODS]))
         raise InputError(f"association.method: found {name!r}, expected {expected} or module:Class")

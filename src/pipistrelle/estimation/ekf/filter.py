@@ -190,9 +190,12 @@ def _left(
 def merged(belief: "EkfBelief", kept: int, gone: int) -> "EkfBelief":
     """Return the belief with two fixed landmarks merged under the label of the first.
 
-    An initialised landmark replaces a ray; of two rays the first remains.
+    An initialised landmark replaces a ray; of two rays the first remains. The label may be new.
     """
     landmark = belief.landmark
+    if kept not in landmark:
+        former = landmark == _present(belief, gone)
+        return replace(belief, landmark=np.where(former, kept, landmark))
     standing = is_standing(landmark)
     first, second = (landmark == _present(belief, label) for label in (kept, gone))
     if kept == gone or not standing[first | second].all():

@@ -438,20 +438,24 @@ def edits(
     """
     landmark, gone = belief.landmark.copy(), [*remove]
     for kept, other in merge:
-        first, second = (_number(belief, label) for label in (kept, other))
+        second = _number(landmark, other)
+        if kept not in landmark:
+            landmark[second] = kept
+            continue
+        first = _number(landmark, kept)
         if kept == other:
             raise InputError("association: found a landmark to merge with itself; expected two")
         if np.mean(belief.count[:, first] == 1) <= 0.5 < np.mean(belief.count[:, second] == 1):
             landmark[first], landmark[second] = other, kept
         gone.append(other)
     for label in gone:
-        _number(belief, label)
+        _number(landmark, label)
     return _without(belief, landmark, ~np.isin(landmark, gone))
 
 
-def _number(belief: FastSlamBelief, label: int) -> int:
-    """Return a landmark's index in a belief; raise InputError if it is not on the map."""
-    found = np.flatnonzero(belief.landmark == label)
+def _number(landmark: Int[np.ndarray, " n"], label: int) -> int:
+    """Return a landmark's index by its label; raise InputError if it is not on the map."""
+    found = np.flatnonzero(landmark == label)
     if not found.size:
         raise InputError(f"association: found landmark {label} to change, which is not on the map")
     return int(found[0])

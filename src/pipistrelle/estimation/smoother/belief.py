@@ -36,8 +36,15 @@ def edited(
     Their measurements are deleted or relabelled; the chain must be eliminated again from this node.
     """
     first = history.nodes - 1
-    for pair in merge:
-        kept, gone = (_slot(history, label) for label in pair)
+    for label, former in merge:
+        gone = _slot(history, former)
+        placed = tuple(label if one == former else one for one in history.placed)
+        history = replace(history, placed=placed)
+        if (label, False) not in history.slots:
+            slots = {(label, False) if n == gone else s: n for s, n in history.slots.items()}
+            history = replace(history, slots=slots)
+            continue
+        kept = _slot(history, label)
         first = min(first, *history.heard[[kept, gone], 0].tolist())
         history = _merged(history, kept, gone)
     slots = [_slot(history, label) for label in remove]

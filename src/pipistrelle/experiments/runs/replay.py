@@ -60,8 +60,6 @@ from pipistrelle.settings import from_file, read_toml, resolve
 from pipistrelle.version import find_version
 
 NO_BAG = BagConfig()
-KNOWN_STD = (1e-3, 1e-3)
-"""Default standard deviation of a caller's given position [m]."""
 LEAST_STD = 1e-6
 """Least standard deviation of a given position [m]; a smaller one gives a singular covariance."""
 
@@ -195,7 +193,7 @@ def replay(
     for own, names in groups:
         check_filters(names, drive.motion, own, drive.moving.values())
         check_calibrated(log, own)
-    bare = all((scan.landmark == UNLABELLED).all() for scan in log.scans)
+    bare = any((scan.landmark == UNLABELLED).any() for scan in log.scans)
     trials: dict[tuple[str, str], TrialResult] = {}
     for (own, names), strategy in product(groups, strategies):
         known = own.association.method == KNOWN
@@ -220,8 +218,10 @@ def replay(
 
 def drive_of(log: Log, truth: Truth) -> Drive:
     """Return a recorded log as the input of an estimator, with the truth for scoring."""
-    placed = [caller for caller in log.callers if caller.place is not None]
-    stds = [np.maximum(caller.place_std or KNOWN_STD, LEAST_STD) for caller in placed]
+    placed = {label: (place, log.landmark_std) for label, place in log.landmarks.items()}
+    whose = [who for who in log.callers if who.place]
+    placed |= {who.landmark: (who.place, who.place_std or log.landmark_std) for who in whose}
+    stds = [np.maximum(std, LEAST_STD) for _, std in placed.values()]
     variance = np.square(np.array(log.initial_pose_std, dtype=float))
     return Drive(
         motion=log_motion(log),
@@ -230,8 +230,8 @@ def drive_of(log: Log, truth: Truth) -> Drive:
         controls=log.controls,
         truth=truth,
         known=Landmarks(
-            landmark=np.array([caller.landmark for caller in placed], dtype=np.int64),
-            mean=np.array([caller.place for caller in placed], dtype=float).reshape(-1, 2),
+            landmark=np.array([*placed], dtype=np.int64),
+            mean=np.array([place for place, _ in placed.values()], dtype=float).reshape(-1, 2),
             covariance=np.array([np.eye(2) * std**2 for std in stds]).reshape(-1, 2, 2),
             weight=np.ones(len(placed)),
         ),
