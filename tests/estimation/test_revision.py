@@ -76,6 +76,18 @@ def test_a_removed_ghost_landmark_leaves_no_trace(name, ghosts):
     assert haunted.labels[2].tolist() == [1, 2, 3, UNLABELLED]
 
 
+@pytest.mark.parametrize(
+    ("ghosts", "updates"), [({2: GHOST, 3: 8}, 10), ({1: 8, 2: GHOST, 4: GHOST}, 12)]
+)
+def test_scans_repeat_from_a_ghosts_second_measurement(ghosts, updates, monkeypatch):
+    update, used = Session._update, []
+    monkeypatch.setattr(Session, "_update", lambda *told: used.append(told) or update(*told))
+    script = Script({k: [1, 2, 3, label] for k, label in ghosts.items()}, {GONE_AT: (GHOST, 8)})
+    haunted = driven("iekf", script, ghosts=ghosts)
+    assert len(used) == updates
+    assert_same(haunted, driven("iekf", Script({})))
+
+
 @pytest.mark.parametrize("name", CATALOGUE)
 def test_a_landmark_from_before_all_that_is_remembered_is_removed_too(name):
     ghosts = STRETCH + 2, STRETCH + 5

@@ -314,25 +314,23 @@ class Session(Generic[B]):
             merge=found.merge,
             remove=(*past[n].remove, *remove),
         )
-        named, rows = np.array(remove, np.int64), {}
+        named, repeated = np.array(remove, np.int64), [n]
         for m, one in enumerate(past[:n] if remove or found.revised else ()):
             scan, label = found.revised.get(one.number) or one.scan, one.label
             if scan is not one.scan:
                 label = np.where(label == UNLABELLED, scan.landmark, label)
-            gone, callers = is_among(label, named), is_among(scan.callers, named)
-            if scan is not one.scan or gone.any() or callers.any():
-                rows[m] = int(gone.sum())
-                scan = replace(scan, callers=np.where(callers, UNLABELLED, scan.callers))
+            if (gone := is_among(label, named)).any() or scan is not one.scan:
+                once, counts = np.unique(label[gone], return_counts=True)
+                # A landmark's first measurement has not affected anything else.
+                affected = (counts > 1).any() or _present(one.belief, once.tolist())
+                if affected or scan is not one.scan:
+                    repeated.append(m)
                 past[m] = replace(one, label=np.where(gone, UNLABELLED, label), scan=scan)
-        once = [*rows.values()] == [len(remove)] and not found.revised
-        if rows and not (once and not _present(past[min(rows)].belief, remove)):
-            return min(rows)
-        # An object measured only once has not affected anything else.
-        self.belief = _edited(self.belief, remove=remove)
-        for at in (past[m].number - self._first for m in rows):
-            label = self.labels[at]
-            self.labels[at] = np.where(is_among(label, named), UNLABELLED, label)
-        return n
+                at, label = one.number - self._first, self.labels[one.number - self._first]
+                self.labels[at] = np.where(is_among(label, named), UNLABELLED, label)
+        if len(repeated) == 1:
+            self.belief = _edited(self.belief, remove=remove)
+        return min(repeated)
 
     def _use(self, stored: StoredScan, since: int) -> Scan:
         """Update the belief with a stored scan; merges change the labels from scan ``since`` on."""

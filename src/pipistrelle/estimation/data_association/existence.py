@@ -47,8 +47,8 @@ PATIENCE = 25
 LEVEL_STD = 5.0
 """Standard deviation of levels [dB]."""
 LASTING = 12
-"""Detections from which a landmark serves to learn detection probabilities. If the vehicle's own
-call detected it, it is then unconfirmed, not removed; else its position depends on callers'."""
+"""Detections from which a landmark serves to learn detection probabilities, and is unconfirmed, not
+removed: except by levels of other callers only, as its position depends on theirs."""
 NEAR = 0.3
 """Least distance for spherical spreading [m]."""
 FORGETTING = 0.2
@@ -228,7 +228,10 @@ def log_ratio(missed: float) -> float:
 def _lower(known: Known, n: Whole, fall: float, scan: Whole) -> None:
     """Lower an undetected landmark's log odds of existence, in place, within its limits."""
     known.odds[n] -= fall
-    if known.count[n] >= LASTING and not math.isnan(known.source[n, OWN]):
+    of_others, own = False, not math.isnan(known.source[n, OWN])
+    for level in known.source[n]:
+        of_others |= not (own or math.isnan(level))
+    if known.count[n] >= LASTING and not of_others:
         if known.odds[n] < GONE:
             known.odds[n], known.confirmed[n] = GONE, False
     elif not known.confirmed[n] and scan - known.heard[n] > PATIENCE:
