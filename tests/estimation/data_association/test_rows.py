@@ -42,7 +42,7 @@ def test_certainty_and_clutter_of_rows_match_the_formulae():
     np.testing.assert_allclose(rows.clutter, np.where(own == 0.15, 1.0, np.fmax(rare, RAREST)))
 
 
-@pytest.mark.parametrize(("apart", "begun"), [(0.9, [1]), (1.1, [1, 0])])
+@pytest.mark.parametrize(("apart", "begun"), [(0.9, [1]), (1.1, [0, 1])])
 def test_a_row_next_to_a_louder_row_begins_no_landmark(apart, begun):
     way = np.array([3.0, 3.0 + apart * BESIDE / 2.0])
     stds = {"bearing_std": 0.01, "range_std": 0.02}
@@ -57,7 +57,7 @@ def test_a_row_next_to_a_louder_row_begins_no_landmark(apart, begun):
     assert not close.any()
     matched = used, np.full(2, -1), close
     found, count = label_matched(label, tuple(rows), joint, none, matched, caller, CHANCES)
-    assert found.tolist() == begun
+    assert sorted(found.tolist()) == begun
     assert count == (0, 2)
 
 

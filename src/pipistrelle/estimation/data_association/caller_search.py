@@ -19,6 +19,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from pipistrelle.estimation.beliefs import JointGaussian
+from pipistrelle.estimation.data_association.existence import WINDOW
 from pipistrelle.estimation.data_association.rows import (
     CallerPlace,
     Model,
@@ -29,9 +30,8 @@ from pipistrelle.estimation.measurement import NEAREST, excess_path_slopes, rang
 from pipistrelle.geometry import wrap_angle
 from pipistrelle.jit import kernel, no_alloc
 
-SCANS, SURE = 40, 0.1
-"""Most scans of a search, as many as a session revises; largest relative std of a range that an
-estimator uses, as it linearises about it."""
+SURE = 0.1
+"""Largest relative std of a range that an estimator uses, as it linearises about it."""
 MEDIAN, SPREAD, FIELD = 10.0, 1.0, 40.0
 """Prior of a caller's range: median [m] and std of its logarithm; std of the positions of landmarks
 about the vehicle [m]."""
@@ -48,7 +48,7 @@ and scan world bearing, excess path and their stds (t, k, 4); NaN where missed."
 
 def place_caller(tracks: Tracks, moves: bool, model: Model) -> CallerPlace | None:
     """Return a caller's position from tracked echoes, or None if it is uncertain or not due."""
-    times, poses, direct, table = in_window(tracks, SCANS)
+    times, poses, direct, table = in_window(tracks, WINDOW)
     heard = direct[~np.isnan(direct[:, 0]), 0]
     if len(tracks.poses) % 2 or not (len(table) and heard.size):
         return None
@@ -355,8 +355,3 @@ def fit(costs: Float[np.ndarray, "r n"]) -> tuple[float, Bool[np.ndarray, " r"]]
     """Return the sum of measurements' least costs (0 for clutter), and a mask of the matched."""
     least = costs.min(axis=1, initial=0.0)
     return float(least.sum()), least < 0.0
-
-
-def direct_row(direct: Int[np.ndarray, " c"], number: int) -> int:
-    """Return the measurement index of a caller's direct call in a scan, or -1 without."""
-    return int(direct[number]) if number < direct.size else -1

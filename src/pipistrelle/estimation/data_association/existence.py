@@ -36,7 +36,7 @@ from pipistrelle.detection.scans import OWN
 from pipistrelle.estimation.beliefs import JointGaussian, is_among
 from pipistrelle.estimation.session import REMEMBERED
 from pipistrelle.geometry import wrap_angle
-from pipistrelle.jit import Whole, kernel, no_alloc
+from pipistrelle.jit import Flag, Whole, kernel, no_alloc
 
 CHANCE = 0.1
 """Probability q of a detection by chance, and that a landmark is hidden."""
@@ -298,22 +298,13 @@ def probabilities(
 
 DENSEST = 0.05
 """Largest density of landmarks [1/m^2]: the extent of a small map is no estimate of it."""
-GAIN = 1.0
-"""Least cost reduction by each further pair of a group."""
-SURE = (8.0, 15.0, 6.0)
-"""Cost reductions required of a pair, a group of two pairs, and a larger group."""
-AHEAD = 5.0
-"""Margin over groups that match the first landmark with another."""
+LIKELIER = 2.0 * math.log(99.0)
+"""Least reduction of the cost by a group, and margin over groups that match its first landmark with
+another: probability 0.99."""
 GATE = 13.8
 """Gate on the squared distance of a pair, exceeded by 1 in 1000."""
 LEAST_STD = 0.15
 """Least standard deviation of a difference along each axis [m], to allow for overconfident filters.
-"""
-
-ASKED = (4, 6, 8, 12, 16, 24, 32, 64)
-"""Numbers of detections at which a landmark is tested for duplicates."""
-BOTH = 0.1
-"""Two landmarks are distinct if both were detected in more than this share of the scans of either.
 """
 
 Pairs = list[tuple[int, int]]
@@ -329,15 +320,21 @@ def asked_of(
     old = np.append(np.flatnonzero(old & told), np.flatnonzero(old & ~told))
     asked = np.zeros(old.size, np.bool_)
     for i, a in enumerate(old):
-        asked[i] = known.heard[a] == now and known.count[a] in ASKED
+        asked[i] = known.heard[a] == now and _is_due(known.count[a])
     apart = np.ones((old.size, old.size) if asked.any() else (0, 0), np.bool_)
     for i in range(apart.shape[0]):
         for j in range(i):
             a, b = old[i], old[j]
             rarer = min(known.count[a], known.count[b])
-            both = known.together[a, b] > BOTH * rarer or (told[a] and told[b])
+            both = known.together[a, b] > CHANCE * rarer or (told[a] and told[b])
             apart[i, j] = apart[j, i] = both
     return old, apart, np.flatnonzero(asked)
+
+
+@no_alloc
+def _is_due(count: Whole) -> Flag:
+    """Return whether to test a landmark for duplicates: at 4, 8, 16 and so on detections."""
+    return count >= 4 and count & (count - 1) == 0
 
 
 def doubles(
@@ -358,7 +355,7 @@ def doubles(
             continue
         cost, group = min(groups)
         others = [other for other, pairs in groups if group[0] not in pairs]
-        limit = min(best[0], -SURE[min(len(group), 3) - 1], min(others, default=0.0) - AHEAD)
+        limit = min(best[0], min([0.0, *others]) - LIKELIER)
         if cost < limit:
             best = cost, group
     return _lower_first(best[1])
@@ -439,13 +436,13 @@ def grown(
         size += 1
         _equate(mean, P, at[a], at[b])
         _take_over(apart, a, b)
-        cost = -GAIN
+        cost = 0.0
         for i in range(at.size):
             for j in range(i):
                 other = math.inf if apart[i, j] else _cost(mean, P, at[i], at[j], prior)
                 if other < cost:
                     cost, a, b = other, i, j
-        if cost == -GAIN:
+        if cost == 0.0:
             return total, size
 
 

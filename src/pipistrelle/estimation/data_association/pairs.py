@@ -48,8 +48,6 @@ MESSAGES, STAY = 50, 1e-6
 """Most message passes, and change of messages at convergence."""
 LARGEST = 30.0
 """Largest logarithm of a weight, so that sums keep their digits."""
-FARTHEST = 1e6
-"""Finite substitute for an infinite cost."""
 
 
 def nearest(costs: Float[np.ndarray, "m n"]) -> Int[np.ndarray, " m"]:
@@ -61,9 +59,9 @@ def nearest(costs: Float[np.ndarray, "m n"]) -> Int[np.ndarray, " m"]:
     from scipy.optimize import linear_sum_assignment  # deferred: costs a quarter of a second
 
     rows, landmarks = costs.shape
-    bare = np.full((rows, rows), FARTHEST)
+    bare = np.full((rows, rows), np.inf)
     np.fill_diagonal(bare, 0.0)
-    taken, chosen = linear_sum_assignment(np.hstack([np.minimum(costs, FARTHEST), bare]))
+    taken, chosen = linear_sum_assignment(np.hstack([costs, bare]))
     found = np.full(rows, NOTHING)
     found[taken] = np.where(chosen < landmarks, chosen, NOTHING)
     return found

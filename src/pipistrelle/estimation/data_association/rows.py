@@ -1,7 +1,7 @@
 """Measurements of a scan as data association uses them, and its memory between scans.
 
 `compared` computes the costs of a caller's measurements against all landmarks; a method of `pairs`
-matches them, and `settled` applies the matches. Precise measurements near no landmark begin new
+matches them, and `label_matched` applies the matches. Precise measurements near no landmark begin
 landmarks, except close to a louder measurement or where two echoes may have merged (bearing of the
 first, delay of the second).
 
@@ -31,7 +31,7 @@ from pipistrelle.detection.scans import (
     Scan,
 )
 from pipistrelle.estimation.beliefs import Gaussian, is_among
-from pipistrelle.estimation.data_association.existence import LEVEL_STD, Known, nobody
+from pipistrelle.estimation.data_association.existence import GATE, LEVEL_STD, Known, nobody
 from pipistrelle.estimation.data_association.pairs import (
     NOTHING,
     UNPLACED,
@@ -50,8 +50,8 @@ AT_SCAN, AT_BEARING, AT_WAY, AT_BEARING_STD, AT_WAY_STD, AT_LEVEL, AT_X, AT_Y = 
 """Columns of a sighting; the bearing is in the world, and x and y are the vehicle's."""
 SILENT, EVEN = 4, 6
 """Scans without sightings that end a track, and scans over which its change counts as linear."""
-NEW_BEARING_STD, NEW_WAY_STD, GATE = 0.05, 0.3, 12.0
-"""Largest stds of a first sighting [rad, m], and gate on the squared distance."""
+NEW_BEARING_STD, NEW_WAY_STD = 0.05, 0.3
+"""Largest stds of a first sighting [rad, m]."""
 Model = tuple[float, float, float, float, float]
 """Stds of the change of a pose's error in a scan [m, rad], stds of a caller's initial velocity
 [m/s] and of its change in a second [m/s], and clutter density over detection probability."""
@@ -156,8 +156,8 @@ def in_window(
 BESIDE, ASIDE = 0.96, 0.5
 """A measurement begins no landmark within this range [m] and bearing [rad] of a louder measurement.
 """
-OVERLAP_STD, OVERLAP_GATE = 0.7, 9.0
-"""Standard deviation of the path of an overlapping echo [m], and gate on the squared distance."""
+OVERLAP_STD = 0.7
+"""Standard deviation of the path of an overlapping echo [m]."""
 SURE_SHARE, ASSUMED = 0.65, 0.75
 """Share of the bearing limit up to which surety is 1, and surety of a default standard deviation.
 """
@@ -337,14 +337,14 @@ def label_matched(
     for n in range(confirmed.size):
         if confirmed[n] not in label:
             silent[n] = place_of(confirmed[n], landmark)
-    stray, gated = stray[:size], (OVERLAP_GATE, *chances[1:])
+    stray, gated = stray[:size], (GATE, *chances[1:])
     overlapping = part_of(heard, stray, OVERLAP_STD / (2.0 if number == OWN else 1.0))
     costs = pair_costs(overlapping, mean, covariance, silent[silent >= 0], at, gated)
     size = 0
     for k in range(stray.size):
         if not np.isfinite(costs[k]).any() and not _is_beside(heard, stray[k]):
             stray[size], size = stray[k], size + 1
-    return _loudest_first(stray[:size], heard.level_db), (right, sure)
+    return stray[:size], (right, sure)
 
 
 @no_alloc
@@ -358,20 +358,6 @@ def _is_beside(heard: ScanRows, row: Whole) -> bool:
         if louder and close and abs(wrap_angle(heard.bearing[m] - heard.bearing[row])) < ASIDE:
             return True
     return False
-
-
-@kernel
-def _loudest_first(
-    rows: Int[np.ndarray, " r"], level_db: Float[np.ndarray, " m"]
-) -> Int[np.ndarray, " r"]:
-    """Sort measurement indices by level, loudest first; equal levels keep their order."""
-    ordered = rows.copy()
-    for k in range(1, ordered.size):
-        row, n = ordered[k], k
-        while n > 0 and level_db[row] > level_db[ordered[n - 1]]:
-            ordered[n], n = ordered[n - 1], n - 1
-        ordered[n] = row
-    return ordered
 
 
 class CallerPlace(NamedTuple):

@@ -515,7 +515,8 @@ class _Work:
 
     def _direct(self, number: int) -> int:
         """Return the index of a caller's direct call in this scan, or -1 without."""
-        return caller_search.direct_row(self.scan.direct, number)
+        direct = self.scan.direct
+        return int(direct[number]) if number < direct.size else -1
 
     def _joint(self) -> Joint:
         """Return the joint Gaussian's labels, mean and covariance, for compiled functions."""

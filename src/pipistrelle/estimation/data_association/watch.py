@@ -39,6 +39,7 @@ from pipistrelle.estimation.beliefs import JointGaussian
 from pipistrelle.estimation.catalogue import GATE as CONFIDENCE
 from pipistrelle.estimation.data_association.existence import (
     BINS,
+    GATE,
     LASTING,
     PERSISTENCE,
     WINDOW,
@@ -66,8 +67,6 @@ POSE = -1
 """Number that replaces a call's in alarms about the pose."""
 NEAREST, TRIED = 100, 1000
 """Most landmarks compared, of the nearest, and most poses tried."""
-NEAR = 9.0
-"""Gate on the squared distance of two points and two landmarks."""
 
 Pairs = tuple[Complex[np.ndarray, "2 p"], Complex[np.ndarray, "2 p"], Float[np.ndarray, " p"]]
 """Pairs of points in the vehicle's frame, of landmarks [m], and sums of the points' variances."""
@@ -263,7 +262,7 @@ def own_pairs(heard: Rows, there: Complex[np.ndarray, " n"]) -> Pairs:
     i, j = np.triu_indices(points.size, 1)
     a, b = np.nonzero(~np.eye(there.size, dtype=np.bool_))
     spread, off = variance[i] + variance[j], abs(points[j] - points[i])[:, np.newaxis]
-    p, q = np.nonzero((off - abs(there[b] - there[a])) ** 2 < NEAR * spread[:, np.newaxis])
+    p, q = np.nonzero((off - abs(there[b] - there[a])) ** 2 < GATE * spread[:, np.newaxis])
     return np.stack([points[i][p], points[j][p]]), np.stack([there[a][q], there[b][q]]), spread[p]
 
 
