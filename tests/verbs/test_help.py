@@ -101,7 +101,7 @@ def test_help_all_of_slam_omits_settings_that_a_log_decides(printed):
     assert found == {
         "--listening.timing",
         *(f"--association.{name}" for name in ("method", "detection", "clutter", "bearing-std")),
-        *(f"--association.{name}" for name in ("way-std", "max-range", "field-of-view")),
+        "--association.way-std",
         *(f"--filter.{name}" for name in ("noise", "excess-path-std", "robust")),
         *(f"--filter.{name}" for name in ("calibrate", "window")),
         *(f"--prior.{name}-std" for name in ("speed-scale", "turn-bias", "wheelbase")),
