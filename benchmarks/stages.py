@@ -28,7 +28,7 @@ DRIVES = {
     "precise_smoother_m": "test_precise_bearings[smoother]",
 }
 """Benchmarks that give a ratio, and an error."""
-BOTH = "test_listening_to_few_frames_by_samples_and_by_blocks"
+BOTH = "test_listening_to_sweeps_and_to_tones"
 
 
 def measure() -> tuple[list[Row], list[float]]:
@@ -77,8 +77,8 @@ def rows(stages: dict[str, Any]) -> Iterator[Row]:
             note = f"in {1e3 * stages[test]['stats']['median']:.0f} ms"
             yield row(name, error, _command(test), ratio=error, note=note)
     if BOTH in stages:
-        ratio = stages[BOTH]["extra_info"]["over_blocks"]
-        yield row("dense_over_block", ratio, _command(BOTH), ratio=ratio)
+        ratio = stages[BOTH]["extra_info"]["over_tones"]
+        yield row("sweeps_over_tones", ratio, _command(BOTH), ratio=ratio)
 
 
 def _command(test: str) -> str:

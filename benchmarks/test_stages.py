@@ -12,8 +12,8 @@ import pytest
 from benchmarks.calibration import calibrate
 from benchmarks.counts import covariance_updates, elementary_functions
 from benchmarks.limits import elementary_function, multiply_add
-from benchmarks.worlds import RADII, scans_of, some_frames, world_of
-from pipistrelle.config import Config, FilterConfig, RayConfig, ReceiverConfig
+from benchmarks.worlds import RADII, scans_of, world_of
+from pipistrelle.config import Config, FilterConfig, RayConfig
 from pipistrelle.experiments.hearing.listening import listen
 from pipistrelle.experiments.machine import keep_freed_memory
 from pipistrelle.experiments.named_settings import Case
@@ -24,7 +24,6 @@ from reference.drives import turn_and_drive
 keep_freed_memory()  # as the commands do
 CONFIG = Config()
 WORLD = world_of(CONFIG)
-FEW = some_frames(WORLD, 25)
 ONE = (CONFIG.emitter.radius,)
 
 pytestmark = pytest.mark.benchmark(timer=time.process_time)
@@ -49,23 +48,23 @@ def test_listening_through_twelve_beams(benchmark):
     benchmark.pedantic(listen, (WORLD, CONFIG, RADII), rounds=5, warmup_rounds=1)
 
 
-def test_listening_to_few_frames_by_samples_and_by_blocks(benchmark):
-    """Time the dense engine and, before each of its rounds, the block engine."""
-    blocks, rounds = [], 5
-    dense = CONFIG.model_copy(update={"receiver": ReceiverConfig(engine="dense")})
+def test_listening_to_sweeps_and_to_tones(benchmark):
+    """Time frames with sweeps and, before each of their rounds, frames with tones."""
+    tones, rounds = [], 5
+    sweep = {"call": "sweep", "sweep": "hyperbolic"}
+    bands = {"emitter": sweep, "beacon": sweep | {"band": (90e3, 65e3)}}
+    config = Config.model_validate(bands)
+    world = world_of(config)
 
-    def by_blocks():
-        took = []
-        for _ in range(15):
-            began = time.process_time()
-            listen(FEW, CONFIG, ONE)
-            took.append(time.process_time() - began)
-        blocks.append(median(took))
+    def to_tones():
+        began = time.process_time()
+        listen(WORLD, CONFIG, ONE)
+        tones.append(time.process_time() - began)
 
-    benchmark.extra_info["frames"] = 15
-    benchmark.pedantic(listen, (FEW, dense, ONE), setup=by_blocks, rounds=rounds, warmup_rounds=1)
-    pairs = zip(benchmark.stats.stats.data, blocks[-rounds:], strict=True)
-    benchmark.extra_info["over_blocks"] = median(samples / block for samples, block in pairs)
+    benchmark.extra_info["frames"] = 375
+    benchmark.pedantic(listen, (world, config, ONE), setup=to_tones, rounds=rounds, warmup_rounds=1)
+    pairs = zip(benchmark.stats.stats.data, tones[-rounds:], strict=True)
+    benchmark.extra_info["over_tones"] = median(one / other for one, other in pairs)
 
 
 @pytest.mark.parametrize("strategy", ["active", "fused", "passive"])

@@ -17,7 +17,6 @@ from pipistrelle.acoustics.paths import callers_of
 from pipistrelle.arrays.layout import square_of_four
 from pipistrelle.arrays.receiver import record_samples
 from pipistrelle.arrays.sampling import blocks_to_hear, sampling
-from pipistrelle.detection.matched import filter_samples
 from pipistrelle.figures.style import STRATEGY_COLOURS, STYLE, TRUTH
 
 config = Config()
@@ -60,10 +59,12 @@ echo = Arrivals(
 vehicle, _ = callers_of(config, np.zeros(2))
 settled, rng = sampling(config, [vehicle]), np.random.default_rng(7)
 blocks, layout = blocks_to_hear(echo, settled) + 30, square_of_four(config.receiver)
-samples = record_samples(blocks, echo, layout, settled, rng)
+samples = record_samples(blocks, echo, layout, settled)
+samples += rng.normal(scale=0.5**0.5, size=(*samples.shape, 2)) @ (1.0, 1.0j)
 length, rate = settled.pulse * settled.block, settled.rate
-matched = filter_samples(samples, calls=settled.calls, rate=rate, noise_std=settled.noise_std)
-heard = {"microphone": samples[:, 0, 0], "matched filter": matched[:, 0, 0, 0]}
+called = settled.calls[0].waveform(np.arange(length) / rate, tone)
+matched = np.correlate(samples[:, 0, 0], called) / np.sqrt(length)
+heard = {"microphone": samples[:, 0, 0], "matched filter": matched}
 
 plt.rcParams.update(STYLE)
 figure, (beam, *axes) = plt.subplots(3, figsize=(7.0, 5.0), layout="constrained")

@@ -9,6 +9,7 @@ far away that is. Here is one frame, sample by sample.
 
 import matplotlib.pyplot as plt
 import numpy as np
+from scipy.signal import fftconvolve
 
 from pipistrelle import Config
 from pipistrelle.acoustics.arrivals import arrivals_of_emission, through_piston
@@ -16,7 +17,6 @@ from pipistrelle.acoustics.paths import callers_of
 from pipistrelle.arrays.layout import square_of_four
 from pipistrelle.arrays.receiver import record_samples
 from pipistrelle.arrays.sampling import BLOCK, blocks_to_hear, sampling
-from pipistrelle.detection.matched import filter_samples
 from pipistrelle.detection.snapshots import detect, detector
 from pipistrelle.figures.style import STRATEGY_COLOURS, STYLE
 
@@ -51,11 +51,12 @@ for i in np.argsort(arrivals.delay):
 layout, settled = square_of_four(config.receiver), sampling(config, callers)
 rng = np.random.default_rng(config.seed)
 blocks = blocks_to_hear(arrivals, settled)
-samples = record_samples(blocks, arrivals, layout, settled, rng)
+samples = record_samples(blocks, arrivals, layout, settled)
+samples += rng.normal(scale=0.5**0.5, size=(*samples.shape, 2)) @ (1.0, 1.0j)
 length, start = settled.pulse * settled.block, settled.pulse * BLOCK
-matched = filter_samples(
-    samples, calls=settled.calls, rate=settled.rate, noise_std=settled.noise_std
-)
+sent = np.exp(2j * np.pi * np.outer(np.arange(length) / settled.rate, settled.tones))
+matched = fftconvolve(samples[:, :, None], sent[::-1, None, :, None].conj(), "valid", axes=0)
+matched /= np.sqrt(length)
 finder = detector(config, layout, settled.tones)
 found = detect(matched, finder, start=start, interval=1.0 / settled.rate, pulse=length)
 

@@ -11,9 +11,9 @@ from pipistrelle.config import (
     STRATEGIES,
     CallerConfig,
     Config,
+    EmitterConfig,
     FilterConfig,
     ListeningConfig,
-    ReceiverConfig,
     ScenarioConfig,
 )
 from pipistrelle.estimation.catalogue import CATALOGUE
@@ -28,11 +28,11 @@ pytestmark = [
 LOGS = Path(__file__).parent / "data"
 
 
-@pytest.mark.parametrize("engine", ["block", "dense"])
-def test_a_short_mission_keeps_to_its_annotations(engine):
+@pytest.mark.parametrize("taper", [0.0, 0.2])
+def test_a_short_mission_keeps_to_its_annotations(taper):
     config = Config(
         scenario=ScenarioConfig(steps=8, landmarks=12, radius=12.0),
-        receiver=ReceiverConfig(engine=engine),
+        emitter=EmitterConfig(taper=taper),
     )
     mission = run_mission(config, STRATEGIES)
     assert [trial.strategy for trial in mission.trials] == list(STRATEGIES)

@@ -432,9 +432,6 @@ class ReceiverConfig(Section):
     """Sampling rate of each microphone [Hz]."""
     noise_level_db: Level = 0.0
     """Noise level of one complex sample, on the scale of the source levels [dB]."""
-    engine: Literal["auto", "block", "dense"] = "auto"
-    """Simulation of the samples: `block`, exact sums over 0.2 ms (fast), `dense`, every sample
-    (slow, the reference), or `auto`, blocks if all calls are tones and fit whole blocks."""
 
 
 class DetectionConfig(Section):

@@ -11,18 +11,18 @@ from hypothesis import strategies as st
 from scipy.stats import binom, chi2
 
 from pipistrelle.acoustics.arrivals import Arrivals
-from pipistrelle.acoustics.call import Sweep, ToneBurst, band_of, cross_talk, replica
+from pipistrelle.acoustics.call import Sweep, ToneBurst, band_of, carrier_of, cross_talk, replica
 from pipistrelle.acoustics.paths import callers_of
 from pipistrelle.arithmetic.random_stream import complex_noise, stream_key
 from pipistrelle.arrays.beamforming import bearing_bound, spread_towards
 from pipistrelle.arrays.layout import Layout, Scattered, microphones_of, scattered, square_of_four
-from pipistrelle.arrays.receiver import add_echo_blocks, record_samples
+from pipistrelle.arrays.receiver import add_echo_blocks, noise_blocks
 from pipistrelle.arrays.sampling import BLOCK, blocks_to_hear, sampling
 from pipistrelle.config import Config, DetectionConfig, InputError
-from pipistrelle.detection.beams import _loudness, circle_of, find_around, wide_of
+from pipistrelle.detection.beams import _loudness, find_wide, wide_of
 from pipistrelle.detection.direct import Lags
 from pipistrelle.detection.front_end import find_calls, front_end
-from pipistrelle.detection.matched import BandFilters, filter_samples
+from pipistrelle.detection.matched import BandFilters
 from pipistrelle.detection.snapshots import detect, detector
 from pipistrelle.geometry import wrap
 from reference.echoes import (
@@ -30,14 +30,13 @@ from reference.echoes import (
     CONFIG,
     LAGS,
     OWN,
-    SAMPLES,
     SETTLED,
-    START,
     C,
     filtered,
     matched_of,
     sounds,
 )
+from reference.samples import in_bands, record_samples
 
 TURN = np.arange(8) * np.pi / 4
 
@@ -94,12 +93,11 @@ def test_gains_scale_the_output_and_faces_receive_nothing_from_behind():
 def exceeded(layout, chance, key, tests):
     """Return how many lags of noise alone, each of its own draw, are as loud as by chance."""
     config = Config(detection=DetectionConfig(false_alarm=chance))
-    circle = circle_of(config, layout, 0, SETTLED.tones[:1])
+    circle = wide_of(config, layout, 0, SETTLED.calls[0], 200_000)  # lags a second apart
     noise = complex_noise((tests, 1, layout.shape[1]), 1.0, stream_key(9, key, "noise alone"))
     position = np.zeros((2 * tests - 1, 1, layout.shape[1]), dtype=complex)
     position[::2] = noise
-    caller, _ = find_around(position, circle, Lags(0.0, 1.0, 1))
-    return caller.size
+    return find_wide(position[:, 0].T, circle, 0.0)[1].size
 
 
 @pytest.mark.parametrize("layout", [CIRCLE, LINE], ids=["circle", "line"])
@@ -140,17 +138,6 @@ def test_a_wide_array_hears_a_call_that_reaches_its_microphones_at_unlike_times(
     assert found.delay.size == 1
     assert abs(wrap(found.bearing[0] - 2.0)) < 5.0 * found.bearing_std[0] < 0.01
     assert abs(found.delay[0] - 7e-3) < 5.0 * found.delay_std[0]
-
-
-def test_the_dense_engine_agrees_with_the_blocks():
-    sound = sounds(6.81e-3, -1.1, 25.0)
-    end = front_end(CONFIG, CIRCLE, SETTLED.tones)
-    samples = record_samples(60, sound, CIRCLE, SETTLED, None)
-    dense = filter_samples(samples, calls=SETTLED.calls, rate=SETTLED.rate, noise_std=1.0)
-    lags = {"start": START, "interval": 1.0 / SETTLED.rate, "pulse": SAMPLES}
-    fine, coarse = find_calls(dense, end, **lags), around_in(matched_of(sound, CIRCLE), CIRCLE)
-    assert fine.bearing == pytest.approx(coarse.bearing, abs=1e-4)
-    assert fine.delay == pytest.approx(coarse.delay, abs=1.0 / SETTLED.rate)
 
 
 def trials(layout, snr_db, count, seed=0):
@@ -348,7 +335,7 @@ def heard(arrivals, layout, name="linear", rng=None, milliseconds=8.0, **more):
     """Return the matched outputs of arrivals, the lags and the front end."""
     config, settled, filters = setting(name, **more)
     blocks = round(milliseconds * 1e-3 / settled.interval)
-    matched = filters(record_samples(blocks, arrivals, layout, settled, rng), 1.0)
+    matched = in_bands(filters, record_samples(blocks, arrivals, layout, settled, rng), 1.0)
     start, interval = settled.pulse * settled.interval, filters.step / settled.rate
     return matched, Lags(start, interval, filters.pulse), config
 
@@ -500,11 +487,13 @@ def passed(layout, chance, name="linear", tests=12_000, threshold=None):
     """Return in how many lags, too far apart to be alike, noise alone is loud enough."""
     config, settled, filters = setting(name, false_alarm=chance)
     nothing, rng = sweeps([], [], [], settled), np.random.default_rng(3)
-    wide = wide_of(config, LAYOUTS[layout], 0, settled.calls, 0)
+    wide = wide_of(config, LAYOUTS[layout], 0, settled.calls[0], filters.step)
     blocks = round(8 * tests * filters.step / settled.block) + 2 * settled.pulse
-    matched = filters(record_samples(blocks, nothing, LAYOUTS[layout], settled, rng), 1.0)
-    loudness = _loudness(matched[:, 0, 0], wide, filters.step / settled.rate)[100:-100:8]
-    return np.count_nonzero(loudness[:tests] > (threshold or wide.threshold))
+    matched = in_bands(filters, record_samples(blocks, nothing, LAYOUTS[layout], settled, rng), 1.0)
+    least = threshold or wide.threshold
+    outputs = np.ascontiguousarray(matched[:, 0, 0].T)
+    loudness = _loudness(outputs, wide, least)[100:-100:8]
+    return np.count_nonzero(loudness[:tests] > least)
 
 
 @pytest.mark.parametrize(
@@ -532,13 +521,17 @@ def test_noise_correlates_between_lags_as_the_calls_autocorrelation():
     _, settled, filters = setting()
     rng, count = np.random.default_rng(5), 400_000
     nothing = sweeps([], [], [], settled)
-    matched = filters(record_samples(count // 40, nothing, FACE, settled, rng), 1.0)[:, 0, 0]
+    matched = in_bands(filters, record_samples(count // 40, nothing, FACE, settled, rng), 1.0)[
+        :, 0, 0
+    ]
     sent = replica(settled.calls[0], settled.rate)
     own = np.correlate(sent, sent, mode="full")[sent.size - 1 :] / np.sum(np.abs(sent) ** 2)
     assert np.mean(np.abs(matched) ** 2) == pytest.approx(1.0, abs=0.01)
     for lag in (1, 2, 3, 5, 8):
         alike = np.mean(matched[lag:] * matched[:-lag].conj())
-        assert abs(alike - own[lag * filters.step]) < 0.02
+        turns = carrier_of(band_of(settled.calls[0], settled.rate), filters.interval) * lag
+        turned = own[lag * filters.step] * np.exp(-2j * np.pi * turns * filters.interval)
+        assert abs(alike - turned) < 0.02
 
 
 @pytest.mark.parametrize("name", ["linear", "tapered"])
@@ -566,7 +559,7 @@ def test_a_tone_and_a_sweep_are_heard_side_by_side_and_leave_little_in_each_othe
     )
     samples = record_samples(60, both, FACE, settled, np.random.default_rng(1))
     lags = Lags(settled.pulse * settled.interval, filters.step / settled.rate, filters.pulse)
-    found = find_calls(filters(samples, 1.0), end, **lags._asdict())
+    found = find_calls(in_bands(filters, samples, 1.0), end, **lags._asdict())
     assert found.caller.tolist().count(1) == 1
     beacon = int(np.flatnonzero(found.caller == 1)[0])
     assert found.direct.detection.tolist() == [-1, beacon]
@@ -593,7 +586,6 @@ def test_tones_off_the_raster_are_found_at_any_rate(layout, rate):
         "receiver": {"sample_rate": rate},
     })  # fmt: skip
     settled = sampling(config, callers_of(config, np.zeros(2)))
-    filters = BandFilters(settled.calls, rate)
     end = front_end(config, LAYOUTS[layout], settled.tones, calls=settled.calls)
     both = Arrivals(
         delay=np.array([6.01e-3, 13e-3]),
@@ -603,10 +595,12 @@ def test_tones_off_the_raster_are_found_at_any_rate(layout, rate):
         caller=np.array([0, 1], dtype=np.int8),
         landmark=np.array([1, 2]),
     )
-    blocks = round(20e-3 / settled.interval)
-    samples = record_samples(blocks, both, LAYOUTS[layout], settled, np.random.default_rng(1))
-    lags = Lags(settled.pulse * settled.interval, filters.step / rate, filters.pulse)
-    found = find_calls(filters(samples), end, **lags._asdict())
+    blocks, layout = round(20e-3 / settled.interval), LAYOUTS[layout]
+    sums = noise_blocks(blocks, layout, settled, 1)
+    add_echo_blocks(sums, both, layout, settled)
+    start, interval = settled.pulse * settled.interval, settled.interval
+    lags = {"start": start, "interval": interval, "pulse": settled.pulse}
+    found = find_calls(filtered(sums, settled), end, **lags)
     order = np.argsort(found.delay)
     assert found.caller[order].tolist() == [0, 1]
     error = found.delay[order] - both.delay

@@ -438,21 +438,19 @@ def test_excess_paths_are_as_good_in_many_of_the_papers_worlds(
     assert far < 0.03 or delay_gate > 0.25
 
 
-def test_the_dense_engine_times_as_the_block_engine_does():
+def test_the_band_recorder_times_as_the_blocks_do():
     off = {}
-    for engine in ("block", "dense"):
+    for taper in (0.0, 0.2):
         config = Config.model_validate({
-            "seed": 1000, "scenario": {"steps": 16}, "receiver": {"engine": engine},
+            "seed": 1000, "scenario": {"steps": 16}, "emitter": {"taper": taper},
         })  # fmt: skip
         (frames,) = listen(world_of(config, 0), config, (0.0088,))
         told = [
             dict(zip(f.rows.landmark.tolist(), f.rows.excess_path, strict=True)) for f in frames
         ]
-        off[engine] = [
-            (n, label, e) for n, f in enumerate(told) for label, e in f.items() if e == e
-        ]
-    both = {key[:2]: key[2] for key in off["block"]}
-    apart = [e - both[n, label] for n, label, e in off["dense"] if (n, label) in both]
+        off[taper] = [(n, label, e) for n, f in enumerate(told) for label, e in f.items() if e == e]
+    both = {key[:2]: key[2] for key in off[0.0]}
+    apart = [e - both[n, label] for n, label, e in off[0.2] if (n, label) in both]
     assert len(apart) > 40
     assert np.median(np.abs(apart)) < 0.03
 

@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 
 from pipistrelle.acoustics.call import ToneBurst
-from pipistrelle.detection.matched import filter_blocks, filter_samples
+from pipistrelle.detection.matched import filter_blocks
+from reference.samples import filter_samples
 
 
 def drawn(*shape):

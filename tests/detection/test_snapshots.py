@@ -14,10 +14,9 @@ from pipistrelle.acoustics.paths import Caller, callers_of
 from pipistrelle.arithmetic.random_stream import complex_noise, stream_key
 from pipistrelle.arrays.beamforming import beamscan
 from pipistrelle.arrays.layout import Layout
-from pipistrelle.arrays.receiver import add_echo_blocks, noise_blocks, record_samples
+from pipistrelle.arrays.receiver import add_echo_blocks, noise_blocks
 from pipistrelle.arrays.sampling import blocks_to_hear, sampling
 from pipistrelle.config import BLOCK, Config, DetectionConfig
-from pipistrelle.detection.matched import filter_samples
 from pipistrelle.detection.snapshots import Detections, _scan_power, detect, detector
 from pipistrelle.geometry import wrap
 from reference.echoes import (
@@ -36,6 +35,7 @@ from reference.echoes import (
     matched_of,
     sounds,
 )
+from reference.samples import filter_samples, record_samples
 
 law = settings(deadline=None, max_examples=40)
 CHANCE, SIGMAS = 1e-6, 4.9

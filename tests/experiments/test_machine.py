@@ -11,10 +11,10 @@ import pytest
 from pipistrelle.__main__ import main
 from pipistrelle.config import (
     Config,
+    EmitterConfig,
     FastSlamConfig,
     InputError,
     RayConfig,
-    ReceiverConfig,
     ScenarioConfig,
 )
 from pipistrelle.estimation.catalogue import COPIES
@@ -100,10 +100,10 @@ def test_the_estimated_memory_of_a_step_matches_the_measured():
     assert step == pytest.approx(said, rel=0.2)
 
 
-@pytest.mark.parametrize("engine", ["block", "dense"])
-def test_the_estimated_memory_of_a_recording_matches_the_measured(engine, monkeypatch):
+@pytest.mark.parametrize("taper", [0.0, 0.2])
+def test_the_estimated_memory_of_a_recording_matches_the_measured(taper, monkeypatch):
     config = Config(
-        scenario=ScenarioConfig(steps=4, landmarks=2), receiver=ReceiverConfig(engine=engine)
+        scenario=ScenarioConfig(steps=4, landmarks=2), emitter=EmitterConfig(taper=taper)
     )
     said = {}
     monkeypatch.setattr(machine, "_refuse_beyond", lambda what, need, _: said.update({what: need}))

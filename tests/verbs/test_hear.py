@@ -69,9 +69,8 @@ def test_only_recordings_of_pipistrelle_are_replaced(obey, refused, undrawn):
     assert not list(Path("tape").glob("*.partial"))
 
 
-def test_the_dense_engine_and_frames_without_sound_are_refused(refused):
+def test_frames_without_sound_are_refused(refused):
     for words, said_of in (
-        (("--engine", "dense", "--save-sound", "tape"), "receiver.engine"),
         (("--frames", "0:2"), "--frames"),
         (("--save-sound", "tape", "--frames", "8:9"), "--frames"),
     ):

@@ -126,7 +126,6 @@ def test_defaults_in_the_help_equal_the_defaults_of_the_settings(printed):
     assert told["beamwidth"] == f"{degrees(width):.1f}"
     assert told["landmarks"] == str(config.scenario.landmarks)
     assert told["duration"] == f"{config.scenario.steps * config.scenario.step:g}"
-    assert told["engine"] == config.receiver.engine
     assert told["particles"] == str(config.fastslam.particles)
 
 

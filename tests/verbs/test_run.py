@@ -394,7 +394,7 @@ def test_settings_as_shown_are_a_file_of_the_same_settings(settings, obey):
 
 def test_short_options_set_their_settings(settings):
     config = settings(
-        *("--beamwidth", "60", "--landmarks", "3", "--duration", "10", "--engine", "dense"),
+        *("--beamwidth", "60", "--landmarks", "3", "--duration", "10"),
         *("--scenario.step", "0.25", "--air.speed-of-sound", "340", "--particles", "30"),
     )
     width = beamwidth(
@@ -403,7 +403,6 @@ def test_short_options_set_their_settings(settings):
     assert degrees(width) == pytest.approx(60, rel=1e-12)
     assert config.scenario.landmarks == 3
     assert config.scenario.steps == 40
-    assert config.receiver.engine == "dense"
     assert config.fastslam.particles == 30
 
 

@@ -1,8 +1,7 @@
 r"""Calls: tone bursts, sweeps and recorded files; their waveforms, bands and cross talk.
 
-Recorder and matched filter know only the waveform of a `Call`. The engine ``block`` has closed
-forms for a `ToneBurst`; ``dense`` accepts any. A motion at the speed v scales a call in time,
-:math:`s(a (t - \tau))` with a the ratio of the received frequency to the sent one.
+Recorder and matched filter know only the waveform of a `Call`. A motion at the speed v scales
+a call in time, :math:`s(a (t - \tau))` with a the ratio of the received frequency to the sent one.
 
 A `Sweep` passes through a band. By the linear law its frequency is linear in time, by the
 hyperbolic law its period is,
@@ -38,13 +37,14 @@ import os
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
+from functools import lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple, Protocol
 
 import numpy as np
 from jaxtyping import Complex, Float
 
-from pipistrelle.config import SWEEP, TONE, CallConfig, InputError
+from pipistrelle.config import BLOCK, SWEEP, TONE, CallConfig, InputError
 from pipistrelle.files import check_ordinary
 from pipistrelle.refusals import refusal
 from pipistrelle.settings import CALL_KEYS, CALLERS, Layer, beside
@@ -337,6 +337,8 @@ MAX_CROSS_TALK = 0.06
 """Largest allowed relative power of a call in the matched filter of another."""
 PADDING = 8
 """Zero-padding factor of a call's spectrum."""
+GRID = 128
+"""Lags in the period of the slowest carrier; every window is a multiple of it."""
 
 
 class Band(NamedTuple):
@@ -358,6 +360,7 @@ def replica(call: Call, rate: float, scale: float = 1.0) -> Complex[np.ndarray, 
     return call.waveform(time, scale * call.frequency)
 
 
+@lru_cache(maxsize=64)
 def band_of(call: Call, rate: float) -> Band:
     """Compute the frequency band that holds nearly all energy of a call sampled at a rate [Hz].
 
@@ -391,6 +394,27 @@ def extent_of(call: Call, rate: float) -> tuple[float, float]:
 def is_whole(count: float) -> bool:
     """Return whether a number is an integer from 1, up to rounding."""
     return round(count) >= 1 and abs(count - round(count)) <= 1e-6
+
+
+def blocks_of(rate: float, duration: float, tones: Float[np.ndarray, " c"]) -> tuple[int, int]:
+    """Return the samples in a block and the blocks in a call, which hold at least its duration [s].
+
+    Of 0.2 ms if all is whole, so that noise is independent between tones; else about a fourteenth
+    of the call.
+
+    >>> blocks_of(200e3, 2.8e-3, np.array([35e3, 30e3])), blocks_of(192e3, 5e-4, np.array([40e3]))
+    ((40, 14), (8, 12))
+    """
+    if on_raster(rate, duration, tones):
+        return round(rate * BLOCK), round(duration / BLOCK)
+    length = duration * rate - 1e-6
+    choice = [(math.ceil(length / count), count) for count in range(LEAST_SAMPLES, 21)]
+    return min(choice, key=lambda b: (b[0] * b[1], abs(b[1] - 14)))
+
+
+def on_raster(rate: float, duration: float, tones: Float[np.ndarray, " c"]) -> bool:
+    """Return whether blocks of 0.2 ms are whole samples, calls whole blocks, tones whole bins."""
+    return all(map(is_whole, (rate * BLOCK, duration / BLOCK, *(tones * BLOCK))))
 
 
 def check_sampled(
@@ -439,3 +463,42 @@ def lag_step(calls: Sequence[Call], rate: float) -> int:
     """
     widest = max(band.high - band.low for band in (band_of(call, rate) for call in calls))
     return max(math.floor(rate / (2.0 * widest)), 1)
+
+
+def bands_of(calls: Sequence[Call], rate: float) -> list[Band]:
+    """Return the band of each call's filter; a tone has twice the rate of its outputs.
+
+    A rectangular tone is timed by its edges, which have no band: its filter falls off slowly.
+    """
+    reach, bands = rate / lag_step(calls, rate), [band_of(call, rate) for call in calls]
+    for c, call in enumerate(calls):
+        if isinstance(call, ToneBurst):
+            low, high = max(call.frequency - reach, 0.0), min(call.frequency + reach, rate / 2.0)
+            bands[c] = bands[c]._replace(low=low, high=high)
+    return bands
+
+
+def carrier_of(band: Band, interval: float) -> float:
+    """Return the carrier of a band's complex envelope [Hz]: near its middle, and a bin of windows.
+
+    `interval`: between two lags [s].
+    """
+    cycle = GRID * interval
+    return round(0.5 * (band.low + band.high) * cycle) / cycle
+
+
+def window_lags(least: float) -> int:
+    """Return the least number of lags, not below `least`, with a fast Fourier transform."""
+    from scipy.fft import next_fast_len
+
+    return GRID * next_fast_len(math.ceil(least / GRID))
+
+
+def bins_of(band: Band, lags: int, interval: float) -> tuple[int, int, int]:
+    """Return the bins of a band's carrier, and of its lowest and highest frequency less that.
+
+    In a window of `lags` times `interval` [s].
+    """
+    length = lags * interval
+    middle = round(carrier_of(band, interval) * length)
+    return middle, math.ceil(band.low * length) - middle, math.floor(band.high * length) - middle

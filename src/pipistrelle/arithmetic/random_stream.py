@@ -40,6 +40,11 @@ def stream_key(seed: int, iteration: int, purpose: str, frame: int = 0) -> int:
     return int(state[0])
 
 
+def stream_from(key: int, number: int) -> int:
+    """Return the key of a stream that begins with a given number of another key's."""
+    return (key + number * int(_GOLDEN)) % 2**64
+
+
 def complex_noise(
     shape: tuple[int, ...], std: float, key: int, out: Complex[np.ndarray, "..."] | None = None
 ) -> Complex[np.ndarray, "..."]:
@@ -53,7 +58,7 @@ def complex_noise(
     True
     """
     noise = np.empty(shape, dtype=np.complex128) if out is None else out
-    _fill(noise.reshape(-1).view(np.float64), _F(std * std), np.uint64(key))
+    _fill(noise.reshape(-1).view(noise.real.dtype), _F(std * std), np.uint64(key))
     return noise
 
 

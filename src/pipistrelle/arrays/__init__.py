@@ -1,9 +1,9 @@
 """Microphone arrays: geometry, sampling, recording of arrivals and beamforming.
 
 `array_file` reads microphones, and `layout` groups them into faces and lines (Bradley & Abaid, Sec.
-II-C). `receiver` makes a recording of arrivals, sample by sample or, with the same statistics, as
-sums over 0.2 ms blocks; `sampling` chooses rate and blocks. `beamforming` computes scan, beam
-pattern and the bound of a bearing.
+II-C). `receiver` makes a recording of arrivals, as sums over 0.2 ms blocks or in each call's band;
+`sampling` chooses rate and blocks. `beamforming` computes scan, beam pattern and the bound of a
+bearing.
 """
 
 from lazy_loader import attach

@@ -10,8 +10,16 @@ so that the call's whole band adds up, however wide the array is. Between lags, 
 tone is interpolated linearly, as its matched output is a triangle; of another call by a windowed
 sinc that preserves the band. For a sweep, the distance between two microphones changes the
 envelope's time as well as the phase: over 44 mm, 0.13 ms, the matched output of a band of 25 kHz
-falls off three times. So all lags of a sweep are scanned by delays, frequency by frequency:
-:math:`Z(\phi, f) = \sum_m w_m e^{-2\pi i f a_m(\phi)} Y_m(f)`, with Y the spectrum of y.
+falls off three times.
+
+**Search.** No beam is louder than the sum of its microphones' moduli,
+
+.. math:: |z(\phi, t)| \le \sum_m w_m |y_m(t - a_m)| ,
+
+which is computed for all beams of a sector at once, as their delays are equal to half a lag. Beams
+are summed only at lags at which it reaches the threshold: in noise, a twentieth. Half lags lose a
+little of a call, and leave out noise: where this may have hidden a peak, they are summed again by
+exact delays.
 
 **Loudness** of a lag is the largest :math:`|z|^2` over the directions. In noise of unit variance z
 is complex normal at every direction, and the maximum of such a process exceeds h, per lag, with
@@ -47,18 +55,18 @@ there. With a flat prior the odds are the likelihood ratios, and the stated vari
 
 with :math:`\eta` the noise.
 
-**Detections.** A tone has a single detection in each snapshot. Another loud call leaves lobes at
-other lags: of its autocorrelation, and of beams to other directions, where some microphones' peaks
-come too early. A peak counts only if it exceeds the sum of the amplitudes that all louder
+**Detections.** A tone has a single detection within half its length. Another loud call leaves lobes
+at other lags: of its autocorrelation, and of beams to other directions, where some microphones'
+peaks come too early. A peak counts only if it exceeds the sum of the amplitudes that all louder
 peaks may leave there, computed in advance as the scan's response to the call, from several
 directions and with Doppler shifts, plus 3 dB.
 
 **Calls only partly in the record**, as the vehicle is deaf while it calls, are peaks at lags before
 its first or after its last. Their skirts reach into the record, wider than a whole call's, as the
 received part has less of the band; and outputs that begin or end amid a peak are a step, which a
-transform spreads over all lags. So if a loud peak is near an end, outputs are computed a call's
-length beyond both ends, of samples padded with silence; peaks there mask the most that their cut
-call may leave, and are not detections themselves.
+transform spreads over all lags. So outputs are computed a call's length beyond both ends, as if
+silence surrounded the record; peaks there mask the most that their cut call may leave, and are not
+detections themselves.
 
 Sources: Rice, Bell System Technical Journal 24 (1945), and Davies, Biometrika 74 (1987), for the
 crossings; Van Trees, Optimum Array Processing (2002), Secs. 2.2, 6.13 and 8.4, for delay and sum
@@ -66,33 +74,39 @@ and the bound.
 """
 
 import math
-from collections.abc import Callable, Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Complex, Float, Int
 
-from pipistrelle.acoustics.call import Band, Call, band_of, coupling, lag_step, replica
+from pipistrelle.acoustics.call import (
+    Band,
+    Call,
+    ToneBurst,
+    band_of,
+    bins_of,
+    carrier_of,
+    coupling,
+    replica,
+    window_lags,
+)
 from pipistrelle.arrays.beamforming import UNKNOWN, spread_towards
 from pipistrelle.arrays.layout import Layout, Scattered
 from pipistrelle.config import Config
-from pipistrelle.detection.direct import MIN_EDGE_ENERGY_OF_BEAM, Lags, front_edge
+from pipistrelle.detection.direct import MIN_EDGE_ENERGY_OF_BEAM, front_edge
 from pipistrelle.detection.matched import reach_of
 from pipistrelle.detection.noise import (
+    NOISE_QUANTILE,
     bearing_std,
-    candidates,
     delay_std,
     loudest_noise,
     over_noise,
-    snapshot,
 )
 from pipistrelle.geometry import wrap, wrap_angle
 from pipistrelle.jit import Whole, kernel, no_alloc
 
 BEAM_STEP = 0.4
 """Root mean square phase between two beams over the microphones [rad]: 4 % loss halfway."""
-STRIDES = 14
-"""Most lags in a tone at which the loudness is scanned."""
 CLIMBS = 4
 """Steps of the climb to the top of a lobe, each by a parabola, a quarter as wide as the last."""
 DIVISIONS = 8
@@ -103,8 +117,6 @@ RARE = 40.0
 """Lobes this many noise powers below the loudest are ignored: odds of 1 to 1e17."""
 TAPS, PARTS, BETA = 12, 256, 8.0
 """Windowed sinc: number of taps, positions between two outputs, shape of its Kaiser window."""
-BEAMS_AT_ONCE = 32
-"""Beams whose outputs are in memory at a time."""
 MARGIN = 2.0
 """Least ratio of a peak's power to the most that louder calls leave there."""
 LOBE = 0.7
@@ -129,26 +141,24 @@ class Beams(NamedTuple):
     speed_of_sound: float
     loudest_noise: float
     """See `noise.loudest_noise`."""
-    around: bool
-    """Whether the first direction follows the last."""
-    centred: bool
-    """Whether the centre is the microphones' middle."""
 
 
-class Circle(NamedTuple):
-    """The detector of tones in a group of omnidirectional microphones."""
+class _Call(NamedTuple):
+    """Frequency, length and interpolation between lags of a call's matched-filter outputs."""
 
-    threshold: float
-    """Least loudness of a call at a lag and tone, in units of an output's noise."""
-    leakage: float
-    """Least loudness relative to another tone's at nearby lags."""
-    tones: Float[np.ndarray, " c"]
-    beams: Beams
-    """Beams about the vehicle's centre."""
+    frequency: float
+    """Of a tone, or carrier of the band, which is 0 in the outputs [Hz]."""
+    tone: bool
+    pulse: int
+    """Lags in a tone."""
+    interval: float
+    """Between two lags [s]."""
+    taps: Float[np.ndarray, "p t"]
+    """Weights of the nearest outputs, for positions between two; of a tone, those two."""
 
 
 class Wide(NamedTuple):
-    """The detector of a wideband call in a group of microphones."""
+    """The detector of a call in a group of microphones."""
 
     threshold: float
     """Least loudness of a call at a lag, in units of an output's noise."""
@@ -158,65 +168,42 @@ class Wide(NamedTuple):
     """Normal of a line on a face [rad]; NaN for an omnidirectional group."""
     middle: Float[np.ndarray, "2"]
     """Middle of the microphones, the beams' centre, in the vehicle's frame [m]."""
+    call: _Call
     band: Band
     doppler_std: float
     """Standard deviation of a delay, by the call's Doppler shift [s]."""
     beams: Beams
+    begin: Int[np.ndarray, " q"]
+    """First beam of each sector, in which delays are equal to half a lag, and the beams' number."""
+    late: Int[np.ndarray, "s k"]
+    """Lag of a sector at each microphone, less the centre's, in half lags."""
+    noise_std: Float[np.ndarray, " s"]
+    """Standard deviation of a sector's noise, as half lags are means of two."""
+    phases: Complex[np.ndarray, "n k"]
+    """Factor of each microphone, for each beam."""
+    margin: int
+    """Lags of silence that every microphone needs at each end."""
+    loss: float
+    """Least power of a call from a beam's direction, relative to the sum by exact delays."""
+    slack: float
+    """Amplitude that noise adds by exact delays, in all but a thousandth of cases."""
     lobes: Float[np.ndarray, " l"]
     """Largest share of its power that a call leaves at each distance from its peak, in lags."""
     cut_lobes: Float[np.ndarray, "s l"]
     """The `lobes` of calls only partly in the record, a row for each missing share."""
 
 
-class _Call(NamedTuple):
-    """Frequency, length and interpolation between lags of a call's matched-filter outputs."""
+def wide_of(config: Config, layout: Layout | Scattered, group: int, call: Call, step: int) -> Wide:
+    """Build the detector of a call for the microphones of a face or another group.
 
-    frequency: float
-    """Of a tone, or centre of the band, shifted to 0 in the outputs [Hz]."""
-    pulse: int
-    """Lags in a tone."""
-    interval: float
-    """Between two lags [s]."""
-    sinc: Float[np.ndarray, "p t"]
-    """Windowed sinc at positions between two outputs; empty for a tone, interpolated linearly."""
-
-
-def circle_of(
-    config: Config, layout: Scattered, group: int, tones: Float[np.ndarray, " c"]
-) -> Circle:
-    """Build the detector of tones in a group of omnidirectional microphones."""
-    (position, gain), c = layout.places(group), config.assumed_sound_speed
-    weight = gain / np.linalg.norm(gain)
-    bearing = np.linspace(-np.pi, np.pi, 3600, endpoint=False)
-    slope = 2.0 * np.pi * tones.max() / c * np.sqrt(spread_towards(bearing, position, weight))
-    looks = 2.0 * np.pi * float(slope.mean())
-    beams = max(math.ceil(2.0 * np.pi * float(slope.max()) / BEAM_STEP), 8)
-    return Circle(
-        threshold=loudest_by_chance(config.detection.false_alarm, looks, gain.size),
-        leakage=10.0 ** (config.detection.leakage_db / 10.0),
-        tones=tones,
-        beams=Beams(
-            bearing=2.0 * np.pi * np.arange(beams) / beams - np.pi,
-            position=position,
-            weight=weight,
-            speed_of_sound=c,
-            loudest_noise=loudest_noise(gain.size),
-            around=True,
-            centred=False,
-        ),
-    )
-
-
-def wide_of(
-    config: Config, layout: Layout | Scattered, group: int, calls: Sequence[Call], caller: int
-) -> Wide:
-    """Build the detector of a wideband call for the microphones of a face or another group."""
+    `step`: samples between two outputs.
+    """
     rate, c = config.receiver.sample_rate, config.assumed_sound_speed
     normal, (place, gain) = float(layout.normal[group]), layout.places(group)
     weight = gain / np.linalg.norm(gain)
     middle = weight**2 @ place
     position = place - middle
-    band = band_of(calls[caller], rate)
+    band, tone = band_of(call, rate), isinstance(call, ToneBurst)
     around = math.isnan(normal)
     limit = math.radians(config.detection.scan_limit_deg)
     fine = np.linspace(-np.pi, np.pi, 3601) if around else normal + np.linspace(-limit, limit, 1801)
@@ -226,29 +213,73 @@ def wide_of(
     count = max(math.ceil(looks[-1] / BEAM_STEP), 8) + (0 if around else 1)
     even = np.linspace(0.0, looks[-1], count + 1 if around else count)
     moving = 2.0 * abs(config.scenario.speed) / c / math.sqrt(2.0)
+    beams = Beams(
+        bearing=np.interp(even, looks, fine)[:count],
+        position=position,
+        weight=weight,
+        speed_of_sound=c,
+        loudest_noise=loudest_noise(weight.size),
+    )
+    interval, pulse = step / rate, max(round(call.duration * rate / step), 1)
+    carrier = call.frequency if tone else carrier_of(band, interval)
     wide = Wide(
         threshold=loudest_by_chance(config.detection.false_alarm, looks[-1], weight.size),
         sine_limit=2.0 if around else math.sin(math.radians(config.detection.angle_limit_deg)),
         normal=normal,
         middle=middle,
+        call=_Call(carrier, tone, pulse, interval, _LINEAR if tone else _SINC),
         band=band,
-        doppler_std=abs(coupling(calls[caller])) * moving,
-        beams=Beams(
-            bearing=np.interp(even, looks, fine)[:count],
-            position=position,
-            weight=weight,
-            speed_of_sound=c,
-            loudest_noise=loudest_noise(weight.size),
-            around=False,
-            centred=True,
-        ),
-        lobes=np.empty(0),
-        cut_lobes=np.empty((0, 0)),
+        doppler_std=abs(coupling(call)) * moving,
+        beams=beams,
+        **_sectors_of(call, beams, carrier, interval, rate),
+        lobes=np.append(np.ones(pulse // 2 + round(2.0 * _lead(beams, interval)) + 1), 0.0),
+        cut_lobes=np.ones((1, 1)),
     )
-    step = lag_step(calls, rate)
-    lobes = _lobes_of(calls[caller], wide, step, rate)
-    cut = _cut_lobes_of(calls[caller], wide, step, rate)
+    if tone:
+        return wide
+    lobes, cut = _lobes_of(call, wide, step, rate), _cut_lobes_of(call, wide, step, rate)
     return wide._replace(lobes=lobes, cut_lobes=cut)
+
+
+def _leads(beams: Beams, bearing: Float[np.ndarray, " n"]) -> Float[np.ndarray, "n k"]:
+    """Return each microphone's time lead over the centre, for sound from given bearings [s]."""
+    toward = np.column_stack((np.cos(bearing), np.sin(bearing)))
+    return toward @ beams.position.T / beams.speed_of_sound
+
+
+def _sectors_of(
+    call: Call, beams: Beams, carrier: float, interval: float, rate: float
+) -> dict[str, Any]:
+    """Divide a call's beams into sectors within which no delay differs by half a lag."""
+    band, sent = band_of(call, rate), replica(call, rate)
+    early, begin = _leads(beams, beams.bearing), [0]
+    for n in range(len(early)):
+        if np.ptp(early[begin[-1] : n + 1], axis=0).max() > 0.5 * interval:
+            begin.append(n)
+    size = np.diff([*begin, len(early)])
+    late = -np.rint(2.0 * np.add.reduceat(early, begin) / interval / size[:, np.newaxis])
+    frequency = np.arange(2 * sent.size) * rate / (2 * sent.size)
+    inside = (frequency >= band.low) & (frequency <= band.high)
+    power = np.abs(np.fft.fft(sent, frequency.size)[inside]) ** 2
+    off = np.linspace(-2.0, 2.0, 4 * PARTS + 1)
+    turn = 2.0 * np.pi * (frequency[inside] - carrier) * interval
+    alike = np.exp(1j * np.outer(off, turn)) @ (power / np.sum(power))
+    between = 0.5 * (np.interp(off - 0.5, off, alike) + np.interp(off + 0.5, off, alike))
+    odd, sector = late % 2.0 != 0.0, np.repeat(np.arange(size.size), size)
+    share = np.where(odd, 0.5 * (1.0 + np.interp(1.0, off, alike).real), 1.0)
+    noise_std, error = np.sqrt(share @ beams.weight**2), 0.5 * late[sector] + early / interval
+    left = np.where(odd[sector], np.interp(error, off, between), np.interp(error, off, alike))
+    left = np.abs(left @ beams.weight**2) / noise_std[sector]
+    loss = float(np.min(left**2))
+    return {
+        "begin": np.array([*begin, len(early)]),
+        "late": late.astype(np.int64),
+        "noise_std": noise_std,
+        "phases": (beams.weight * np.exp(-2j * np.pi * carrier * early)).astype(np.complex64),
+        "margin": TAPS + _margin(beams, interval),
+        "loss": loss,
+        "slack": math.sqrt((loss - 1.0) * math.log(1.0 - NOISE_QUANTILE)),
+    }
 
 
 def loudest_by_chance(chance: float, looks: float, microphones: int) -> float:
@@ -271,87 +302,64 @@ def loudest_by_chance(chance: float, looks: float, microphones: int) -> float:
     return float(brentq(excess, alone, energy))  # pyrefly: ignore[bad-argument-type]
 
 
-def find_around(
-    matched: Complex[np.ndarray, "l c k"], circle: Circle, lags: Lags
-) -> tuple[Int[np.ndarray, " m"], Float[np.ndarray, "6 m"]]:
-    """Return caller, delay, bearing and power of the tones that a group of microphones detects.
-
-    Returns the caller of each; delay at the vehicle's centre [s], bearing [rad], power, the
-    standard deviations of bearing and delay, and the arctangent of the bearing's slope in the
-    logarithm of the speed of sound.
-    """
-    margin = _margin(circle.beams, lags.interval)
-    return _find(_padded(matched, margin), margin, circle, lags)
-
-
 def edge_around(
-    matched: Complex[np.ndarray, "l c k"],
-    circle: Circle,
-    lags: Lags,
-    b: int,
-    p: int,
-    bearing: float,
+    matched: Complex[np.ndarray, "k l"], wide: Wide, b: int, bearing: float
 ) -> tuple[float, float]:
     """Return start and std of a tone [lags] in the beam to a detection's bearing (`front_edge`)."""
-    stride, margin = max(lags.pulse // STRIDES, 1), _margin(circle.beams, lags.interval)
-    low = max((b - 2 * (lags.pulse + stride)) // stride * stride, 0)
-    beam = np.empty(min(b + stride + 1, len(matched)) - low, dtype=np.complex128)
-    call = _Call(float(circle.tones[p]), lags.pulse, lags.interval, _LINEAR)
-    _beam(_padded(matched, margin)[p], margin + low, bearing, circle.beams, call, beam)
+    pulse, sound = wide.call.pulse, _padded(matched, wide.margin).T
+    low = max(b - 3 * pulse, 0)
+    beam = np.empty(min(b + pulse, matched.shape[1]) - low, dtype=np.complex128)
+    for k in range(beam.size):
+        z, _, noise = _output(sound, float(wide.margin + low + k), bearing, wide.beams, wide.call)
+        beam[k] = z / math.sqrt(noise)
     alone = beam[:, np.newaxis, np.newaxis, np.newaxis]
-    lag, std = front_edge(alone, b - low, 0, 0, lags.pulse, MIN_EDGE_ENERGY_OF_BEAM)
+    lag, std = front_edge(alone, b - low, 0, 0, pulse, MIN_EDGE_ENERGY_OF_BEAM)
     return low + lag, std
 
 
 def find_wide(
-    matched: Complex[np.ndarray, "l k"],
-    wide: Wide,
-    lags: Lags,
-    around: Callable[[], Complex[np.ndarray, "n k"]] | None = None,
+    matched: Complex[np.ndarray, "k l"], wide: Wide, start: float, cut: int = 0
 ) -> tuple[Float[np.ndarray, "6 m"], Bool[np.ndarray, " m"]]:
-    """Return delay, bearing and power of the wideband calls that a group of microphones detects.
+    """Return delay, bearing and power of the calls that a group of microphones detects.
 
-    `around`: returns the outputs also at lags at which a call is only partly in the record, equally
-    many at each end; called if a loud peak is near an end. Returns the numbers of `find_around`, on
-    a face with the angle off its normal in place of the last; and a mask of the calls that are
-    wholly in the record.
+    `start`: delay of the first lag at which whole calls are recorded [s]; `cut`: lags at each end,
+    before it, at which a call is only partly in the record. Returns delay at the vehicle's centre
+    [s], bearing [rad], power, the standard deviations of bearing and delay, and the arctangent of
+    the bearing's slope in the logarithm of the speed of sound, on a face the angle off its normal;
+    and a mask of the calls that are wholly in the record.
     """
-    if not len(matched):
+    if not matched.shape[1]:
         return np.empty((6, 0)), np.empty(0, dtype=bool)
-    loudness, cut = _loudness(matched, wide, lags.interval), 0
-    ends = loudness[: wide.lobes.size], loudness[-wide.lobes.size :]
-    if around is not None and max(end.max() for end in ends) > wide.threshold:
-        cut, matched = -len(matched), around()
-        cut = (len(matched) + cut) // 2
-        loudness = _loudness(matched, wide, lags.interval)
+    sound, call = _padded(matched, wide.margin), wide.call
+    least = math.sqrt(wide.loss * wide.threshold)
+    loudness = _refined(sound, _loudness(sound, wide, least**2), least - wide.slack, wide)
     peaks = _peaks(loudness, wide.threshold, wide.lobes, wide.cut_lobes, cut)
-    turn = np.exp(-2j * np.pi * wide.band.centre * lags.interval * np.arange(len(matched)))
-    margin = TAPS + _margin(wide.beams, lags.interval)
-    slow = _padded((matched * turn[:, np.newaxis])[:, np.newaxis], margin)[0]
-    call = _Call(wide.band.centre, lags.pulse, lags.interval, _SINC)
-    numbers = _rows(slow, margin, peaks, wide, call)
-    delay, bearing = numbers[:2]
-    ahead = wide.middle[0] * np.cos(bearing) + wide.middle[1] * np.sin(bearing)
-    numbers[0] = lags.start + delay + ahead / wide.beams.speed_of_sound
-    numbers[0] -= cut * lags.interval
-    whole = (cut <= peaks) & (peaks < len(matched) - cut)
+    numbers = _rows(sound.T, peaks + wide.margin, wide)
+    numbers[0] += start - (cut + wide.margin) * call.interval
+    whole = (cut <= peaks) & (peaks < matched.shape[1] - cut)
     if math.isnan(wide.normal):
         return numbers, whole
-    numbers[5] = wrap(bearing - wide.normal)
+    numbers[5] = wrap(numbers[1] - wide.normal)
     seen = np.abs(np.sin(numbers[5])) <= wide.sine_limit
     return numbers[:, seen], whole[seen]
 
 
+def _lead(beams: Beams, interval: float) -> float:
+    """Return the largest time lead of a microphone over the beams' centre, in lags."""
+    farthest = float(np.linalg.norm(beams.position, axis=1).max())
+    return farthest / beams.speed_of_sound / interval
+
+
 def _margin(beams: Beams, interval: float) -> int:
     """Return an upper bound, in lags, of any microphone's time lead over the beams' centre."""
-    lag = beams.speed_of_sound * interval
-    return math.ceil(np.linalg.norm(beams.position, axis=1).max() / lag) + 2
+    return math.ceil(_lead(beams, interval)) + 2
 
 
-def _padded(matched: Complex[np.ndarray, "l c k"], margin: int) -> Complex[np.ndarray, "c _ k"]:
-    """Pad the matched-filter outputs of each caller with zeros at both ends."""
-    around = ((0, 0), (margin, margin), (0, 0))
-    return np.pad(matched.transpose(1, 0, 2).astype(np.complex128), around)
+def _padded(matched: Complex[np.ndarray, "k l"], margin: int) -> Complex[np.ndarray, "k n"]:
+    """Surround the matched-filter outputs with silence, in single precision."""
+    sound = np.zeros((len(matched), matched.shape[1] + 2 * margin), dtype=np.complex64)
+    sound[:, margin:-margin] = matched
+    return sound
 
 
 def _sinc() -> Float[np.ndarray, "p t"]:
@@ -361,23 +369,7 @@ def _sinc() -> Float[np.ndarray, "p t"]:
     return np.sinc(away) * window / np.i0(BETA)
 
 
-_SINC, _LINEAR = _sinc(), np.empty((0, 0))
-
-
-@no_alloc
-def _delayed(
-    early: float, at: float, frequency: float, interval: float
-) -> tuple[Whole, float, complex, complex]:
-    """Return how to interpolate a tone between two lags at a microphone ahead by `early` [s].
-
-    The first of two lags and the fraction of the way to the next, and the phases that turn the
-    outputs there to the centre's.
-    """
-    place, turn = at - early / interval, 2.0 * math.pi * frequency
-    k = math.floor(place)
-    now, after = -turn * (early + (k - at) * interval), -turn * (early + (k + 1 - at) * interval)
-    phases = complex(math.cos(now), math.sin(now)), complex(math.cos(after), math.sin(after))
-    return k, place - k, phases[0], phases[1]
+_SINC, _LINEAR = _sinc(), np.array([[1.0, 0.0], [0.0, 1.0]])
 
 
 @no_alloc
@@ -387,29 +379,22 @@ def _output(
     """Return a beam's output at a bearing and a fractional lag, its energy, and noise variance."""
     ahead, left = math.cos(bearing), math.sin(bearing)
     total, energy, noise = 0.0j, 0.0, 0.0
-    parts = call.sinc.shape[0] - 1
+    parts, taps = call.taps.shape[0] - 1, call.taps.shape[1]
     for m in range(beams.weight.size):
         early = (beams.position[m, 0] * ahead + beams.position[m, 1] * left) / beams.speed_of_sound
-        y = 0.0j
-        if parts < 0:
-            k, part, now, after = _delayed(early, at, call.frequency, call.interval)
-            y = (1.0 - part) * now * matched[k, m] + part * after * matched[k + 1, m]
-            total += beams.weight[m] * y
-            square = beams.weight[m] * beams.weight[m]
-            noise += square * (1.0 - 2.0 * part * (1.0 - part) / call.pulse)
-        else:
-            place = at - early / call.interval
-            k = math.floor(place)
-            part = (place - k) * parts
-            row = min(int(part), parts - 1)
-            share = part - row
-            for t in range(call.sinc.shape[1]):
-                weight = (1.0 - share) * call.sinc[row, t] + share * call.sinc[row + 1, t]
-                y += weight * matched[k - call.sinc.shape[1] // 2 + 1 + t, m]
-            turn = -2.0 * math.pi * call.frequency * early
-            total += beams.weight[m] * y * complex(math.cos(turn), math.sin(turn))
-            noise = 1.0
+        place = at - early / call.interval
+        k = math.floor(place)
+        part = (place - k) * parts
+        row = min(int(part), parts - 1)
+        share, y = part - row, 0.0j
+        for t in range(taps):
+            weight = (1.0 - share) * call.taps[row, t] + share * call.taps[row + 1, t]
+            y += weight * matched[k - taps // 2 + 1 + t, m]
+        turn = -2.0 * math.pi * call.frequency * early
+        total += beams.weight[m] * y * complex(math.cos(turn), math.sin(turn))
         energy += y.real * y.real + y.imag * y.imag
+        mean = 2.0 * part * (1.0 - part) / call.pulse if call.tone else 0.0
+        noise += beams.weight[m] * beams.weight[m] * (1.0 - mean)
     return total, energy, noise
 
 
@@ -443,7 +428,7 @@ def _climb(
 
     The lag of a tone stays: the loudest bearing is found at a given time.
     """
-    late = 0.5 if call.sinc.size else 0.0
+    late = 0.0 if call.tone else 0.5
     for _ in range(CLIMBS):
         before = _power(matched, at, bearing - step, beams, call)
         here = _power(matched, at, bearing, beams, call)
@@ -474,8 +459,8 @@ def _lobes(
     """
     count, loudest, n = 0, 0, power.size
     for i in range(n):
-        before = power[i - 1] if i > 0 or beams.around else -1.0
-        after = power[(i + 1) % n] if i + 1 < n or beams.around else -1.0
+        before = power[i - 1] if i > 0 else -1.0
+        after = power[i + 1] if i + 1 < n else -1.0
         if power[i] > before and power[i] >= after and power[i] >= faintest:
             near = i + 1 if i + 1 < n else i - 1
             half = 0.5 * abs(wrap_angle(beams.bearing[near] - beams.bearing[i]))
@@ -494,17 +479,16 @@ def _ambiguity(
     top: float,
     noise: float,
     lobes: Float[np.ndarray, "4 n"],
-    own: Whole,
     near: float,
 ) -> float:
     """Return a bearing's variance from the odds that another lobe of the scan is the true source.
 
-    Of a lobe and its power; lobes of the index `own`, or nearer than `near` [rad], are the same.
+    Of a lobe and its power; lobes nearer than `near` [rad] are the same.
     """
     odds, square = 0.0, 0.0
     for k in range(lobes.shape[1]):
         off = wrap_angle(lobes[1, k] - bearing)
-        if k != own and abs(off) >= near:
+        if abs(off) >= near:
             share = math.exp(min(lobes[2, k] - top, 0.0) / noise)
             odds, square = odds + share, square + share * off * off
     return square / (1.0 + odds)
@@ -513,120 +497,70 @@ def _ambiguity(
 @no_alloc
 def _write_row(
     lobe: tuple[float, float, float],
-    wave: float,
     square: float,
-    late: tuple[float, float],
-    beams: Beams,
+    at: float,
+    wide: Wide,
     row: Float[np.ndarray, "6"],
 ) -> None:
-    """Write bearing, power and standard deviations of a detection, but not its delay.
+    """Write delay, bearing, power and standard deviations of a detection.
 
-    ``lobe``: bearing, power and power over the noise; ``wave``: angular frequency; ``square``: see
-    `_ambiguity`; ``late``: standard deviations of the delay at the beams' centre, by the noise and
-    by the Doppler shift [s].
+    ``lobe``: bearing, power and power over the noise; ``square``: see `_ambiguity`.
     """
-    bearing, top, over = lobe
-    cosine, sine = math.cos(bearing), math.sin(bearing)
-    x = y = xx = xy = 0.0
+    (bearing, top, over), beams, band, call = lobe, wide.beams, wide.band, wide.call
+    cosine, sine, c = math.cos(bearing), math.sin(bearing), beams.speed_of_sound
+    xx = xy = 0.0
     for m in range(beams.weight.size):
         share = beams.weight[m] * beams.weight[m]
         along = beams.position[m, 0] * cosine + beams.position[m, 1] * sine
         across = beams.position[m, 1] * cosine - beams.position[m, 0] * sine
-        x, y = x + share * along, y + share * across
         xy, xx = xy + share * along * across, xx + share * across * across
-    if beams.centred:  # but for rounding
-        x = y = 0.0
-    spread = max(xx - y * y, 1e-12)
-    std = bearing_std(over, wave / beams.speed_of_sound, 12.0 * spread)
+    spread, wave = max(xx, 1e-12), 2.0 * math.pi * band.centre
+    late = call.interval * delay_std(over, call.pulse)
+    if not call.tone:
+        wave, late = math.hypot(wave, band.spread), math.sqrt(0.5 * (1.0 + 1.0 / over) / over)
+        late = math.hypot(late / band.spread, wide.doppler_std)
+    std = bearing_std(over, wave / c, 12.0 * spread)
     std = min(math.hypot(std, math.sqrt(square)), UNKNOWN)
+    row[0] = at * call.interval + (wide.middle[0] * cosine + wide.middle[1] * sine) / c
     row[1], row[2], row[3] = wrap_angle(bearing), top, std
-    aside = abs(y) / beams.speed_of_sound * std  # by the microphones' distance from the centre
-    row[4] = math.hypot(math.hypot(late[0], aside), late[1])
-    row[5] = math.atan((xy - x * y) / spread)
+    aside = (wide.middle[1] * cosine - wide.middle[0] * sine) / c * std
+    row[4] = math.hypot(late, aside)
+    row[5] = math.atan(xy / spread)
 
 
 @kernel
 def _rows(
-    slow: Complex[np.ndarray, "l k"],
-    margin: Whole,
-    peaks: Int[np.ndarray, " m"],
-    wide: Wide,
-    call: _Call,
+    slow: Complex[np.ndarray, "l k"], peaks: Int[np.ndarray, " m"], wide: Wide
 ) -> Float[np.ndarray, "6 m"]:
-    """Return delay, bearing, power and standard deviations of the wideband call at each peak.
+    """Return delay, bearing, power and standard deviations of the call at each peak.
 
     The lag is not yet the peak's, and another of several nearly equal lobes may be the loudest at
-    its own time: the top of each is computed. `slow` has silent margins.
+    its own time: the top of each is computed. No peak is within a margin of the
+    ends.
     """
-    beams, band = wide.beams, wide.band
+    beams, call, margin = wide.beams, wide.call, wide.margin
     numbers, power = np.empty((6, peaks.size)), np.empty(beams.bearing.size)
-    lobes = np.empty((4, power.size))
-    wave = math.hypot(2.0 * math.pi * band.centre, band.spread)
+    lobes, last = np.empty((4, power.size)), len(slow) - margin - 1
     for i in range(peaks.size):
-        at = float(margin + peaks[i])
+        at = float(peaks[i])
         for n in range(power.size):
             power[n] = _power(slow, at, beams.bearing[n], beams, call)
         best, _ = _lobes(slow, at, power, LOBE * power.max(), 0.0, beams, call, lobes)
-        at = min(max(lobes[0, best], float(margin)), float(slow.shape[0] - margin - 1))
+        at = min(max(lobes[0, best], float(margin)), float(last))
         bearing, top, step = lobes[1, best], lobes[2, best], lobes[3, best]
-        _, energy, _ = _output(slow, at, bearing, beams, call)
-        over = over_noise(top, energy, beams.weight.size, beams.loudest_noise)
+        if call.tone:
+            at = _start(slow, peaks[i], bearing, beams, call, (margin, last))
+            _, bearing, top = _climb(slow, at, bearing, step, beams, call)
+        _, energy, least = _output(slow, at, bearing, beams, call)
+        over = over_noise(top, energy / least, beams.weight.size, beams.loudest_noise)
         noise = top / (over + 1.0)
         for n in range(power.size):
             power[n] = _power(slow, at, beams.bearing[n], beams, call)
         faintest = 0.8 * top - RARE * noise
         _, count = _lobes(slow, at, power, faintest, step, beams, call, lobes)
-        square = _ambiguity(bearing, top, noise, lobes[:, :count], -1, 4.0 * step)
-        late = math.sqrt(0.5 * (1.0 + 1.0 / over) / over) / band.spread, wide.doppler_std
-        _write_row((bearing, top, over), wave, square, late, beams, numbers[:, i])
-        numbers[0, i] = (at - margin) * call.interval
+        square = _ambiguity(bearing, top, noise, lobes[:, :count], 4.0 * step)
+        _write_row((bearing, top, over), square, at, wide, numbers[:, i])
     return numbers
-
-
-@kernel
-def _find(
-    matched: Complex[np.ndarray, "c l k"], margin: Whole, circle: Circle, lag: Lags
-) -> tuple[Int[np.ndarray, " m"], Float[np.ndarray, "6 m"]]:
-    """Return caller, delay, bearing and power of detected tones; `matched` is zero-padded."""
-    beams, pulse, tones = circle.beams, lag.pulse, matched.shape[0]
-    stride, count, last = max(pulse // STRIDES, 1), 0, matched.shape[1] - margin - 1
-    loudness = np.empty(((matched.shape[1] - 2 * margin + stride - 1) // stride, tones))
-    calls = [_Call(f, pulse, lag.interval, np.empty((0, 0))) for f in circle.tones]
-    tables = [_table(call, beams) for call in calls]
-    for p in range(tones):
-        _scan(matched[p], margin, stride, tables[p], circle.threshold, loudness[:, p])
-    flat, power = loudness.reshape(-1), np.empty(beams.bearing.size)
-    tests = candidates(flat, circle.threshold, tones)
-    caller, numbers = np.empty(tests.size, dtype=np.int64), np.empty((6, tests.size))
-    lobes, step = np.empty((4, power.size)), 2.0 * math.pi / power.size
-    for test in tests:
-        begin, end = snapshot(
-            flat, test, tones, tones, pulse // stride, False, circle.threshold, circle.leakage
-        )
-        if begin == end:
-            continue
-        p, b = test % tones, margin + begin * stride
-        sound, call, at, best, found = matched[p], calls[p], float(b), 0, 0
-        for _ in range(2):  # again at the refined time
-            _powers(sound, b, tables[p], power)
-            top = power.argmax()
-            _, energy, _ = _output(sound, at, beams.bearing[top], beams, call)
-            over = over_noise(power[top], energy, beams.weight.size, beams.loudest_noise)
-            faintest = 0.9 * power[top] - RARE * power[top] / (over + 1.0)
-            best, found = _lobes(sound, at, power, faintest, step, beams, call, lobes)
-            at = _start(sound, b, lobes[1, best], beams, call, (margin, last))
-            b = min(max(round(at), margin), last)
-        caller[count] = p
-        bearing, loudest = lobes[1, best], lobes[2, best]
-        _, energy, least = _output(sound, at, bearing, beams, call)
-        over = over_noise(loudest, energy / least, beams.weight.size, beams.loudest_noise)
-        square = _ambiguity(bearing, loudest, loudest / (over + 1.0), lobes[:, :found], best, 0.0)
-        late = lag.interval * delay_std(over, pulse), 0.0
-        wave = 2.0 * math.pi * call.frequency
-        _write_row((bearing, loudest, over), wave, square, late, beams, numbers[:, count])
-        numbers[0, count] = lag.start + lag.interval * (at - margin)
-        count += 1
-    return caller[:count], numbers[:, :count]
 
 
 @no_alloc
@@ -664,164 +598,131 @@ def _start(
 
 
 @kernel
-def _beam(
-    matched: Complex[np.ndarray, "l k"],
-    first: Whole,
-    bearing: float,
-    beams: Beams,
-    call: _Call,
-    beam: Complex[np.ndarray, " r"],
-) -> None:
-    """Write a beam's outputs at consecutive lags, in units of noise, in phase with the first."""
-    turn = 2.0 * math.pi * call.frequency * call.interval
-    for k in range(beam.size):
-        z, _, noise = _output(matched, float(first + k), bearing, beams, call)
-        beam[k] = z * complex(math.cos(turn * k), -math.sin(turn * k)) / math.sqrt(noise)
-
-
-class _Table(NamedTuple):
-    """Lag offsets and factors that sum microphone outputs to a tone's beams at whole lags."""
-
-    back: Int[np.ndarray, "n k"]
-    """Offset from the centre's lag to the first of the two that are interpolated."""
-    first: Complex[np.ndarray, "n k"]
-    then: Complex[np.ndarray, "n k"]
-    """`first` and `then`: factors of the outputs at that lag and the next."""
-
-
-@kernel
-def _table(call: _Call, beams: Beams) -> _Table:
-    """Compute each microphone's lag offsets and factors for a tone's beams at whole lags."""
-    shape = beams.bearing.size, beams.weight.size
-    back = np.empty(shape, dtype=np.int64)
-    first, then = np.empty(shape, dtype=np.complex128), np.empty(shape, dtype=np.complex128)
-    for i in range(shape[0]):
-        ahead, left = math.cos(beams.bearing[i]), math.sin(beams.bearing[i])
-        for m in range(shape[1]):
-            early = beams.position[m, 0] * ahead + beams.position[m, 1] * left
-            early /= beams.speed_of_sound
-            k, part, now, after = _delayed(early, 0.0, call.frequency, call.interval)
-            back[i, m] = k
-            first[i, m] = beams.weight[m] * (1.0 - part) * now
-            then[i, m] = beams.weight[m] * part * after
-    return _Table(back, first, then)
+def _modulus(z: complex) -> float:
+    """Return the modulus of a complex number of moderate size."""
+    return math.sqrt(z.real * z.real + z.imag * z.imag)
 
 
 @no_alloc
-def _powers(
-    matched: Complex[np.ndarray, "l k"], b: Whole, table: _Table, power: Float[np.ndarray, " n"]
+def _hear(
+    matched: Complex[np.ndarray, "k l"],
+    b: Whole,
+    late: Int[np.ndarray, " k"],
+    heard: Complex[np.ndarray, " k"],
 ) -> None:
-    """Write the power of every beam at a whole lag."""
-    for i in range(power.size):
-        z = 0.0j
-        for m in range(matched.shape[1]):
-            k = b + table.back[i, m]
-            z += table.first[i, m] * matched[k, m] + table.then[i, m] * matched[k + 1, m]
-        power[i] = z.real * z.real + z.imag * z.imag
+    """Write each microphone's output at a lag and its delay in half lags."""
+    for m in range(late.size):
+        k = b + (late[m] >> 1)
+        heard[m] = matched[m, k]
+        if late[m] & 1:
+            heard[m] = np.float32(0.5) * (heard[m] + matched[m, k + 1])
+
+
+@no_alloc
+def _beam_power(phases: Complex[np.ndarray, " k"], heard: Complex[np.ndarray, " k"]) -> float:
+    """Return the power of a beam's sum."""
+    real, imaginary = np.float32(0.0), np.float32(0.0)
+    for m in range(heard.size):
+        real += phases[m].real * heard[m].real - phases[m].imag * heard[m].imag
+        imaginary += phases[m].real * heard[m].imag + phases[m].imag * heard[m].real
+    return float(real * real + imaginary * imaginary)
 
 
 @kernel
-def _scan(
-    matched: Complex[np.ndarray, "l k"],
-    margin: Whole,
-    stride: Whole,
-    table: _Table,
-    threshold: float,
-    loudness: Float[np.ndarray, " s"],
-) -> None:
-    """Write the largest beam power of a tone at every `stride`-th lag; 0 if energy is too low."""
-    square, power = _largest_near(matched, margin), np.empty(len(table.back))
-    for s in range(len(loudness)):
-        b, energy = margin + s * stride, 0.0
-        for m in range(square.shape[1]):
-            energy += square[b, m]
-        loudness[s] = 0.0
-        if energy >= threshold:
-            _powers(matched, b, table, power)
-            loudness[s] = power.max()
-
-
-@kernel
-def _largest_near(matched: Complex[np.ndarray, "l k"], margin: Whole) -> Float[np.ndarray, "l k"]:
-    """Return the largest squared output of each microphone within a margin of each lag."""
-    lags, microphones = matched.shape
-    square = np.zeros((lags, microphones))
-    for m in range(microphones):
-        for b in range(lags):
-            level = (
-                matched[b, m].real * matched[b, m].real + matched[b, m].imag * matched[b, m].imag
-            )
-            for near in range(max(b - margin, 0), min(b + margin + 1, lags)):
-                square[near, m] = max(square[near, m], level)
-    return square
-
-
 def _loudness(
-    matched: Complex[np.ndarray, "l k"], wide: Wide, interval: float
+    matched: Complex[np.ndarray, "k l"], wide: Wide, threshold: float
 ) -> Float[np.ndarray, " l"]:
-    """Return the power of the loudest beam at each lag of a wideband call's outputs."""
-    from scipy.fft import fft, ifft, next_fast_len
+    """Return the power of the loudest beam at lags where moduli reach the threshold; else 0.
 
-    lags, beams = len(matched), wide.beams
-    count = next_fast_len(lags + 2 * _margin(beams, interval))
-    spectrum = np.ascontiguousarray(fft(matched, count, axis=0).T, dtype=np.complex128)
-    length = count * interval
-    first, last = math.ceil(wide.band.low * length), math.floor(wide.band.high * length)
-    toward = np.stack((np.cos(beams.bearing), np.sin(beams.bearing)))
-    early = (beams.position @ toward).T / beams.speed_of_sound
-    loudness = np.zeros(lags)
-    for start in range(0, len(early), BEAMS_AT_ONCE):
-        some = early[start : start + BEAMS_AT_ONCE]
-        spectra = np.zeros((len(some), count), dtype=np.complex64)
-        _steer(spectrum, some, beams.weight, first, last, 1.0 / length, spectra)
-        sound = ifft(spectra, axis=1, overwrite_x=True)[:, :lags]
-        np.maximum(loudness, np.max(sound.real**2 + sound.imag**2, axis=0), out=loudness)
+    `matched` has silent margins. Delays are rounded to half lags.
+    """
+    (microphones, lags), margin, least = matched.shape, wide.margin, math.sqrt(threshold)
+    moduli = np.empty((microphones, 2, lags), dtype=np.float32)
+    for m in range(microphones):
+        sound, weight = matched[m], np.float32(wide.beams.weight[m])
+        whole, half = moduli[m]
+        for b in range(lags):
+            whole[b] = weight * _modulus(sound[b])
+        for b in range(lags - 1):
+            half[b] = np.float32(0.5) * weight * _modulus(sound[b] + sound[b + 1])
+    total, heard = np.empty(lags, dtype=np.float32), np.empty(microphones, dtype=np.complex64)
+    test, size = np.empty(lags + 1, dtype=np.int64), lags - 2 * margin
+    loudness = np.zeros(size)
+    for s in range(len(wide.late)):
+        total[:] = 0.0
+        for m in range(microphones):
+            late = wide.late[s, m]
+            row = moduli[m, late & 1, margin + (late >> 1) :]
+            for b in range(size):
+                total[b] += row[b]
+        faintest, count = np.float32(least * wide.noise_std[s]), 0
+        for b in range(size):
+            test[count] = margin + b
+            count += total[b] >= faintest
+        for b in test[:count]:
+            _hear(matched, b, wide.late[s], heard)
+            for n in range(wide.begin[s], wide.begin[s + 1]):
+                power = _beam_power(wide.phases[n], heard) / wide.noise_std[s] ** 2
+                loudness[b - margin] = max(loudness[b - margin], power)
     return loudness
 
 
 @kernel
-def _steer(
-    spectrum: Complex[np.ndarray, "k n"],
-    early: Float[np.ndarray, "b k"],
-    weight: Float[np.ndarray, " k"],
-    first: Whole,
-    last: Whole,
-    step: float,
-    beams: Complex[np.ndarray, "b n"],
-) -> None:
-    """Write spectra of delay-and-sum beams from the microphones' spectra, in a frequency band."""
-    count = spectrum.shape[1]
-    total = np.empty(last - first + 1, dtype=np.complex128)
-    for b in range(early.shape[0]):
-        total[:] = 0.0
-        for m in range(weight.size):
-            turn = -2.0 * math.pi * early[b, m] * step
-            phase = weight[m] * complex(math.cos(turn * first), math.sin(turn * first))
-            turned = complex(math.cos(turn), math.sin(turn))
-            for i in range(total.size):
-                total[i] += phase * spectrum[m, (first + i) % count]
-                phase *= turned
-        for i in range(total.size):
-            beams[b, (first + i) % count] = total[i]
+def _refined(
+    matched: Complex[np.ndarray, "k l"],
+    rough: Float[np.ndarray, " l"],
+    faintest: float,
+    wide: Wide,
+) -> Float[np.ndarray, " l"]:
+    """Return the loudness by exact delays at possible peaks and their neighbours; 0 between.
+
+    A rough amplitude below `faintest` cannot become loud enough.
+    """
+    loudness = np.zeros(rough.size)
+    heard, power = np.empty(len(matched), dtype=np.complex64), np.empty(len(wide.phases))
+    for b in np.flatnonzero(rough >= faintest**2):
+        beside = wide.loss * rough[max(b - 1, 0) : b + 2].max()
+        if math.sqrt(rough[b]) < math.sqrt(beside) - 2.0 * wide.slack:
+            continue
+        for near in range(max(b - 1, 0), min(b + 2, rough.size)):
+            if loudness[near] > 0.0:
+                continue
+            for s in range(len(wide.late)):
+                _hear(matched, near + wide.margin, wide.late[s], heard)
+                for n in range(wide.begin[s], wide.begin[s + 1]):
+                    power[n] = _beam_power(wide.phases[n], heard) / wide.noise_std[s] ** 2
+            least = max(math.sqrt(power.max()) - 2.0 * wide.slack, faintest)
+            for n in range(power.size):
+                if math.sqrt(power[n]) >= least:
+                    at, bearing = float(near + wide.margin), wide.beams.bearing[n]
+                    exact = _power(matched.T, at, bearing, wide.beams, wide.call)
+                    loudness[near] = max(loudness[near], exact)
+    return loudness
 
 
 def _lobes_of(call: Call, wide: Wide, step: int, rate: float) -> Float[np.ndarray, " l"]:
     """Return a call's highest side lobes by lag from its peak, relative to the peak's power."""
     interval, sent, beams = step / rate, replica(call, rate), wide.beams
     reach = math.ceil(sent.size / step) + 2 * _margin(beams, interval)
-    count, most, length = 4 * reach, np.zeros(reach), 4 * reach * interval
-    bins = np.arange(math.ceil(wide.band.low * length), math.floor(wide.band.high * length) + 1)
-    own, place = np.fft.fft(sent, step * count)[bins], (bins / length)[:, np.newaxis]
+    count, most = window_lags(4 * reach), np.zeros(reach)
+    length, (middle, low, high) = count * interval, bins_of(wide.band, count, interval)
+    bins = middle + np.arange(low, high + 1)
+    own, place = np.fft.fft(sent, step * count)[bins].conj(), bins / length
+    early, share = _leads(beams, beams.bearing), beams.weight**2
     facing = wide.normal if not math.isnan(wide.normal) else 0.0
-    for scale in (1.0 - SHIFT, 1.0, 1.0 + SHIFT):
-        power = np.fft.fft(replica(call, rate, scale), step * count)[bins] * own.conj()
-        for angle in _ANGLES:
-            toward = np.array([math.cos(facing + angle), math.sin(facing + angle)])
-            early = beams.position @ toward / beams.speed_of_sound
-            delayed = np.exp(2j * np.pi * place * (early - 0.5 * length)) * beams.weight
-            heard = np.zeros((count, beams.weight.size), dtype=complex)
-            heard[bins % count] = power[:, np.newaxis] * delayed
-            loudness = _loudness(np.fft.ifft(heard, axis=0), wide, interval)
+    spectra = np.zeros((len(early), count), dtype=np.complex64)
+    for angle in _ANGLES:
+        off = _leads(beams, np.array([facing + angle])) - early
+        first, turn = np.exp(2j * np.pi * off * place[0]), np.exp(2j * np.pi * off / length)
+        answer = [
+            (share * at) @ np.vander(to, bins.size, increasing=True)
+            for at, to in zip(first, turn, strict=True)
+        ]
+        for scale in (1.0 - SHIFT, 1.0, 1.0 + SHIFT):
+            power = np.fft.fft(replica(call, rate, scale), step * count)[bins] * own
+            power *= np.exp(-1j * np.pi * place * length)
+            spectra[:, bins - middle] = power * answer
+            loudness = np.max(np.abs(np.fft.ifft(spectra, axis=1)) ** 2, axis=0)
             peak = int(loudness.argmax())
             around = np.maximum(loudness[peak : peak + reach], loudness[peak : peak - reach : -1])
             most = np.maximum(most, around / loudness[peak])
@@ -882,7 +783,7 @@ def _peaks(
         b, left = peaks[i], 0.0
         for k in range(kept):
             away = abs(found[k] - b)
-            away = min(away, loudness.size - away)
+            away = min(away, loudness.size - away) if cut > 0 else away
             missing = max(cut - found[k], found[k] - (loudness.size - cut - 1))
             table = lobes
             if missing > 0:

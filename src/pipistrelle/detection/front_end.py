@@ -14,25 +14,21 @@ landmark's or, without labels, the number of the echo: detections of one call, t
 """
 
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
-from functools import cache
-from itertools import product
+from itertools import chain, product
 from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Complex, Float, Int
 
-from pipistrelle.acoustics.call import Call, ToneBurst, cross_talk
+from pipistrelle.acoustics.call import Call, ToneBurst, blocks_of, cross_talk, lag_step, on_raster
 from pipistrelle.arrays.layout import Layout, Scattered, along_line
 from pipistrelle.config import Config, InputError
 from pipistrelle.detection.beams import (
     MARGIN,
-    Circle,
     Wide,
-    circle_of,
     edge_around,
-    find_around,
     find_wide,
     wide_of,
 )
@@ -325,8 +321,8 @@ class Finder(NamedTuple):
     faces: slice
     members: Int[np.ndarray, " k"] | slice
     """`faces` and `members`: rows and indices of its microphones in a recording."""
-    detector: Detector | Circle | Wide
-    """Detector of tones on faces, of tones at omnidirectional microphones, or of another call."""
+    detector: Detector | Wide
+    """Detector of tones on faces, or of a call at any microphones."""
     lead: Float[np.ndarray, "2"]
     """Phase centre of a line, over the speed of sound [s]; 0 for other groups."""
 
@@ -344,8 +340,6 @@ class Finders:
     """Share of a call's power (column) in the filter of another (row), unless all are tones."""
     least_snr: float
     """Least signal-to-noise ratio of an output of gain 0 dB for a detection, as a power ratio."""
-    from_start: bool
-    """Whether outputs keep the phase of the record's start, not of a call at their lag."""
 
     def of(self, caller: int, group: int) -> Finder:
         """Return the detector of a caller's calls at a group of microphones.
@@ -380,31 +374,42 @@ def front_end(
     >>> round(found.threshold, 1), found.beams.bearing.size
     (18.8, 143)
     """
-    wide = [p for p, call in enumerate(calls) if not isinstance(call, ToneBurst)]
+    rate, pulse = config.receiver.sample_rate, config.emitter.pulse
+    sent = calls or tuple(ToneBurst(tone, pulse) for tone in tones)
+    wide = [p for p, call in enumerate(sent) if not isinstance(call, ToneBurst)]
     narrow = np.unique(np.append(0, np.setdiff1d(np.arange(tones.size), wide)))
-    lines = _leaking(config, [call for call in calls if isinstance(call, ToneBurst)])
+    tonal = [call for call in sent if isinstance(call, ToneBurst)]
+    lines = config if on_raster(rate, pulse, tones) else _leaking(config, tonal)
     if isinstance(layout, Layout) and not wide:
         return detector(lines, layout, tones)
-    found = list(_tone_finders(lines, layout, tones[narrow], narrow, where))
-    snrs, finders = [snr for snr, _ in found], [finder for _, finder in found]
-    talk, silent = np.zeros((tones.size, tones.size)), 0 in wide
-    if wide:
-        talk, snrs = cross_talk(calls, config.receiver.sample_rate), []
-        np.fill_diagonal(talk, 0.0)
-        finders = finders if len(narrow) > silent else []
-    for caller, g in product(wide, range(layout.normal.size)):
+    step = lag_step(sent, rate) if wide else blocks_of(rate, pulse, tones)[0]
+    talk, silent = cross_talk(sent, rate) if wide else np.zeros((tones.size, tones.size)), 0 in wide
+    found, around = [], []
+    if len(narrow) > silent:
+        found = list(_tone_finders(lines, layout, tones[narrow], narrow))
+    if isinstance(layout, Scattered):
+        around = np.flatnonzero(np.isnan(layout.normal)).tolist()
+    heard = np.setdiff1d(narrow, wide)
+    if around and heard.size:
+        leak = 10.0 ** (lines.detection.leakage_db / 10.0) / MARGIN
+        talk[np.ix_(heard, heard)] = np.maximum(talk[np.ix_(heard, heard)], leak)
+        _refuse_lines_own(config, where)
+    np.fill_diagonal(talk, 0.0)
+    each = product(heard.tolist(), around), product(wide, range(layout.normal.size))
+    for caller, g in chain(*each):
         row, members = layout.members(g)
-        one = wide_of(config, layout, g, calls, caller)
-        faces, alone = slice(row, row + 1), np.array([caller])
-        finders.append(Finder(alone, g, faces, members, one, np.zeros(2)))
-        snrs.append((one.threshold - 1.0) / one.beams.weight.size)
+        if caller in heard:
+            wave = config.assumed_sound_speed / tones[narrow].max()
+            _refuse_far_apart(layout.places(g)[0], wave, where)
+        one, gain = wide_of(config, layout, g, sent[caller], step), layout.places(g)[1]
+        alone = Finder(np.array([caller]), g, slice(row, row + 1), members, one, np.zeros(2))
+        found.append(((one.threshold - 1.0) / np.sum(gain**2), alone))
     return Finders(
-        finders=tuple(finders),
+        finders=tuple(finder for _, finder in found),
         narrow=narrow,
         silent=silent,
         talk=talk,
-        least_snr=float(min(snrs)),
-        from_start=bool(calls),
+        least_snr=float(np.nanmin([snr for snr, _ in found])),
     )
 
 
@@ -413,26 +418,17 @@ def _tone_finders(
     layout: Layout | Scattered,
     tones: Float[np.ndarray, " n"],
     callers: Int[np.ndarray, " n"],
-    where: str,
 ) -> Iterator[tuple[float, Finder]]:
-    """Yield each microphone group's least detectable signal-to-noise ratio and tone detector."""
+    """Yield the least detectable signal-to-noise ratio and the tone detector of lines on faces."""
     if isinstance(layout, Layout):
         of_all = detector(config, layout, tones)
         yield math.nan, Finder(callers, 0, slice(None), slice(None), of_all, np.zeros(2))
         return
-    for g, normal in enumerate(layout.normal):
-        if math.isnan(normal):
-            members, lead = layout.members(g)[1], np.zeros(2)
-            position, gain = layout.places(g)
-            _refuse_lines_own(config, where)
-            _refuse_far_apart(position, config.assumed_sound_speed / tones.max(), where)
-            one = circle_of(config, layout, g, tones)
-            snr = (one.threshold - 1.0) / np.sum(gain**2)
-        else:
-            members, line = along_line(layout, g)
-            one = detector(config, line, tones)
-            lead = layout.position[members].mean(axis=0) / config.assumed_sound_speed
-            snr = (one.threshold - members.size) / np.sum(layout.amplitude[members] ** 2)
+    for g in np.flatnonzero(~np.isnan(layout.normal)).tolist():
+        members, line = along_line(layout, g)
+        one = detector(config, line, tones)
+        lead = layout.position[members].mean(axis=0) / config.assumed_sound_speed
+        snr = (one.threshold - members.size) / np.sum(layout.amplitude[members] ** 2)
         yield snr, Finder(callers, g, slice(1), members, one, lead)
 
 
@@ -443,21 +439,19 @@ def find_calls(
     start: float,
     interval: float,
     pulse: int,
-    around: Callable[[], Complex[np.ndarray, "l f c e"]] | None = None,
+    cut: int = 0,
 ) -> Detections:
     """Return the detections and direct calls of all calls that exceed the noise (see `detect`).
 
-    `around`: returns the outputs also at lags at which a call is only partly in the record, equally
-    many at each end (`BandFilters.around`); without it, such calls are not considered, and with it
-    they merely mask fainter ones.
+    `cut`: lags at each end, before `start` and after the last whole call, at which a call is only
+    partly in the record (`BandFilters.cut`); such calls merely mask fainter ones.
     """
     lags = Lags(start, interval, pulse)
     if isinstance(end, Detector):
-        return detect(matched, end, **lags._asdict())
-    around = around and cache(around)
-    parts, whole = zip(
-        *(_found(matched, end, one, lags, around) for one in end.finders), strict=True
-    )
+        whole = np.ascontiguousarray(matched[cut : len(matched) - cut])
+        return detect(whole, end, **lags._asdict())
+    parts, whole = zip(*(_found(matched, end, one, lags, cut) for one in end.finders), strict=True)
+    matched = matched[cut : len(matched) - cut]
     found = joined(parts)
     found = detections_at(found, np.concatenate(whole) & ~_cross_talk_in(found, end, lags))
     return replace(found, direct=_direct_of(matched, end, found, lags))
@@ -501,19 +495,12 @@ def _leaking(config: Config, tones: Sequence[Call]) -> Config:
 
 
 def _outputs(
-    matched: Complex[np.ndarray, "l f c e"], end: Finders, finder: Finder, lags: Lags
+    matched: Complex[np.ndarray, "l f c e"], end: Finders, finder: Finder
 ) -> Complex[np.ndarray, "l g n k"]:
     """Select the matched-filter outputs that a detector uses, with the phases that it expects."""
     outputs = np.ascontiguousarray(matched[:, finder.faces, finder.callers][..., finder.members])
-    if isinstance(finder.detector, Wide):
-        return outputs
     if end.silent:
         outputs[:, :, 0] = 0.0
-    if end.from_start and isinstance(finder.detector, Circle):
-        turns = finder.detector.tones * lags.interval
-        if np.abs(turns - np.rint(turns)).max() > 1e-6:
-            phase = np.exp(2j * np.pi * np.outer(np.arange(len(outputs)), turns))
-            outputs = outputs * phase[:, np.newaxis, :, np.newaxis]
     return outputs
 
 
@@ -528,38 +515,39 @@ def _found(
     end: Finders,
     finder: Finder,
     lags: Lags,
-    around: Callable[[], Complex[np.ndarray, "l f c e"]] | None,
+    cut: int,
 ) -> tuple[Detections, Bool[np.ndarray, " m"]]:
     """Detect calls at a group of microphones; also return a mask of calls recorded in full."""
-    outputs = _outputs(matched, end, finder, lags)
-    if isinstance(finder.detector, Detector):
-        found = detect(outputs, finder.detector, **lags._asdict())
-        found = replace(
-            found,
-            face=finder.group + found.face,
-            caller=finder.callers[found.caller],
-            delay=found.delay + _ahead(finder, found.bearing),
-            direct=None,
-        )
-        return found, np.ones(found.caller.size, dtype=bool)
-    if isinstance(finder.detector, Circle):
-        caller, numbers = find_around(outputs[:, 0], finder.detector, lags)
-        whole = np.ones(caller.size, dtype=bool)
-    else:
-        more = around and (lambda: _outputs(around(), end, finder, lags)[:, 0, 0])
-        numbers, whole = find_wide(outputs[:, 0, 0], finder.detector, lags, more)
-        caller = np.zeros(whole.size, dtype=np.int64)
-    delay, bearing, power, bearing_std, delay_std, angle = numbers
-    return Detections(
-        face=np.full(caller.size, finder.group),
-        caller=finder.callers[caller],
-        angle=angle,
-        bearing=bearing,
-        delay=delay,
-        power=power,
-        bearing_std=bearing_std,
-        delay_std=delay_std,
-    ), whole
+    if isinstance(finder.detector, Wide):
+        around = 0 if finder.detector.call.tone else cut
+        outputs = _of_call(matched[cut - around : len(matched) - cut + around], finder)
+        numbers, whole = find_wide(outputs, finder.detector, lags.start, around)
+        delay, bearing, power, bearing_std, delay_std, angle = numbers
+        return Detections(
+            face=np.full(whole.size, finder.group),
+            caller=np.full(whole.size, finder.callers[0]),
+            angle=angle,
+            bearing=bearing,
+            delay=delay,
+            power=power,
+            bearing_std=bearing_std,
+            delay_std=delay_std,
+        ), whole
+    outputs = _outputs(matched[cut : len(matched) - cut], end, finder)
+    found = detect(outputs, finder.detector, **lags._asdict())
+    found = replace(
+        found,
+        face=finder.group + found.face,
+        caller=finder.callers[found.caller],
+        delay=found.delay + _ahead(finder, found.bearing),
+        direct=None,
+    )
+    return found, np.ones(found.caller.size, dtype=bool)
+
+
+def _of_call(matched: Complex[np.ndarray, "l f c e"], finder: Finder) -> Complex[np.ndarray, "k l"]:
+    """Select the matched-filter outputs of a detector's only call."""
+    return matched[:, finder.faces, finder.callers[0]].transpose(1, 2, 0)[0][finder.members]
 
 
 def _cross_talk_in(found: Detections, end: Finders, lags: Lags) -> Bool[np.ndarray, " m"]:
@@ -583,13 +571,15 @@ def _direct_of(
 
     def edge(d: int, p: int, b: int) -> tuple[float, float]:
         finder = finders[d]
-        if isinstance(finder.detector, Wide) or b >= len(matched):
+        if b >= len(matched):
             return math.nan, math.nan
+        if isinstance(finder.detector, Wide):
+            if not finder.detector.call.tone:
+                return math.nan, math.nan
+            outputs = _of_call(matched, finder)
+            return edge_around(outputs, finder.detector, b, float(found.bearing[d]))
         number = int(np.searchsorted(finder.callers, p))
-        outputs, face = _outputs(matched, end, finder, lags), int(found.face[d]) - finder.group
-        if isinstance(finder.detector, Circle):
-            bearing = float(found.bearing[d])
-            return edge_around(outputs[:, 0], finder.detector, lags, b, number, bearing)
+        outputs, face = _outputs(matched, end, finder), int(found.face[d]) - finder.group
         return front_edge(outputs, b, face, number, lags.pulse, MIN_EDGE_ENERGY)
 
     bearings = found.bearing.tolist()

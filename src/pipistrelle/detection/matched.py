@@ -7,11 +7,21 @@ fraction of a lag.
 import math
 from collections.abc import Sequence
 from functools import lru_cache
+from itertools import pairwise
 
 import numpy as np
-from jaxtyping import Complex, Float, Int
+from jaxtyping import Complex, Float
 
-from pipistrelle.acoustics.call import Call, ToneBurst, band_of, lag_step, replica
+from pipistrelle.acoustics.call import (
+    Call,
+    ToneBurst,
+    bands_of,
+    bins_of,
+    carrier_of,
+    lag_step,
+    replica,
+    window_lags,
+)
 from pipistrelle.jit import Whole, kernel, no_alloc
 
 
@@ -156,124 +166,106 @@ def filter_blocks(
     return matched
 
 
-def filter_samples(
-    samples: Complex[np.ndarray, "t f e"],
-    *,
-    calls: Sequence[Call],
-    rate: float,
-    noise_std: float,
-) -> Complex[np.ndarray, "l f c e"]:
-    """Apply the matched filter of each call to samples, by fast convolution.
-
-    `samples` may be real, as in a recording; `calls` are equally long; `rate` [Hz]; `noise_std`: of
-    one complex sample. Lag i is a call that starts with sample i; noise has unit variance. The
-    precision is that of the samples.
-    """
-    from scipy.signal import oaconvolve
-
-    time = np.arange(round(calls[0].duration * rate)) / rate
-    sent = np.stack([call.waveform(time, call.frequency) for call in calls], axis=1)
-    replica = sent[::-1].conj() / (noise_std * np.linalg.norm(sent, axis=0))
-    return oaconvolve(
-        samples[:, :, None, :],
-        replica.astype(np.result_type(samples, np.complex64))[:, None, :, None],
-        mode="valid",
-        axes=0,
-    )
-
-
 class BandFilters:
-    """Matched filters of real samples for several calls: tones by sums, other calls in their band.
+    """Matched filters for several calls, each in its band, of samples or of spectra.
 
-    Sample rate `rate` [Hz]; lags are `step` samples long, and the longest call has `length`
-    samples. The output of a tone keeps the phase of the recording's start, like block sums.
+    Sample rate `rate` [Hz]; lags are `step` samples long, and a call `cut` lags at most. The output
+    of a call turns with its carrier, of a tone with the tone, from lag to lag.
     """
 
     def __init__(self, calls: Sequence[Call], rate: float) -> None:
         self.calls, self.rate, self.step = calls, rate, lag_step(calls, rate)
+        self.interval, self._bands = self.step / rate, bands_of(calls, rate)
         self.pulse = round(calls[0].duration * rate / self.step)
         """Lags in a call."""
         longest = max(replica(call, rate).size for call in calls)
         self.length = max(longest, self.pulse * self.step)
-        self._replicas = lru_cache(maxsize=2)(self._in_bands)
+        self.cut = -(-self.length // self.step)
+        """Lags at each end at which a call is only partly in the record."""
+        self._weights = lru_cache(maxsize=None)(self._weights_of)
 
     def __call__(
         self, samples: Float[np.ndarray, "t f e"], noise_std: float = 1.0
     ) -> Complex[np.ndarray, "l f c e"]:
-        """Correlate samples with each call; output i is of a call that starts at sample i * `step`.
+        """Correlate real samples with each call, as if silence surrounded them.
 
-        `noise_std`: of one complex sample, so that real ones have half of it. Noise has unit
-        variance. If there are fewer samples than a call, the output is empty.
+        Output `cut` + i is of a call that starts at sample i * `step`. `noise_std`: of one complex
+        sample, so that real ones have half of it. Noise has unit variance. If there are fewer
+        samples than a call, the output is empty.
         """
-        from scipy.fft import next_fast_len, rfft
+        from scipy.fft import rfft
 
-        lags = max((len(samples) - self.length) // self.step + 1, 0)
-        whole = np.result_type(samples, np.complex64)
-        outputs = np.empty((lags, len(samples[0]), len(self.calls), samples.shape[2]), whole)
-        if not lags:
-            return outputs
-        count, heard = self.step * next_fast_len(-(-len(samples) // self.step)), None
-        replicas = self._replicas(count)
-        for c, call in enumerate(self.calls):
-            if isinstance(call, ToneBurst):
-                outputs[:, :, c] = self._summed(samples, call.frequency)[:lags] / noise_std
-            else:
-                heard = rfft(samples, count, axis=0) if heard is None else heard
-                filtered = self._filtered(heard, count, *replicas[c])
-                outputs[:, :, c] = filtered[:lags] / whole.type(noise_std)
-        return outputs
+        whole, shape = (len(samples) - self.length) // self.step + 1, samples.shape[1:]
+        if whole < 1:
+            return np.empty((0, shape[0], len(self.calls), shape[1]), dtype=np.complex64)
+        more, lags = self.cut * self.step, window_lags(whole + 3 * self.cut)
+        silent = np.zeros((math.prod(shape), lags * self.step), np.result_type(samples, np.float32))
+        silent[:, more : more + len(samples)] = samples.reshape(len(samples), -1).T
+        heard, factor = rfft(silent, axis=1), 2.0 / self.rate
+        bins = (bins_of(band, lags, self.interval) for band in self._bands)
+        spectra = [(heard, middle, factor) for middle, *_ in bins]
+        outputs = self._filtered(spectra, lags, noise_std)[..., : whole + 2 * self.cut]
+        return outputs.reshape(len(self.calls), *shape, -1).transpose(3, 1, 0, 2)
 
-    def around(
-        self, samples: Float[np.ndarray, "t f e"], noise_std: float = 1.0
-    ) -> Complex[np.ndarray, "l f c e"]:
-        """Return matched-filter outputs also at lags where a call overlaps the samples only partly.
+    def outputs(
+        self,
+        envelopes: Sequence[Complex[np.ndarray, "m s"]],
+        lags: int,
+        noise_std: float,
+        noise: Sequence[Complex[np.ndarray, "m b"]] = (),
+    ) -> Complex[np.ndarray, "c m l"]:
+        """Return the outputs for the envelopes in each band, and for noise by band and bin.
 
-        These lags precede and follow the others, as many at each end as a call is long, as if
-        silence surrounded the samples.
+        `lags`: in the window of the envelopes.
         """
-        more = self.step * -(-self.length // self.step)
-        silence = np.zeros((more, *samples.shape[1:]), samples.dtype)
-        return self(np.concatenate((silence, samples, silence)), noise_std)
+        from scipy.fft import fft
 
-    def _summed(
-        self, samples: Float[np.ndarray, "t f e"], tone: float
-    ) -> Complex[np.ndarray, "l f e"]:
-        """Return the matched-filter outputs of samples for a tone [Hz], at unit noise."""
-        blocks = len(samples) // self.step
-        some = samples[: blocks * self.step].reshape(blocks, self.step, -1)
-        wave = 2.0 * np.exp(-2j * np.pi * tone / self.rate * np.arange(self.step))
-        turn = np.exp(-2j * np.pi * tone * self.step / self.rate * np.arange(blocks))
-        sums = np.einsum("bnm,n->bm", some, wave.astype(np.complex64), optimize=True)
-        summed = (sums * turn[:, np.newaxis]).reshape(blocks, 1, 1, -1)
-        each = {"pulse": self.pulse, "block": self.step, "noise_std": 1.0}
-        return filter_blocks(summed, **each).reshape(-1, *samples.shape[1:])
+        length = lags * self.interval
+        spectra = [(fft(one, axis=1), 0, length / one.shape[1]) for one in envelopes]
+        return self._filtered(spectra, lags, noise_std, noise)
 
     def _filtered(
         self,
-        heard: Complex[np.ndarray, "k f e"],
-        count: int,
-        bins: Int[np.ndarray, " b"],
-        sent: Complex[np.ndarray, " b"],
-    ) -> Complex[np.ndarray, "l f e"]:
-        """Return the matched-filter outputs of a call in its band, from the samples' spectrum."""
+        spectra: Sequence[tuple[Complex[np.ndarray, "m s"], int, float]],
+        lags: int,
+        noise_std: float,
+        noise: Sequence[Complex[np.ndarray, "m b"]] = (),
+    ) -> Complex[np.ndarray, "c m l"]:
+        """Return the outputs for spectra of each call, with the bin of its carrier and a factor."""
         from scipy.fft import ifft
 
-        fewer = np.zeros((count // self.step, *heard.shape[1:]), heard.dtype)
-        fewer[bins % len(fewer)] = heard[bins] * sent.astype(heard.dtype)[:, None, None]
-        return ifft(fewer, axis=0, overwrite_x=True)
+        shape = len(spectra), len(spectra[0][0]), lags
+        filtered = np.zeros(shape, np.result_type(*(heard.dtype for heard, *_ in spectra)))
+        for c, (heard, middle, factor) in enumerate(spectra):
+            low, weights = self._weights(c, lags)
+            weights = (weights / noise_std).astype(filtered.dtype)
+            ends = np.clip([0, -low - lags, -low, lags - low, weights.size], 0, weights.size)
+            for first, stop in pairwise(np.unique(ends).tolist()):  # a tone's band folds
+                source, target = (middle + low + first) % heard.shape[1], (low + first) % lags
+                part = heard[:, source : source + stop - first] * factor
+                if noise:
+                    part += noise[c][:, first:stop]
+                part *= weights[first:stop]
+                filtered[c, :, target : target + stop - first] += part
+        outputs = ifft(filtered, axis=2, norm="forward", overwrite_x=True)
+        for c, call in enumerate(self.calls):
+            if isinstance(call, ToneBurst):
+                off = call.frequency - carrier_of(self._bands[c], self.interval)
+                turns = off * self.interval * np.arange(lags)
+                outputs[c] *= np.exp(-2j * np.pi * turns).astype(outputs.dtype)
+        return outputs
 
-    def _in_bands(
-        self, count: int
-    ) -> list[tuple[Int[np.ndarray, " b"], Complex[np.ndarray, " b"]]]:
-        """Return each call's frequency bins in a transform of `count` samples, and its weights."""
-        found = []
-        for call in self.calls:
-            band, length = band_of(call, self.rate), count / self.rate
-            bins = np.arange(math.ceil(band.low * length), math.floor(band.high * length) + 1)
-            own = np.fft.fft(replica(call, self.rate), count)[bins].conj()
-            own *= 2.0 / self.step / math.sqrt(np.sum(np.abs(own) ** 2) / count)
-            found.append((bins, own))
-        return found
+    def _weights_of(self, c: int, lags: int) -> tuple[int, Complex[np.ndarray, " b"]]:
+        """Return a call's lowest bin, from its carrier, and the filter's factor in each bin."""
+        call, count = self.calls[c], lags * self.step
+        middle, low, high = bins_of(self._bands[c], lags, self.interval)
+        bins = np.arange(middle + low, middle + high + 1)
+        sent = np.fft.fft(replica(call, self.rate), count)[bins].conj()
+        if isinstance(call, ToneBurst):
+            away = np.abs(bins / count * self.rate - call.frequency) * self.interval
+            sent *= np.cos(0.5 * np.pi * np.clip(2.0 * away - 1.0, 0.0, 1.0)) ** 2
+        energy = np.sum(sent.real**2 + sent.imag**2)
+        return low, sent * self.rate / math.sqrt(energy * count)
 
 
 @kernel

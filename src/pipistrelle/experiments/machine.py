@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from pipistrelle.acoustics.call import lag_step
 from pipistrelle.arrays.layout import Layout, Scattered
 from pipistrelle.arrays.sampling import Sampling
 from pipistrelle.config import Config, InputError, ScenarioConfig
@@ -93,10 +94,9 @@ def check_recording(
         "emitter.pulse": settled.pulse * settled.interval,
     }
     numbers = 2 * settled.tones.size  # complex sums of each tone
-    if settled.dense:  # samples and each tone's filter, in single precision
-        period = setup.step * setup.steps_per_frame
-        length |= {"scenario.step": max(length.get("scenario.step", 0.0), period)}
-        numbers = (1 + settled.tones.size) * settled.block
+    if settled.banded:  # envelopes, noise and outputs of each call, in single precision
+        each = settled.block / lag_step(settled.calls, settled.rate)
+        numbers = math.ceil(3.0 * settled.tones.size * each)
     key = max(length, key=length.__getitem__)
     numbers *= math.prod(layout.shape)
     need = COPIES * DOUBLE * length[key] / settled.interval * numbers

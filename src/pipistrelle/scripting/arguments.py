@@ -70,7 +70,6 @@ TIMING: Key = ("listening", "timing")
 SHORT: dict[str, Key] = {
     "world": WORLD_KEY,
     "landmarks": ("scenario", "landmarks"),
-    "engine": ("receiver", "engine"),
     "particles": ("fastslam", "particles"),
     "gate": GATE_KEY,
     "truth": ("bag", "truth"),

@@ -231,7 +231,6 @@ def run(
     beamwidth: float | None = None,
     landmarks: int | None = None,
     duration: float | None = None,
-    engine: Literal["auto", "block", "dense"] | None = None,
     particles: int | None = None,
     world: Path | str | None = None,
     output: Path | str | None = None,
@@ -267,9 +266,6 @@ def run(
         Number of landmarks; sets scenario.landmarks.
     duration : float, optional
         Length of the drive [s]; sets scenario.steps.
-    engine : "auto", "block" or "dense", optional
-        Computation of samples: block (exact sums over blocks, fast), dense (every sample, slow) or
-        auto (block where it applies); sets receiver.engine.
     particles : int, optional
         Particles of FastSLAM; sets fastslam.particles.
     world : Path, optional

@@ -25,7 +25,6 @@ OPTIONS = {
     "beamwidth": ("DEG", "33.3"),
     "landmarks": ("N", "50"),
     "duration": ("SECONDS", "187.5"),
-    "engine": ("", "auto"),
     "particles": ("N", "100"),
     "world": ("DIR", "a random one"),
     "output": ("DIR", "runs/TIME-NAME"),
@@ -49,7 +48,7 @@ SLAM_OPTIONS = OPTIONS | {
     "truth": ("TOPIC", ""),
 }
 QUIET = switch("quiet", "Print only the result folder.")
-MISSION = ("config", "beamwidth", "landmarks", "duration", "engine", "particles", "world")
+MISSION = ("config", "beamwidth", "landmarks", "duration", "particles", "world")
 """Parameters of `run` that affect the settings."""
 
 

@@ -3,7 +3,6 @@
 import shutil
 import time
 import tracemalloc
-from contextlib import nullcontext
 from itertools import product
 from pathlib import Path
 from types import SimpleNamespace
@@ -77,14 +76,14 @@ def frames_of_run(settings=None, named=None):
     return [frame.unlabelled for frame in frames]
 
 
-def agreeing(scan, run, bearing, way):
-    """Count the rows of a run that stand in a scan, too."""
+def agreeing(scan, run, limit, stds=0.0):
+    """Count the rows of a run that stand in a scan, too, within a limit or some deviations."""
     count = 0
     for i in range(run.bearing.size):
         same = scan.caller == run.caller[i]
-        for name, limit in (("bearing", bearing), ("range", way), ("excess_path", way)):
-            mine, his = getattr(scan, name), getattr(run, name)[i]
-            same &= (np.isnan(mine) & np.isnan(his)) | (np.abs(mine - his) < limit)
+        for name in ("bearing", "range", "excess_path"):
+            mine, his, std = getattr(scan, name), getattr(run, name)[i], getattr(run, f"{name}_std")
+            same &= (np.isnan(mine) & np.isnan(his)) | (np.abs(mine - his) < limit + stds * std[i])
         count += bool(same.any())
     return count
 
@@ -94,13 +93,13 @@ def test_detections_of_a_recording_equal_the_runs(own):
     run = frames_of_run()
     assert [scan.time for scan in log] == [scan.time for scan in run]
     rows = sum(scan.bearing.size for scan in run)
-    found = sum(agreeing(a, b, 1e-6, 1e-6) for a, b in zip(log, run, strict=True))
+    found = sum(agreeing(a, b, 1e-6) for a, b in zip(log, run, strict=True))
     assert rows > 100
     assert found >= rows - 2  # next to the threshold the measured noise may decide otherwise
     for mine, his in zip(log, run, strict=True):
         for caller, row in enumerate(his.direct.tolist()):
             assert (mine.direct[caller] < 0) == (row < 0)
-    assert agreeing(log[0], run[1], 1e-6, 1e-6) == 0, "another frame is another"
+    assert agreeing(log[0], run[1], 1e-6) == 0, "another frame is another"
 
 
 LOUD = {"level_db": 65.0}  # else nothing is near enough for an echo of the vehicle's own
@@ -131,18 +130,19 @@ def test_detections_of_a_recorded_call_equal_the_runs(tmp_path, monkeypatch, cas
     assert sum(np.count_nonzero(scan.caller == 0) for scan in run) >= 8
     rows = sum(scan.bearing.size for scan in run)
     assert rows > 50
-    assert sum(agreeing(a, b, 1e-4, 1e-3) for a, b in zip(log, run, strict=True)) >= rows - 2
+    # the noise before the record, which the file lacks, reaches into it through filters in bands
+    assert sum(agreeing(a, b, 0.0, 0.1) for a, b in zip(log, run, strict=True)) >= rows - 2
 
 
 HARBOUR_SWEEP = {"emitter": {"call": "sweep", "band": (165e3, 135e3), "taper": 0.2}}
 
 
 @pytest.mark.parametrize(
-    ("settings", "limit"),
-    [({}, 1e-6), pytest.param(HARBOUR_SWEEP, 1e-4, marks=SLOW)],
+    ("settings", "limit", "stds"),
+    [({}, 1e-6, 0.0), pytest.param(HARBOUR_SWEEP, 0.0, 0.1, marks=SLOW)],
     ids=["tone", "sweep"],
 )
-def test_detections_of_an_underwater_recording_equal_the_runs(tmp_path, settings, limit):
+def test_detections_of_an_underwater_recording_equal_the_runs(tmp_path, settings, limit, stds):
     harbour = str(Path(__file__).parents[3] / "examples" / "harbour.toml")
     folder = record(tmp_path / "tape", "--settings", harbour, *words(settings))
     medium = read_description(folder).medium
@@ -151,7 +151,7 @@ def test_detections_of_an_underwater_recording_equal_the_runs(tmp_path, settings
     log, run = heard(folder)[0], frames_of_run(settings, harbour)
     rows = sum(scan.bearing.size for scan in run)
     assert rows > 100
-    assert sum(agreeing(a, b, limit, limit) for a, b in zip(log, run, strict=True)) >= rows - 2
+    assert sum(agreeing(a, b, limit, stds) for a, b in zip(log, run, strict=True)) >= rows - 2
 
 
 def test_the_log_of_a_recording_holds_its_detections(own, tmp_path):
@@ -175,12 +175,10 @@ def test_slam_on_a_recording_repeats_the_run(tmp_path, settings, limit):
     pipistrelle.hear(tmp_path / "tape", output=tmp_path / "log")
     asked = {"filters": "smoother", "association__method": "marginal"}
     again = pipistrelle.slam(tmp_path / "log", gate=1.0, **asked).tracks
-    warned = pytest.warns(UserWarning, match="every sample is recorded")
-    with warned if settings else nullcontext():
-        run = pipistrelle.run(
-            duration=4.0, landmarks=20, strategies="fused", receiver__elements=4,
-            listening__timing=True, filter__noise="measured", **settings, **asked,
-        ).tracks  # fmt: skip
+    run = pipistrelle.run(
+        duration=4.0, landmarks=20, strategies="fused", receiver__elements=4,
+        listening__timing=True, filter__noise="measured", **settings, **asked,
+    ).tracks  # fmt: skip
     for name in ("x_m", "y_m", "heading_rad"):
         assert np.abs(again[name].to_numpy() - run[name].to_numpy()).max() < limit
 
@@ -199,7 +197,7 @@ def test_sixteen_bits_and_flac_give_nearly_the_same_detections(tmp_path):
     soundfile.write(tmp_path / "flac" / "recording.w64", samples, rate, subtype="PCM_16")
     for name in ("short", "flac"):
         log, _ = heard(tmp_path / name)
-        found = sum(agreeing(a, b, 5e-3, 5e-3) for a, b in zip(log, run, strict=True))
+        found = sum(agreeing(a, b, 5e-3) for a, b in zip(log, run, strict=True))
         assert found > 0.95 * rows
 
 
@@ -563,7 +561,7 @@ def test_an_echo_that_the_window_cuts_leaves_no_rows(tmp_path, end, loud, deaf):
     whole = {"begins": deaf, "ends": period - 2e-3}[end]
     late = [whole + 2e-3 * share * (1 if end == "ends" else -1) for share in CUT]
     folder, times = swept(tmp_path / "tape", late, deaf=deaf, period=period, loud=loud)
-    rows = pipistrelle.hear(folder, detection__false_alarm=1e-9).measurements
+    rows = pipistrelle.hear(folder, detection__false_alarm=1e-10).measurements
     for begin, delay, share in zip(times, late, CUT, strict=True):
         found = rows.filter((rows["time"] - begin).abs() < 1e-6)["range"].to_numpy()
         assert np.min(np.abs(found - 170.0 * 10e-3)) < 0.01, "the faint echo is heard"

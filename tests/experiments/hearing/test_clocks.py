@@ -59,18 +59,17 @@ IN_SOME_FRAMES = {"period": 1.2, "offset": 0.45}
 
 
 @pytest.mark.parametrize(
-    ("engine", "clock", "steps", "least"),
+    ("taper", "clock", "steps", "least"),
     [
-        ("block", TWICE_A_FRAME, 80, 36),
-        ("block", IN_SOME_FRAMES, 80, 7),
-        ("dense", TWICE_A_FRAME, 24, 11),
-        pytest.param("dense", TWICE_A_FRAME, 80, 36, marks=pytest.mark.slow),
-        pytest.param("dense", IN_SOME_FRAMES, 80, 7, marks=pytest.mark.slow),
+        (0.0, TWICE_A_FRAME, 80, 36),
+        (0.0, IN_SOME_FRAMES, 80, 7),
+        (0.2, TWICE_A_FRAME, 24, 11),
+        pytest.param(0.2, TWICE_A_FRAME, 80, 36, marks=pytest.mark.slow),
+        pytest.param(0.2, IN_SOME_FRAMES, 80, 7, marks=pytest.mark.slow),
     ],
 )
-def test_excess_paths_and_bearings_are_of_the_moment_of_reception(engine, clock, steps, least):
-    setup = {"receiver": {"engine": engine}} if engine == "dense" else {}
-    setup["scenario"] = SETUP | {"steps": steps}
+def test_excess_paths_and_bearings_are_of_the_moment_of_reception(taper, clock, steps, least):
+    setup = {"emitter": {"taper": taper}, "scenario": SETUP | {"steps": steps}}
     config = config_of({"distance": 9.0} | clock, **setup)
     world, between, _ = heard_calls(config)
     label, caller = len(world.landmarks) + 1, np.asarray(world.callers[1].place)

@@ -11,7 +11,7 @@ from pipistrelle.acoustics.emitter import SHAPES, Bodies, Shape
 from pipistrelle.acoustics.paths import VEHICLE, callers_of
 from pipistrelle.acoustics.propagation import Medium, medium_of
 from pipistrelle.arrays.layout import Layout, layout_of
-from pipistrelle.arrays.receiver import add_echo_blocks, noise_blocks, record_samples
+from pipistrelle.arrays.receiver import add_echo_blocks, noise_blocks
 from pipistrelle.arrays.sampling import sampling
 from pipistrelle.config import (
     BLOCK,
@@ -24,17 +24,17 @@ from pipistrelle.config import (
     ScenarioConfig,
 )
 from pipistrelle.detection.front_end import find_calls, front_end
-from pipistrelle.detection.matched import BandFilters, filter_blocks, filter_samples
+from pipistrelle.detection.matched import BandFilters, filter_blocks
 from pipistrelle.detection.snapshots import detect, detector
 from pipistrelle.experiments.hearing.listening import listen
 from pipistrelle.experiments.hearing.scenario import world_of
 from pipistrelle.experiments.hearing.world_folder import read_world
 from pipistrelle.geometry import wrap
+from reference.samples import filter_samples, in_bands, record_samples
 
 CONFIG = Config(scenario=ScenarioConfig(steps=40))
 DENSE = Config(
     scenario=ScenarioConfig(steps=12),
-    receiver=ReceiverConfig(engine="dense"),
     beacon=BeaconConfig(frequency=15e3),  # a sweep's band about it is its own
 )
 GOLOMB = np.array([0.0, 1.0, 4.0, 9.0, 15.0, 22.0, 32.0, 34.0])
@@ -152,12 +152,13 @@ def dense_matched(call, delay, snr_db=25.0, seed=None):
     rng = None if seed is None else np.random.default_rng(seed)
     signal = record_samples(150, echoes(delay, snr_db), layout, settled, rng)
     lags = {"start": settled.pulse * BLOCK, "interval": 1.0 / settled.rate, "pulse": 560}
-    if not settled.real:
+    if not settled.banded:
         matched = filter_samples(signal, calls=settled.calls, rate=settled.rate, noise_std=1.0)
         return matched, lags, front_end(DENSE, layout, settled.tones)
     filters = BandFilters(settled.calls, settled.rate)
     lags |= {"interval": filters.step / settled.rate, "pulse": 560 // filters.step}
-    return filters(signal, 1.0), lags, front_end(DENSE, layout, settled.tones, calls=settled.calls)
+    end = front_end(DENSE, layout, settled.tones, calls=settled.calls)
+    return in_bands(filters, signal, 1.0), lags, end
 
 
 @pytest.mark.parametrize(("call", "width"), [(ToneBurst, 2.8e-3), (Sweep, 1.0e-4)])
@@ -189,12 +190,6 @@ def test_a_sweep_is_heard_in_a_mission_where_echoes_overlap_less():
         off.append(np.abs(range_errors(world, heard)))
     assert min(error.size for error in off) >= 8
     assert np.quantile(off[1], 0.9) < 0.02 < 0.5 * np.quantile(off[0], 0.9)
-
-
-def test_the_block_engine_refuses_calls_other_than_tone_bursts():
-    sums = {"receiver": CONFIG.receiver.model_copy(update={"engine": "block"})}
-    with pytest.raises(InputError, match="for a Sweep; expected 'dense'"):
-        listen(world_of(CONFIG), CONFIG.model_copy(update=sums), (0.0088,), call=Sweep)
 
 
 def test_another_medium_brings_echoes_at_its_delay_and_level():

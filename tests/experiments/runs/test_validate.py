@@ -101,10 +101,6 @@ def test_without_room_for_a_recording_the_setting_that_makes_it_long_is_named(mo
         with pytest.raises(InputError, match=rf"^{key}: a recording of \d+ s may need .* GB"):
             checked_scenario(settings(**{section: pair}))
         checked_scenario(settings(**{section: pair}), workers=0)
-    with pytest.raises(InputError, match=r"^scenario\.step: a recording of 5 s may need"):
-        checked_scenario(
-            resolve(from_flags({"scenario": {"step": 1.25}, "receiver": {"engine": "dense"}}))
-        )
 
 
 def test_running_a_mission_checks_its_recording(monkeypatch):

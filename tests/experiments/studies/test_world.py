@@ -192,7 +192,7 @@ OTHERS = {
     "beacon.taper": 0.5, "beacon.frequency": 25000.0, "beacon.level_db": 55.0,
     "receiver.array": [[x, y, 0.0, 0.0, ""] for x, y in ((0.01, 0.0), (0.0, 0.01), (-0.01, 0.0))],
     "receiver.elements": 8, "receiver.spacing": 0.004, "receiver.sample_rate": 250000.0,
-    "receiver.noise_level_db": 6.0, "receiver.engine": "dense",
+    "receiver.noise_level_db": 6.0,
     "detection.false_alarm": 0.01, "detection.snapshots": "runs", "detection.leakage_db": -10.0,
     "detection.peak_db": -0.5, "detection.scan_limit_deg": 76.0,
     "detection.angle_limit_deg": 40.0, "detection.averaging": "weighted",

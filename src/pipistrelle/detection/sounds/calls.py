@@ -8,10 +8,9 @@ For tones, real samples become block sums, as in the front end:
 
 .. math:: S_b = 2 \sum_{n=bB}^{(b+1)B-1} x[n] e^{-2\pi i f n / f_s}
 
-with n counted from the vehicle's call. If a call and a block last a whole number of 0.2 ms and
-tones are whole bins, blocks are the simulation's, and noise is independent between tones; otherwise
-a block is about a fourteenth of a call, and tones are arbitrary below half the rate. If any call is
-not a tone, samples become outputs of matched filters.
+with n counted from the vehicle's call, and the blocks of the simulation
+(`pipistrelle.acoustics.call.blocks_of`). If any call is not a tone, samples become outputs of
+matched filters.
 """
 
 import math
@@ -23,7 +22,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Complex, Float, Int
 
-from pipistrelle.acoustics.call import LEAST_SAMPLES, Call, ToneBurst, is_whole
+from pipistrelle.acoustics.call import Call, ToneBurst
 from pipistrelle.config import BLOCK
 from pipistrelle.detection.matched import BandFilters
 from pipistrelle.detection.sounds.sound_file import FILE as ABOUT
@@ -51,29 +50,6 @@ class Blocks(NamedTuple):
     def interval(self) -> float:
         """Duration of a block of samples [s]."""
         return self.block / self.rate
-
-
-def blocks_of(
-    rate: float, duration: float, tones: Float[np.ndarray, " c"], deaf: float | None = None
-) -> Blocks:
-    """Choose how samples are divided into blocks, for calls of a duration [s].
-
-    `deaf`: time before the first block, by default the duration [s].
-
-    >>> blocks_of(200e3, 2.8e-3, np.array([35e3, 30e3]))[1:4]
-    (40, 14, 560)
-    >>> blocks_of(192e3, 5e-4, np.array([40e3]))[1:4]
-    (8, 12, 96)
-    """
-    length = duration * rate
-    whole = [rate * BLOCK, duration / BLOCK, *(tones * BLOCK)]
-    if all(map(is_whole, whole)):
-        block, pulse = round(rate * BLOCK), round(duration / BLOCK)
-    else:
-        choice = [(max(round(length / count), 1), count) for count in range(LEAST_SAMPLES, 21)]
-        block, pulse = min(choice, key=lambda b: (abs(b[0] * b[1] - length), abs(b[1] - 14)))
-    blank = length if deaf is None else deaf * rate
-    return Blocks(rate, block, pulse, math.ceil(blank - 1e-6), tones)
 
 
 class ToneSums:
@@ -157,6 +133,7 @@ class CallOutputs:
         self._filters = BandFilters(calls, rate)
         tones = np.array([call.frequency for call in calls])
         self.blocks = Blocks(rate, self._filters.step, self._filters.pulse, blank, tones)
+        self.cut = self._filters.cut
         self.channel = channel
         tone = any(isinstance(call, ToneBurst) for call in calls)
         alike = self.blocks.pulse if tone else round(BLOCK / self.blocks.interval)
@@ -167,21 +144,21 @@ class CallOutputs:
         self.mean = np.zeros(int(channel.max()) + 1)
         """Mean of each channel's samples, which is subtracted."""
 
-    def __call__(
-        self, samples: Float[np.ndarray, "t m"], *, around: bool = False
-    ) -> Complex[np.ndarray, "l f c e"]:
+    def around(self, samples: Float[np.ndarray, "t m"]) -> Complex[np.ndarray, "l f c e"]:
         """Return matched-filter outputs of the samples after a call; the samples begin with it.
 
-        `around`: also at lags at which only a part of a call is received (`BandFilters.around`).
+        At `cut` lags of each end, only a part of a call is received.
         """
         heard = samples[self.blocks.blank :]
-        if len(heard) < self._filters.length:
-            return np.empty((0, *self.gain.shape), dtype=np.complex64)
         heard = heard - self.mean.astype(heard.dtype)[: heard.shape[1]]
-        filtered = self._filters.around if around else self._filters
-        outputs = filtered(heard[:, self.channel])
+        outputs = self._filters(heard[:, self.channel])
         outputs *= self.gain.astype(np.float32)
         return outputs
+
+    def __call__(self, samples: Float[np.ndarray, "t m"]) -> Complex[np.ndarray, "l f c e"]:
+        """Return the outputs of whole calls; the samples begin with the vehicle's."""
+        outputs = self.around(samples)
+        return outputs[self.cut : len(outputs) - self.cut]
 
 
 FILE = "calls.csv"
@@ -334,6 +311,7 @@ def _leaks(sound: Sound, sent: Call, apart: int) -> Float[np.ndarray, " k"]:
     for first, samples in _pieces(sound, some * step, filters.length + step):
         some_channels = samples[:, :: math.ceil(sound.channels / _LISTEN)]
         outputs = filters((some_channels - some_channels.mean(axis=0))[:, np.newaxis])
+        outputs = outputs[filters.cut : len(outputs) - filters.cut]
         level = np.sqrt((outputs.real**2 + outputs.imag**2).sum(axis=(1, 2, 3)))
         found = np.empty((-(-len(level) // some), 2))
         for i, begin in enumerate(range(0, len(level), some)):

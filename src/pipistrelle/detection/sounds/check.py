@@ -18,7 +18,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Complex, Float, Int
 
-from pipistrelle.acoustics.call import Call, ToneBurst, extent_of, replica
+from pipistrelle.acoustics.call import Call, ToneBurst, carrier_of, extent_of, replica
 from pipistrelle.config import Config
 from pipistrelle.detection.noise import energy_of
 from pipistrelle.detection.scans import OWN, Scan
@@ -110,10 +110,12 @@ def _echo(frame: Frame, hearing: Hearing, d: int) -> _Echo | None:
     first, length = round(at) - reach, 2 * reach * frame.interval
     if not 0 <= first <= len(outputs) - 2 * reach:
         return None
-    bins = np.arange(math.ceil(wide.band.low * length), math.floor(wide.band.high * length) + 1)
-    spectrum = np.fft.fft(outputs[first : first + 2 * reach], axis=0)[bins % (2 * reach)]
+    carrier = carrier_of(wide.band, frame.interval)
+    limits = (np.array(wide.band[:2]) - carrier) * length
+    bins = np.arange(math.ceil(limits[0]), math.floor(limits[1]) + 1)
+    spectrum = np.fft.fft(outputs[first : first + 2 * reach], axis=0)[bins]
     turn = np.exp(2j * np.pi * bins / length * (at - first) * frame.interval)
-    return _Echo(bins / length, spectrum * turn[:, np.newaxis])
+    return _Echo(carrier + bins / length, spectrum * turn[:, np.newaxis])
 
 
 def _pairs(frame: Frame, hearing: Hearing) -> list[tuple[int, float, int, float]]:

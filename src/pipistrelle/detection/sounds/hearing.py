@@ -24,14 +24,13 @@ detected.
 import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Complex, Float, Int
 
-from pipistrelle.acoustics.call import Call, ToneBurst, check_sampled
+from pipistrelle.acoustics.call import Call, ToneBurst, blocks_of, check_sampled
 from pipistrelle.config import Config
 from pipistrelle.detection.beams import Wide
 from pipistrelle.detection.front_end import (
@@ -50,7 +49,6 @@ from pipistrelle.detection.sounds.calls import (
     CallOutputs,
     Calls,
     ToneSums,
-    blocks_of,
     calls_of,
 )
 from pipistrelle.detection.sounds.sound_file import ARRAY_FILE as ARRAY
@@ -259,7 +257,7 @@ class Hearing:
     def wide(self, caller: int, group: int) -> Wide | None:
         """Return the wideband detector of a caller and a group; None for a tone."""
         one = self.end.of(caller, group).detector if isinstance(self.end, Finders) else None
-        return one if isinstance(one, Wide) else None
+        return one if isinstance(one, Wide) and not one.call.tone else None
 
     def frames(self, numbers: Sequence[int]) -> Iterator[Frame]:
         """Yield matched-filter output and detections after some of the calls, numbered from 0."""
@@ -268,7 +266,7 @@ class Hearing:
             first = int(calls.sample[k])
             samples = self.sound.read(first, int(calls.length[k]))
             matched = self._matched(first, samples, room)
-            yield self._frame(float(calls.time[k]), matched, samples)
+            yield self._frame(float(calls.time[k]), matched)
 
     def _matched(
         self, first: int, samples: Float[np.ndarray, "t m"], room: Workspace
@@ -277,7 +275,7 @@ class Hearing:
         on, shape = self.blocks, self.sums.gain.shape
         if isinstance(self.sums, CallOutputs):
             self.sound.refuse_odd(first, samples)
-            return self.sums(samples)
+            return self.sums.around(samples)
         count = max((len(samples) - on.blank) // on.block, 0)
         blocks = self.sums(samples, room.array("blocks", (count, *shape)))
         if not np.isfinite(blocks).all():
@@ -289,20 +287,20 @@ class Hearing:
         self,
         time: float,
         matched: Complex[np.ndarray, "l f c e"],
-        samples: Float[np.ndarray, "t m"],
     ) -> Frame:
         """Detect the echoes of a call; return its frame with detections and unlabelled scan."""
-        on, around = self.blocks, None
+        on, cut = self.blocks, 0
+        if isinstance(self.sums, CallOutputs) and len(matched):
+            cut = self.sums.cut
         start = on.blank / on.rate
-        if isinstance(self.sums, CallOutputs):
-            around = partial(self.sums, samples, around=True)
         found = find_calls(
-            matched, self.end, start=start, interval=on.interval, pulse=on.pulse, around=around
+            matched, self.end, start=start, interval=on.interval, pulse=on.pulse, cut=cut
         )
         if self.own_clock.any():
             found = detections_at(found, ~self.own_clock[found.caller])
         found = with_edge_floor(found, self.config)
         scan, _ = unlabelled_scan(time, found, self.config, self.own_clock)
+        matched = matched[cut : len(matched) - cut]
         return Frame(time, matched, start, on.interval, found, scan)
 
 
@@ -314,12 +312,14 @@ def prepared(
     sent, where = about.calls(folder), str(folder / FILE)
     for call in sent:
         check_sampled(call, sound.rate, where=where, duration=f"{where}, key 'call.duration'")
+    blank = math.ceil((about.call.deaf or 0.0) * sound.rate - 1e-6)
     if all(isinstance(call, ToneBurst) for call in sent):
         tones = np.array([call.frequency for call in sent])
-        blocks = blocks_of(sound.rate, about.call.duration, tones, about.call.deaf)
-        sums = ToneSums(blocks, array.channel)
+        block, pulse = blocks_of(sound.rate, about.call.duration, tones)
+        blank = blank or block * pulse
+        sums = ToneSums(Blocks(sound.rate, block, pulse, blank, tones), array.channel)
     else:
-        blank = math.ceil((about.call.deaf or about.call.duration) * sound.rate - 1e-6)
+        blank = blank or math.ceil(about.call.duration * sound.rate - 1e-6)
         sums = CallOutputs(sent, sound.rate, blank, array.channel)
     return array, sums, sent, calls_of(folder, about, sound, sums.blocks, sent[0])
 

@@ -24,8 +24,7 @@ import numpy as np
 from jaxtyping import Float
 
 from pipistrelle.acoustics.call import sound_of
-from pipistrelle.acoustics.paths import Caller, callers_of, moves
-from pipistrelle.arrays.sampling import free_tones
+from pipistrelle.acoustics.paths import Caller, moves
 from pipistrelle.config import (
     SWEEP,
     TONE,
@@ -171,11 +170,9 @@ def _placeless(
         call |= {"call": TONE, "frequency": None}
     call |= one.model_dump(exclude_none=True, include=fields)
     if call["call"] != SWEEP and call["frequency"] is None:
-        known = (*callers_of(config, np.zeros(2))[:1], *before)
-        free = free_tones(config, known, config.beacon.frequency)
         raise InputError(
-            f"{key}.frequency: found none, expected a tone of its own{free}; give one, for only "
-            "the first may have the beacon's"
+            f"{key}.frequency: found none, expected a tone of its own; give one, for only the "
+            "first may have the beacon's"
         )
     sent = CallConfig.model_validate({key: v for key, v in call.items() if v is not None})
     usual = config.emitter if one.way == "mission" else config.beacon

@@ -1,26 +1,24 @@
-"""Simulated listening: measurements of each frame along a path, by the block or dense engine.
+"""Simulated listening: measurements of each frame along a path, by sums over blocks or in bands.
 
 A frame lasts from each call of the vehicle to the next. The noise is drawn once for all beamwidths,
 keyed by the number of the frame, and the arrivals from other callers are shared by all.
 
-The dense engine records until the vehicle calls again: 100,000 samples of 40 channels for the
-paper's half second, less the call itself, when the receiver is deaf. The block engine stops after
-the last arrival. The rest would be noise, which gets no label, so labelled scans have the same
-distribution; only the count of clutter lacks the false alarms of the silence (about 0.01 a frame).
+A frame is simulated until the last arrival. The rest would be noise, which gets no label, so
+labelled scans have the same distribution; only the count of clutter lacks the false alarms of the
+silence (about 0.01 a frame).
 
 Callers without a clock call when the vehicle does. A call of a caller with a clock belongs to
 all frames that receive its sounds; arrivals that begin less than the duration of a call before
 the vehicle's next call are lost.
 """
 
-import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
-from jaxtyping import Bool, Complex, Float, Int
+from jaxtyping import Bool, Complex, Int
 
 from pipistrelle.acoustics.arrivals import (
     Arrivals,
@@ -30,14 +28,14 @@ from pipistrelle.acoustics.arrivals import (
     through_piston,
     through_pistons,
 )
-from pipistrelle.acoustics.call import Call, ToneBurst, band_of
+from pipistrelle.acoustics.call import Call, ToneBurst, band_of, window_lags
 from pipistrelle.acoustics.paths import VEHICLE, callers_at
 from pipistrelle.acoustics.propagation import Medium, medium_of
 from pipistrelle.arithmetic.random_stream import stream_key
 from pipistrelle.arrays.layout import Layout, Scattered, layout_of
-from pipistrelle.arrays.receiver import add_echo_blocks, noise_blocks, record_samples
+from pipistrelle.arrays.receiver import BandRecorder, InBands, add_echo_blocks, noise_blocks
 from pipistrelle.arrays.sampling import Sampling, block_shape, blocks_to_hear, sampling
-from pipistrelle.config import BLOCK, Config
+from pipistrelle.config import Config
 from pipistrelle.detection.direct import own_alone
 from pipistrelle.detection.front_end import (
     FrameMeasurements,
@@ -49,7 +47,7 @@ from pipistrelle.detection.front_end import (
     unlabelled_scan,
     with_edge_floor,
 )
-from pipistrelle.detection.matched import BandFilters, Workspace, filter_blocks, filter_samples
+from pipistrelle.detection.matched import BandFilters, Workspace, filter_blocks
 from pipistrelle.detection.scans import UNLABELLED
 from pipistrelle.detection.snapshots import Detections, Detector, detections_at, joined
 from pipistrelle.experiments.hearing.oracle import faintest_level_db, label_detections
@@ -186,8 +184,8 @@ def _emissions(
 
 Progress = Callable[[str, int, int], None]
 """Called with the stage's name, the number of frames done and the total."""
-Keep = Callable[[int, Arrivals, np.ndarray], None]
-"""Called with a frame's number, its arrivals, and its block sums or samples."""
+Keep = Callable[[int, Arrivals, np.ndarray | InBands], None]
+"""Called with a frame's number, its arrivals, and its block sums or sound in bands."""
 
 
 def listen(
@@ -233,8 +231,8 @@ def listen(
         False: frames also hold their measurements without labels, for data association
         (`pipistrelle.estimation.data_association`).
     keep : callable, optional
-        Receives each frame's number, from 1 on, its arrivals, and its block sums or real samples,
-        which the next frame overwrites.
+        Receives each frame's number, from 1 on, its arrivals, and its block sums, which the next
+        frame overwrites, or its sound in the calls' bands.
     progress : callable, optional
 
     Returns
@@ -261,7 +259,7 @@ def listen(
     settled = sampling(config, scenario.callers, call=call, medium=medium)
     rig = _Rig(config, scenario, layout or layout_of(config), settled, oracle, labels)
     purpose = "noise" if setup.vehicle == 1 else f"noise of {setup.vehicle}"
-    engine = rig.dense if settled.dense else rig.blocks
+    recorded = rig.in_bands if settled.banded else rig.blocks
     beams: tuple[list[FrameMeasurements], ...] = tuple([] for _ in radii)
     beam = beam or partial(through_piston, off_axis=config.emitter.off_axis)
     calls: dict[int, tuple[CallHeard, list[list[Detections]]]] = {}
@@ -269,10 +267,10 @@ def listen(
         key = stream_key(config.seed, iteration, purpose, number)
         for timed in frame.calls:
             calls.setdefault(timed.number, (timed, [[] for _ in radii]))
-        for r, record in enumerate(engine(frame.aimed, key)):
-            more = {"around": record.around} if record.around else {}
-            found = find(record.matched, rig.front_end, **record.lags, **more)
-            if keep is not None and record.sums is not None:
+        for r, record in enumerate(recorded(frame.aimed, key)):
+            cut = {"cut": record.cut} if record.cut else {}
+            found = find(record.matched, rig.front_end, **record.lags, **cut)
+            if keep is not None:
                 keep(number, frame.aimed[r], record.sums)
             for timed in frame.calls:
                 calls[timed.number][1][r].append(rig.of_call(timed, frame.time, record, found))
@@ -299,10 +297,10 @@ class _Record(NamedTuple):
     """Time between two lags [s]."""
     pulse: int
     """Half width of the matched filter's response to a call, in lags."""
-    sums: Complex[np.ndarray, "b f c e"] | Float[np.ndarray, "t f e"] | None = None
-    """Block sums or real samples before the filter, if available."""
-    around: Callable[[], Complex[np.ndarray, "l f c e"]] | None = None
-    """Returns the output including calls that are only partly recorded (`BandFilters.around`)."""
+    sums: Complex[np.ndarray, "b f c e"] | InBands
+    """Block sums before the filter, or the sound in the calls' bands."""
+    cut: int = 0
+    """Lags at each end, outside the time axis, at which a call is only partly in the record."""
 
     @property
     def lags(self) -> dict[str, Any]:
@@ -322,10 +320,9 @@ class _Rig:
         oracle: Callable[..., Int[np.ndarray, " d"]],
         labels: bool,
     ) -> None:
-        calls = settled.calls if settled.real else ()
         self.config, self.layout, self.sampling = config, layout, settled
         self.oracle, self.labels = oracle, labels
-        self.front_end = front_end(config, layout, settled.tones, calls=calls)
+        self.front_end = front_end(config, layout, settled.tones, calls=settled.calls)
         self.faintest_db = _faintest_db(self.front_end, layout, settled, config)
         self.callers = caller_labels(scenario)
         self.own_clock = np.array([caller.calls is not None for caller in scenario.callers])
@@ -333,8 +330,9 @@ class _Rig:
             caller.heading is not None for caller in scenario.callers
         ]
         self.workspace = Workspace()
-        self.filters = BandFilters(settled.calls, settled.rate) if settled.real else None
-        """Matched filters for real samples."""
+        if settled.banded:
+            self.filters = BandFilters(settled.calls, settled.rate)
+            self.recorder = BandRecorder(layout, settled)
 
     def of_call(
         self, call: CallHeard, time: float, record: _Record, found: Detections
@@ -342,7 +340,8 @@ class _Rig:
         """Select the detections from a caller's timed call; delays count from that call."""
         after, early = call.time - time, 0.5 * record.interval * record.pulse
         stretch = after - early, call.until - time - early
-        part = call_in(record.matched, self.front_end, found, call.caller, stretch, **record.lags)
+        whole = record.matched[record.cut : len(record.matched) - record.cut]
+        part = call_in(whole, self.front_end, found, call.caller, stretch, **record.lags)
         direct = part.direct and part.direct._replace(delay=part.direct.delay - after)
         return replace(part, delay=part.delay - after, direct=direct)
 
@@ -413,33 +412,28 @@ class _Rig:
                 noise_std=settled.noise_std,
                 out=space.array("matched", lags),
             )
-            yield _Record(matched, start=pulse * BLOCK, interval=BLOCK, pulse=pulse, sums=signal)
+            yield _Record(matched, pulse * settled.interval, settled.interval, pulse, sums=signal)
 
-    def dense(self, aimed: Sequence[Arrivals], key: int) -> Iterator[_Record]:
-        """Simulate the samples of each beam's arrivals, and yield their matched-filter output."""
-        settled, setup, filters = self.sampling, self.config.scenario, self.filters
-        period = math.floor(setup.steps_per_frame * setup.step / settled.interval) - settled.pulse
+    def in_bands(self, aimed: Sequence[Arrivals], key: int) -> Iterator[_Record]:
+        """Simulate each beam's arrivals in the calls' bands, and yield the matched outputs."""
+        settled, filters, recorder = self.sampling, self.filters, self.recorder
+        whole = blocks_to_hear(aimed[0], settled, self.layout) * settled.interval
+        cut, interval = filters.cut, filters.interval
+        lags = window_lags(whole / interval + cut)
         start = settled.pulse * settled.interval
-        for arrivals in aimed:
-            samples = record_samples(
-                max(period, blocks_to_hear(arrivals, settled, self.layout)),
-                arrivals,
-                self.layout,
-                settled,
-                np.random.default_rng(key),
-                single=True,
+        before = start - cut * interval
+        own, others = _parted(aimed[0])
+        shared, noise = recorder.silence(lags), recorder.noise(lags, key)
+        recorder.add(shared, arrivals_at(aimed[0], others), lags, before)
+        for left, arrivals in zip(range(len(aimed) - 1, -1, -1), aimed, strict=True):
+            envelopes = [one.copy() for one in shared] if left else shared
+            recorder.add(envelopes, arrivals_at(arrivals, own), lags, before)
+            outputs = filters.outputs(envelopes, lags, settled.noise_std, noise)
+            shape = len(outputs), *self.layout.shape, lags
+            matched = outputs.reshape(shape).transpose(3, 1, 0, 2)
+            yield _Record(
+                matched, start, interval, filters.pulse, sums=(lags, cut, envelopes, noise), cut=cut
             )
-            if filters is not None:
-                interval, pulse = filters.step / settled.rate, filters.pulse
-                matched = filters(samples, settled.noise_std)
-                around = partial(filters.around, samples, settled.noise_std)
-                yield _Record(matched, start, interval, pulse, sums=samples, around=around)
-            else:
-                matched = filter_samples(
-                    samples, calls=settled.calls, rate=settled.rate, noise_std=settled.noise_std
-                )
-                pulse = settled.pulse * settled.block
-                yield _Record(matched, start=start, interval=1.0 / settled.rate, pulse=pulse)
 
 
 def _faintest_db(
@@ -451,7 +445,7 @@ def _faintest_db(
     else:
         threshold, elements = 1.0 + end.least_snr, 1
     samples = settled.pulse * settled.block
-    if settled.real:
+    if settled.banded:
         samples = round(max(band_of(call, settled.rate).energy for call in settled.calls))
     return faintest_level_db(
         threshold,

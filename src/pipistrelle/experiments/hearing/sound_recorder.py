@@ -14,8 +14,8 @@ from pipistrelle.acoustics.call import RecordedCall, settings_of
 from pipistrelle.acoustics.paths import VEHICLE, Caller, moves
 from pipistrelle.arithmetic.random_stream import stream_key
 from pipistrelle.arrays.layout import array_text, layout_of, microphones_in
-from pipistrelle.arrays.receiver import real_samples
-from pipistrelle.arrays.sampling import sampling
+from pipistrelle.arrays.receiver import InBands, real_samples
+from pipistrelle.arrays.sampling import blocks_to_hear, sampling
 from pipistrelle.config import SQUARE, Config, InputError
 from pipistrelle.detection.sounds.calls import FILE as CALLS
 from pipistrelle.detection.sounds.sound_file import ARRAY_FILE as ARRAY
@@ -91,11 +91,6 @@ class SoundRecorder:
     def begin(self, scenario: Scenario) -> None:
         """Create the sound file with its header; raise if the settings give no real samples."""
         settled = sampling(self.config, scenario.callers)
-        if settled.dense and not settled.real:
-            raise InputError(
-                "--save-sound: found receiver.engine 'dense' for tones whose sums are all that "
-                "there is, whose samples are complex; expected 'auto' or 'block'"
-            )
         for caller, tone in zip(scenario.callers, settled.tones, strict=True):
             if tone >= settled.rate / 2.0:
                 raise InputError(
@@ -110,15 +105,15 @@ class SoundRecorder:
         self._file = PiecesFile(self.own.folder / SOUND_FILE)
         self._file.write(wav_header(self.size, self.channels, settled.rate, self.bits))
 
-    def keep(self, number: int, arrivals: Arrivals, sums: np.ndarray) -> None:
+    def keep(self, number: int, arrivals: Arrivals, sums: np.ndarray | InBands) -> None:
         """Write the samples of a frame if its number, from 1 on, is in the recorded range."""
         index = number - 1
         if index not in self.frames or self._file is None:
             return
         place, settled = index - self.frames.start, self.sampling
         length = int(self.first[place + 1] - self.first[place])
-        heard = len(sums) // settled.block if settled.real else len(sums)
-        self.late += heard > length // settled.block - settled.pulse + (settled.block == 1)
+        heard = blocks_to_hear(arrivals, settled, self.layout)
+        self.late += heard > length // settled.block - settled.pulse
         rng = np.random.default_rng(stream_key(self.config.seed, 0, "other frequencies", number))
         samples = real_samples(
             sums, arrivals, self.layout, settled, length, rng, leak=self.leak

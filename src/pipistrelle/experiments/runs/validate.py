@@ -10,7 +10,7 @@ import numpy as np
 from pipistrelle.acoustics.paths import VEHICLE, Caller, callers_of, moves
 from pipistrelle.arrays.beamforming import pattern_of
 from pipistrelle.arrays.layout import Scattered, layout_of
-from pipistrelle.arrays.sampling import off_raster, sampling
+from pipistrelle.arrays.sampling import sampling
 from pipistrelle.config import SQUARE, Config, InputError, Section
 from pipistrelle.detection.front_end import front_end
 from pipistrelle.estimation.beliefs import Belief, Gaussian, completed
@@ -122,7 +122,7 @@ def checked_scenario(
     scenario = world_of(config, world=world)
     settled = sampling(config, scenario.callers)
     layout = layout_of(config)
-    front_end(config, layout, settled.tones, calls=settled.calls if settled.real else ())
+    front_end(config, layout, settled.tones, calls=settled.calls)
     check_recording(scenario, config, layout, settled, workers=workers)
     _refuse_supersonic(scenario, config)
     return scenario
@@ -142,7 +142,7 @@ def warnings_of(config: Config, callers: Sequence[Caller] = ()) -> tuple[str, ..
     layout = layout_of(config)
     limit = min(config.detection.angle_limit_deg, config.detection.scan_limit_deg)
     callers = callers or callers_of(config, np.zeros(2))
-    warnings = _cost(config, callers)
+    warnings: list[str] = []
     for caller in callers:
         frequency, key = caller.frequency, caller.key or caller.name
         tone, wave = f"{key}.frequency ({frequency:g} Hz)", config.medium.sound_speed / frequency
@@ -212,18 +212,6 @@ def _left_from_air(config: Config) -> list[str]:
             f"{0.5 * wave / spacing:.1f} times as coarse as of half a wave ({wave / 2.0:.2g} m)"
         )
     return warnings
-
-
-def _cost(config: Config, callers: Sequence[Caller]) -> list[str]:
-    """Return a warning that all samples must be simulated, slowly, if no setting asks for it."""
-    why = off_raster(config, callers)
-    swept = [caller.key or caller.name for caller in callers if caller.sound is not None]
-    if config.receiver.engine != "auto" or not (why or swept):
-        return []
-    cause = f"{', '.join(swept)}: no plain tone" if swept else str(why)
-    return [
-        f"receiver.engine: every sample is recorded, some 0.3 s a frame in place of 1 ms ({cause})"
-    ]
 
 
 def _doubles(layout: Scattered, frequency: float, tone: str, c: float) -> list[str]:
