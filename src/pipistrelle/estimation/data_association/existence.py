@@ -61,7 +61,7 @@ root of 2, and bearings."""
 BINS = RINGS * SECTORS
 WINDOW = REMEMBERED
 """Scans of which `Known.past` is kept."""
-OFTEN = 255
+OFTEN = np.iinfo(np.uint8).max
 """Largest count of joint detections."""
 
 

@@ -156,8 +156,8 @@ def in_window(
 BESIDE, ASIDE = 0.96, 0.5
 """A measurement begins no landmark within this range [m] and bearing [rad] of a louder measurement.
 """
-OVERLAP_STD = 0.7
-"""Standard deviation of the path of an overlapping echo [m]."""
+OVERLAP_STD, OVERLAP_GATE = 0.7, 9.2
+"""Standard deviation of the path of an overlapping echo [m], and gate, exceeded by 1 in 100."""
 SURE_SHARE, ASSUMED = 0.65, 0.75
 """Share of the bearing limit up to which surety is 1, and surety of a default standard deviation.
 """
@@ -337,7 +337,7 @@ def label_matched(
     for n in range(confirmed.size):
         if confirmed[n] not in label:
             silent[n] = place_of(confirmed[n], landmark)
-    stray, gated = stray[:size], (GATE, *chances[1:])
+    stray, gated = stray[:size], (OVERLAP_GATE, *chances[1:])
     overlapping = part_of(heard, stray, OVERLAP_STD / (2.0 if number == OWN else 1.0))
     costs = pair_costs(overlapping, mean, covariance, silent[silent >= 0], at, gated)
     size = 0
