@@ -20,8 +20,8 @@ Merging landmarks a and b costs
 
 with the covariance S of their difference in the joint map, and the density :math:`\lambda` of
 landmarks. Each further pair of a group is tested given the pairs before, which the same drift has
-moved. Groups grow greedily, and the group of least cost is accepted if clearly better than all
-contradicting groups. Landmarks detected in a scan of the same caller are distinct
+moved. Groups grow greedily; the best is accepted if it is 99 times likelier than distinct landmarks
+and than each contradicting group. Landmarks detected in a scan of the same caller are distinct
 (`Known.together`). Source: Neira & Tardos, IEEE Transactions on Robotics and Automation 17 (2001).
 """
 
