@@ -41,9 +41,7 @@ def heard_so_often(times, surety=1.0):
 
 def test_the_ratio_is_of_the_likelihoods_of_a_miss_with_and_without_landmark():
     for m in (0.0, 0.3, 1.0):
-        hidden, chance = 0.1, 0.1
-        exists = hidden + (1.0 - hidden) * m
-        absent = 1.0 - chance * (1.0 - m)
+        exists, absent = 0.1 + 0.9 * m, 1.0 - 0.1 * (1.0 - m)
         assert log_ratio(m) == pytest.approx(np.log(absent / exists))
 
 
