@@ -503,7 +503,7 @@ class _Work:
 
     def _another(self) -> int:
         """Return the next unused label for a landmark or a caller."""
-        taken = {caller.label for caller in self.callers.values()}
+        taken = self._callers_labels()
         self.labels += 1
         while self.labels in taken:
             self.labels += 1
