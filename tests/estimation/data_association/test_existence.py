@@ -45,34 +45,22 @@ def test_the_ratio_is_of_the_likelihoods_of_a_miss_with_and_without_landmark():
         assert log_ratio(m) == pytest.approx(np.log(absent / exists))
 
 
-def test_odds_rise_with_each_scan_and_confirm_at_the_third():
-    for times, confirmed in ((1, False), (2, False), (3, True)):
-        known = heard_so_often(times)
-        assert known.odds[0] == pytest.approx(min(RISE * (times - 1), MOST))
-        assert bool(known.confirmed[0]) is confirmed
+@pytest.mark.parametrize(("surety", "scans"), [(1.0, 3), (0.5, 6)])
+def test_odds_rise_with_certain_detections_until_confirmation(surety, scans):
+    for times in range(1, scans + 1):
+        known = heard_so_often(times, surety)
+        assert known.odds[0] == pytest.approx(min(RISE * (surety * times - 1.0), MOST))
+        assert bool(known.confirmed[0]) is (times == scans)
         assert known.count[0] == times
 
 
-def test_less_certain_detections_take_more_scans_to_confirm():
-    for times, confirmed in ((3, False), (5, False), (6, True)):
-        known = heard_so_often(times, surety=0.5)
-        assert known.odds[0] == pytest.approx(RISE * (0.5 * times - 1.0))
-        assert bool(known.confirmed[0]) is confirmed
-
-
-def test_a_landmark_missed_repeatedly_is_deleted():
-    known = heard_so_often(3)
-    missed = judged(known, NONE, THERE, UNSEEN, 3)
-    assert missed.odds[0] == pytest.approx(known.odds[0] - log_ratio(UNSEEN[0]))
-    for scan in range(4, 8):
-        missed = judged(missed, NONE, THERE, UNSEEN, scan)
+def test_odds_fall_with_misses_that_calls_could_detect_until_deletion():
+    known = missed = heard_so_often(3)
+    assert judged(known, NONE, THERE, SEEN, 3).odds[0] == known.odds[0]
+    for scan in range(1, 6):
+        missed = judged(missed, NONE, THERE, UNSEEN, 2 + scan)
+        assert missed.odds[0] == pytest.approx(known.odds[0] - scan * log_ratio(UNSEEN[0]))
     assert missed.odds[0] < GONE
-
-
-def test_a_landmark_that_no_call_can_detect_keeps_its_odds():
-    known = heard_so_often(3)
-    after = judged(known, NONE, THERE, SEEN, 3)
-    assert after.odds[0] == known.odds[0]
 
 
 def learned(source, place, hits=9.0):
@@ -92,11 +80,11 @@ def test_detection_probabilities_are_learned_by_level_and_bearing():
 
 
 def test_detection_probabilities_without_levels_are_learned_by_range():
-    mean = np.array([0.0, 0.0, 0.0, 1.5, 0.0, 4.1, 0.0])
-    there = mean, np.array([3, 5]), np.array([-2]), np.array([False])
-    p, bins = learned(np.full((2, 1), np.nan), there)
+    mean = np.array([0.0, 0.0, 0.0, 1.5, 0.0, 4.1, 0.0, 90.0, 0.0, 150.0, 0.0])
+    there = mean, np.array([3, 5, 7, 9]), np.array([-2]), np.array([False])
+    p, bins = learned(np.full((4, 1), np.nan), there)
     assert (p > 0.0).all()
-    assert bins[:, 0].tolist() == [SECTORS, 4 * SECTORS]
+    assert bins[:, 0].tolist() == [SECTORS, 4 * SECTORS, 12 * SECTORS, 14 * SECTORS]
 
 
 @pytest.mark.parametrize(("moves", "detectable"), [(False, True), (True, False)])
@@ -108,8 +96,7 @@ def test_a_caller_that_has_moved_too_far_away_detects_no_landmark(moves, detecta
 
 
 def test_an_unconfirmed_landmark_is_deleted_after_a_long_silence():
-    known = heard_so_often(1)
-    nowhere = (AHEAD, np.array([-1]), *THERE[2:])
+    known, nowhere = heard_so_often(1), (AHEAD, np.array([-1]), *THERE[2:])
     for scan in range(1, PATIENCE + 2):
         known = judged(known, NONE, nowhere, SEEN, scan)
     assert known.odds[0] < GONE

@@ -20,14 +20,14 @@ CHANCES = (25.0, 0.06, 1.2, 0.8, 0.06)
 PLACES = np.random.default_rng(2).uniform(-10.0, 10.0, (20, 2))
 EXPECTED = np.array([9.0, 6.0])
 AT = 3 + 2 * len(PLACES)
+MEAN = np.concatenate([np.zeros(3), PLACES.ravel(), EXPECTED])
+LABELS = np.arange(1, len(PLACES) + 2)
 
 
 def tried(caller, heard=20):
     """Return where a caller at a place is taken for, that is expected elsewhere."""
-    mean = np.concatenate([np.zeros(3), PLACES.ravel(), EXPECTED])
-    covariance = np.diag([1e-4] * (mean.size - 2) + [0.01, 0.01])
-    labels = np.arange(len(PLACES) + 1)
-    joint = JointGaussian(landmark=labels, mean=mean, covariance=covariance)
+    covariance = np.diag([1e-4] * AT + [0.01, 0.01])
+    joint = JointGaussian(landmark=LABELS, mean=MEAN, covariance=covariance)
     seen = PLACES[:heard]
     bearing = np.arctan2(seen[:, 1], seen[:, 0])
     way = np.array([excess_path_slopes(0.0, 0.0, *place, *caller)[0] for place in seen])
@@ -53,24 +53,14 @@ def test_a_caller_at_its_expected_position_or_with_few_rows_stays_there():
 
 @pytest.mark.parametrize(
     ("moves", "hears_itself", "heard_before", "begun"),
-    [
-        (True, True, True, 0),
-        (False, True, True, 20),
-        (True, False, True, 20),
-        (True, True, False, 20),
-    ],
+    [(True,) * 3 + (0,), (False, True, True, 20), (True, False, True, 20), (True, True, False, 20)],
 )
 def test_rows_of_a_misplaced_caller_begin_no_landmark(moves, hears_itself, heard_before, begun):
     """Of one that stands they are new, and who only listens has nothing else to go by."""
     size, rng = len(PLACES), np.random.default_rng(5)
-    mean = np.concatenate([np.zeros(3), PLACES.ravel(), EXPECTED])
-    joint = JointGaussian(
-        landmark=np.arange(1, size + 2), mean=mean, covariance=1e-4 * np.eye(mean.size)
-    )
-    source = np.full((size, 2), 60.0 if heard_before else np.nan)
-    known = with_new(nobody(2), list(range(1, size + 1)), 0, 2)._replace(
-        confirmed=np.ones(size, bool), source=source
-    )
+    joint = JointGaussian(landmark=LABELS, mean=MEAN, covariance=1e-4 * np.eye(MEAN.size))
+    known = with_new(nobody(2), LABELS[:-1].tolist(), 0, 2)
+    known.confirmed[:], known.source[:] = True, 60.0 if heard_before else np.nan
     caller = CallerState(label=size + 1, place=CallerPlace(*EXPECTED), told=True)
     memory = Memory(scan=5, labels=size + 1, known=known, callers={1: caller})
     bearing = np.append(np.arange(-3.0, 3.0, 0.3), np.arctan2(EXPECTED[1], EXPECTED[0]))
@@ -86,8 +76,7 @@ def test_rows_of_a_misplaced_caller_begin_no_landmark(moves, hears_itself, heard
         excess_path_std=0.02,
         level_db=np.full(size + 2, 40.0),
     )
-    moving = np.ones(1, int) if moves else np.empty(0, int)
-    scan = replace(heard, direct=np.array([-1, size]), moving_callers=moving)
+    scan = replace(heard, direct=np.array([-1, size]), moving_callers=np.ones(int(moves), int))
     stage = association_of(Config(association=AssociationConfig(method="marginal")))
     after, assignment = stage.associate(memory, SimpleNamespace(joint=lambda: joint), scan)
     assert after.labels - memory.labels == begun

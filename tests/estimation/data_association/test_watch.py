@@ -11,6 +11,7 @@ from pipistrelle.detection.scans import UNLABELLED, make_scan
 from pipistrelle.estimation.beliefs import Gaussian, JointGaussian
 from pipistrelle.estimation.catalogue import entry
 from pipistrelle.estimation.data_association.existence import (
+    BINS,
     CHANCE,
     LASTING,
     PERSISTENCE,
@@ -155,33 +156,56 @@ def scan_from(rng, pose, landmarks, caller):
     return Rows(bearing, std, way, std, np.ones(10)), np.array([towards, 0.01])
 
 
+def joint_of(pose, landmarks):
+    """Return a surely known map, its landmarks numbered from 1, and pose."""
+    mean = np.concatenate([pose, np.stack([landmarks.real, landmarks.imag]).T.ravel()])
+    labels = np.arange(1, landmarks.size + 1)
+    return JointGaussian(landmark=labels, mean=mean, covariance=1e-4 * np.eye(mean.size))
+
+
+def detecting(bins):
+    """Return a watch whose call detects 9 of 11 old landmarks in the first bins, else none."""
+    watch = of_calls(1)
+    watch.hits[:, :bins], watch.asked[:] = 9, 10
+    return watch
+
+
 @pytest.mark.parametrize("caller", [None, CALLER])
 @pytest.mark.parametrize("off", [(0.0, 0.0, 0.7), (1.5, -1.0, 0.0), (-3.0, 2.0, 2.5)])
 def test_pose_is_found_again_on_map(rng, caller, off):
     landmarks = rng.uniform(-9.0, 9.0, 12) + 1j * rng.uniform(-9.0, 9.0, 12)
-    places = np.append(landmarks, CALLER)
     pose = np.array([0.5, -0.4, 0.3])
-    mean = np.concatenate([pose - off, np.stack([places.real, places.imag]).T.ravel()])
-    joint = JointGaussian(landmark=np.arange(1, 14), mean=mean, covariance=1e-4 * np.eye(mean.size))
-    at = OWN_CALL if caller is None else mean.size - 2
+    joint = joint_of(pose - off, np.append(landmarks, CALLER))
+    at = OWN_CALL if caller is None else joint.mean.size - 2
     heard = (0, *scan_from(rng, pose, landmarks, caller), at)
     found = placed_again(of_calls(1), joint, *PLACES, [heard], CHANCES)
     assert found is not None
     assert found.mean[:3] == pytest.approx(pose, abs=0.15)
-    assert np.array_equal(found.mean[3:], mean[3:])
+    assert np.array_equal(found.mean[3:], joint.mean[3:])
 
 
 def test_pose_is_not_found_in_clutter(rng):
     landmarks = rng.uniform(-9.0, 9.0, 12) + 1j * rng.uniform(-9.0, 9.0, 12)
-    mean = np.concatenate([np.zeros(3), np.stack([landmarks.real, landmarks.imag]).T.ravel()])
-    joint = JointGaussian(landmark=np.arange(12), mean=mean, covariance=1e-4 * np.eye(27))
-    std = np.full(6, 0.01)
-    watch = of_calls(1)
-    watch.hits[:], watch.asked[:] = 9, 10
+    joint, std = joint_of(np.zeros(3), landmarks), np.full(6, 0.01)
     for _ in range(20):
         rows = Rows(rng.uniform(-1.5, 1.5, 6), std, rng.uniform(1.0, 9.0, 6), std, np.ones(6))
         heard = [(0, rows, np.zeros(2), OWN_CALL)]
-        assert placed_again(watch, joint, *PLACES, heard, CHANCES) is None
+        assert placed_again(detecting(BINS), joint, *PLACES, heard, CHANCES) is None
+
+
+@pytest.mark.parametrize("silent", [0.0, 60.0])
+def test_pose_is_where_fewer_landmarks_are_missed(rng, silent):
+    """Two places have the same landmarks, one has four more; calls reach 16 m."""
+    near = rng.uniform(2.0, 9.0, (2, 4)) * np.exp(1j * rng.uniform(-1.0, 1.0, (2, 4)))
+    landmarks, std = np.concatenate([near[0], near[0] + 60.0, near[1] + silent]), np.full(4, 0.01)
+    rows = Rows(np.angle(near[0]), std, abs(near[0]), std, np.ones(4))
+    joint, heard = (
+        joint_of(np.array([30.0, 30.0, 1.0]), landmarks),
+        (0, rows, np.zeros(2), OWN_CALL),
+    )
+    found = placed_again(detecting(BINS // 3), joint, *PLACES, [heard], CHANCES)
+    assert found is not None
+    assert found.mean[:3] == pytest.approx([60.0 - silent, 0.0, 0.0], abs=0.15)
 
 
 def drive(rng, scans, event, turn=0.0, callers=()):

@@ -55,9 +55,9 @@ FORGETTING = 0.2
 """Weight of the newest level in the mean."""
 PERSISTENCE = 5
 """Scans over which the misses of a landmark are correlated."""
-RINGS, SECTORS = 12, 8
+RINGS, SECTORS = 24, 8
 """Bins of detection probabilities: levels, `LEVEL_STD` wide, else ranges from 1 m by factors of the
-root of 2, and bearings."""
+root of 2 (to 4 km), and bearings."""
 BINS = RINGS * SECTORS
 WINDOW = REMEMBERED
 """Scans of which `Known.past` is kept."""
