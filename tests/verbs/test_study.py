@@ -190,7 +190,7 @@ def test_a_length_of_time_is_worded_in_the_unit_that_fits(seconds, words):
         (
             "none.toml",
             "none.toml: found no such file; expected association, beyond, callers, pair, paper, "
-            "physics, timing or the path of",
+            "physics, sweeps, timing or the path of",
         ),
         ("small.toml --iterations 0", "--iterations: found 0, expected 1 to 1000000"),
         ("small.toml --iterations 2.5", "--iterations: found '2.5', expected a whole number"),

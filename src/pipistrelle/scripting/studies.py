@@ -149,8 +149,8 @@ def study(
     Parameters
     ----------
     plan : str or mapping
-        "paper", "physics", "beyond", "timing", "association", "callers", "pair", or a FILE.toml
-        like the plan.toml of a study; in Python also its content as a table.
+        "paper", "physics", "beyond", "timing", "association", "callers", "pair", "sweeps", or a
+        FILE.toml like the plan.toml of a study; in Python also its content as a table.
     iterations : int, optional
         Number of worlds.
     workers : int

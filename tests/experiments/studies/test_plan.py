@@ -315,7 +315,7 @@ def test_a_flag_that_contradicts_a_plan_is_named(refused, text, flag, said):
 
 
 def test_a_plan_that_is_not_there_is_refused():
-    plans = "association, beyond, callers, pair, paper, physics, timing"
+    plans = "association, beyond, callers, pair, paper, physics, sweeps, timing"
     said = rf"^none\.toml: found no such file; expected {plans} or the path"
     with pytest.raises(InputError, match=said):
         find_plan("none.toml")
@@ -457,13 +457,16 @@ def test_a_missing_route_of_a_caller_is_refused(refused):
     assert "boat.csv: found no such file" in refused(BARE + "[[config.callers]]\nroute='boat.csv'")
 
 
-def test_timing_is_beyond_with_timing_and_nothing_else():
-    timing, beyond = (plan_settings(read_plan(find_plan(name))) for name in ("timing", "beyond"))
-    differ = {
-        name for name in timing.keys() | beyond.keys() if timing.get(name) != beyond.get(name)
-    }
-    assert differ == {"name", "config.listening.timing"}
-    assert timing["config.listening.timing"] is True
+@pytest.mark.parametrize(
+    ("name", "of", "sections"),
+    [("timing", "beyond", ()), ("sweeps", "association", ("config.emitter", "config.beacon"))],
+)
+def test_a_plan_has_the_worlds_of_another_with_timing(name, of, sections):
+    plan, other = (plan_settings(read_plan(find_plan(word))) for word in (name, of))
+    differ = {key for key in plan.keys() | other.keys() if plan.get(key) != other.get(key)}
+    there = {key.rpartition(".")[0] for key in differ if not key.startswith("grid.")}
+    assert there == {"", "config.listening", *sections}
+    assert plan["config.listening.timing"] is True
 
 
 @pytest.mark.parametrize("name", ["callers", "pair"])
