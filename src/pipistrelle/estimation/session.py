@@ -6,7 +6,7 @@ it and all later scans, with their labels or with data association.
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any, Generic, NamedTuple
 
 import numpy as np
@@ -40,8 +40,7 @@ Leg = tuple[Controls, Durations]
 """Control steps and their durations [s]."""
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class StoredScan:
+class StoredScan(NamedTuple):
     """A scan that data association may still revise, with the belief and memory before it."""
 
     number: int
@@ -275,7 +274,7 @@ class Session(Generic[B]):
                     pair for pair in merge if _present(self.belief, pair) == _present(before, pair)
                 )
                 since = past[first].number - self._first
-            past[n] = replace(past[n], belief=self.belief, merge=merge)
+            past[n] = past[n]._replace(belief=self.belief, merge=merge)
             used, n = self._use(past[n], since), n + 1
             if n == len(past):
                 self._past = past[-REMEMBERED:]
@@ -286,7 +285,7 @@ class Session(Generic[B]):
     def _decided(self, past: list[StoredScan], n: int, asked: set[int]) -> tuple[int, int]:
         """Associate a scan; return the first scans to be repeated and to be associated next."""
         scan, association = past[n].original, self._association
-        past[n] = replace(past[n], belief=self.belief, memory=self._memory)
+        past[n] = past[n]._replace(belief=self.belief, memory=self._memory)
         stated = self._noise(scan) if self._noise else scan
         answer = association.associate(self._memory, self.belief, stated)
         if not (isinstance(answer, tuple) and len(answer) == 2 and type(answer[1]) is Assignment):
@@ -299,16 +298,15 @@ class Session(Generic[B]):
         back = min(max(min(again) - past[0].number, 0), n)
         self._memory = association.carried(past[back].memory, self._memory)
         removed = tuple({label for one in past[back:n] for label in one.remove})
-        past[back : n + 1] = [replace(one, remove=()) for one in past[back : n + 1]]
-        past[back] = replace(past[back], remove=removed)  # other labels may be issued again
+        past[back : n + 1] = [one._replace(remove=()) for one in past[back : n + 1]]
+        past[back] = past[back]._replace(remove=removed)  # other labels may be issued again
         return back, back
 
     def _revised(self, past: list[StoredScan], n: int, found: Assignment) -> int:
         """Apply an assignment to its scan and to earlier scans; return the first to be repeated."""
         merges = [pair for one in past[:n] for pair in one.merge]
         remove = (*found.remove, *(gone for kept, gone in merges if kept in found.remove))
-        past[n] = replace(
-            past[n],
+        past[n] = past[n]._replace(
             scan=found.scan or past[n].original,
             label=found.label,
             merge=found.merge,
@@ -325,7 +323,7 @@ class Session(Generic[B]):
                 affected = (counts > 1).any() or _present(one.belief, once.tolist())
                 if affected or scan is not one.scan:
                     repeated.append(m)
-                past[m] = replace(one, label=np.where(gone, UNLABELLED, label), scan=scan)
+                past[m] = one._replace(label=np.where(gone, UNLABELLED, label), scan=scan)
                 at, label = one.number - self._first, self.labels[one.number - self._first]
                 self.labels[at] = np.where(is_among(label, named), UNLABELLED, label)
         if len(repeated) == 1:
@@ -358,9 +356,10 @@ def _present(belief: Any, labels: Sequence[int]) -> list[int]:
 
 def _edited(belief: B, remove: Sequence[int] = (), merge: Sequence[tuple[int, int]] = ()) -> B:
     """Return a belief with landmarks removed, if it has them, and pairs of duplicates merged."""
+    if not (remove := _present(belief, remove)) and not merge:
+        return belief
     editable: Any = completed(belief, Belief)
-    remove = _present(belief, remove)
-    return editable.edited(remove, merge) if remove or merge else belief
+    return editable.edited(remove, merge)
 
 
 def check_poses(method: str, poses: Gaussian, size: int) -> None:

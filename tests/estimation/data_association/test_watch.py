@@ -58,27 +58,24 @@ def test_scan_records_log_probability_of_misses_as_far_as_strays_may_be_of_them(
     places = np.array([[3.0, 0.0], [3.0, 1.0], [3.0, -1.0], [2.0, 2.0], [5.0, 0.0]])
     mean, known = np.append(np.zeros(3), places), known_of(np.zeros((5, 1)), [0] * 5)
     known.count[[0, 1, 2, 4]] = LASTING, LASTING, LASTING, LASTING
-    sums = of_calls(1)[:4]
-    hits, asked, p = 8.0, 9.0, 0.8
+    before, p = of_calls(1)[:4], 0.8
+    before[0][:], before[1][:] = 8.0, 9.0
     for strays, share in ((0, 0.0), (1, 1.0 / 1.6), (4, 1.0)):
-        hits_, asked_, found, expected = (part.copy() for part in sums)
-        hits_[:], asked_[:] = hits, asked
         bearing, way = np.append([0.0, 0.785], np.full(strays, 2.0)), np.full(2 + strays, 9.0)
         way[:2] = 3.0, 2.83
         label = np.array([1, *[UNLABELLED] * (1 + strays)])
         std, number = np.full(way.size, 0.01), np.zeros(way.size, np.int64)
         sure = np.arange(way.size) >= 2
-        heard = label, number, sure, bearing, std, way, std, np.ones(way.size)
+        heard = label, number, sure, std > 0.0, bearing, std, way, std, np.ones(way.size)
         at = np.array([3, 5, 7, 9, -1])
         place = mean, at, np.full(1, OWN_CALL), np.zeros(1, np.bool_)
-        updated, judged = (hits_, asked_, found, expected), np.ones(1, np.bool_)
-        scan = 1e-6 * np.eye(13), place, judged, heard, CHANCES
-        past, missed = observed(tuple(known), updated, *scan)
+        scan = 1e-6 * np.eye(13), place, np.ones(1, np.bool_), heard, CHANCES, 90
+        *after, past, missed, _ = observed(tuple(known), before, *scan)
         miss = share * math.log(1.0 - p)
         assert past[:, 0, -1] == pytest.approx([1.0, miss, miss, 0.0, 0.0])
         assert missed == pytest.approx([1.0, *[(1.0 - p) ** (1.0 / PERSISTENCE)] * 3, 1.0])
-        assert (hits_.sum() - hits * hits_.size, asked_.sum() - asked * asked_.size) == (1, 3)
-        assert [*found, *expected] == pytest.approx([1.0, 3 * p])
+        assert [(after[k] - before[k]).sum() for k in range(2)] == [1, 3]
+        assert [*after[2], *after[3]] == pytest.approx([1.0, 3 * p])
 
 
 def test_ratio_counts_each_landmark_once_and_by_scans_after_its_first():
@@ -86,7 +83,7 @@ def test_ratio_counts_each_landmark_once_and_by_scans_after_its_first():
     miss, q, now = math.log(0.2), CHANCE, 90
     past = [[miss, miss], [miss, 1.0], [1.0, miss], [0.0, miss]]
     known = known_of(past, [3, 3, 3, now - 1])
-    found = ratios(tuple(known), np.arange(4), now)[0, -2:]
+    found = ratios(known.past, known.born, known.confirmed, now)[0, -2:]
 
     def missed(m):
         return math.log((1 - q + q * m) / (q + (1 - q) * m))
@@ -104,15 +101,17 @@ def drawn_past(rng, share, scans):
 
 def test_alarm_follows_only_a_loss_of_detections(rng):
     """One landmark in ten is hidden: no alarm in a thousand drives; else one in three scans."""
-    judged, old = np.ones(1, np.int64), np.arange(15)
+    judged, known = np.ones(1, np.int64), known_of(np.zeros((15, WINDOW)), [0] * 15)
+
+    def failure(past):
+        ratio = ratios(past[:, np.newaxis], known.born, known.confirmed, 90)
+        return failed(of_calls(1), ratio, judged)
+
     for _ in range(1000):
-        known = known_of(drawn_past(rng, 0.9, WINDOW), [0] * 15)
-        assert not failed(of_calls(1), ratios(tuple(known), old, 90), judged)[0]
+        assert not failure(drawn_past(rng, 0.9, WINDOW))[0]
     for _ in range(50):
         past = np.hstack([drawn_past(rng, 1.0, WINDOW - 3), drawn_past(rng, 0.0, 3)])
-        calls, since, pose = failed(
-            of_calls(1), ratios(tuple(known_of(past, [0] * 15)), old, 90), judged
-        )
+        calls, since, pose = failure(past)
         assert (calls, pose) == ([0], True)
         assert WINDOW - 4 <= since <= WINDOW - 2
 

@@ -177,7 +177,8 @@ def judged(
 
     ``missed``: probability m that an existing landmark is in no measurement.
     """
-    after = Known(*(column.copy() for column in known))
+    names = "heard", "count", "odds", "confirmed", "source", "together"
+    after = known._replace(**{name: getattr(known, name).copy() for name in names})
     _judge(tuple(after), rows, place, missed, scan)
     return after
 

@@ -193,10 +193,12 @@ def pair_costs(
         across, b, along = _spread(covariance, H, index, 5 if caller < 0 else 7)
         unsure = across * along - b * b if caller == OWN_CALL else 0.0
         for m in range(heard.bearing.size):
-            if unsure > max(made.vague, BARELY * heard.bearing_std[m] * heard.way_std[m]) ** 2:
-                continue
             nu = wrap_angle(heard.bearing[m] - bearing)
             a = across + heard.bearing_std[m] ** 2
+            if nu * nu > made.gate * a:  # the bearing only, which is fast
+                continue
+            if unsure > max(made.vague, BARELY * heard.bearing_std[m] * heard.way_std[m]) ** 2:
+                continue
             if math.isnan(heard.way[m]) or caller == UNPLACED:
                 squared, size = nu * nu / a, 2.0 * math.pi * a
                 density = made.bearing_clutter

@@ -222,7 +222,7 @@ def _read(
         usable[m] = _within(bearing_std[m], limit, assumed) and (bare or within)
         with_way[m] = usable[m] and not bare
         sure[m] = _within(way_std[m], birth_limit, assumed)
-        if not _is_assumed(bearing_std[m], assumed):
+        if bearing_std[m] not in assumed:
             share = SURE_SHARE * limit / bearing_std[m]
             surety[m] = share if share < 1.0 else 1.0  # also for NaN
             rare = bearing_std[m] / (RARE_SHARE * limit)
@@ -231,19 +231,10 @@ def _read(
     return caller, bearing, bearing_std, way, way_std, numbers[LEVEL], *told
 
 
-@no_alloc
+@kernel
 def _within(std: float, limit: float, assumed: Float[np.ndarray, " a"]) -> Flag:
     """Return whether a standard deviation is within a limit or is a default."""
-    return std <= limit or _is_assumed(std, assumed)
-
-
-@no_alloc
-def _is_assumed(std: float, assumed: Float[np.ndarray, " a"]) -> Flag:
-    """Return whether a standard deviation is one of the assumed defaults."""
-    found = False
-    for one in assumed:
-        found |= std == one
-    return found
+    return std <= limit or std in assumed
 
 
 @kernel

@@ -56,7 +56,6 @@ from pipistrelle.estimation.data_association.pairs import (
 from pipistrelle.estimation.data_association.rows import (
     CallerPlace,
     CallerState,
-    Joint,
     Memory,
     Model,
     Tracks,
@@ -174,9 +173,7 @@ class Sequential(Association[Memory]):
         work.search_callers()
         work.match_all()
         work.watch_calls()
-        after, assignment = work.finished()
-        again = {} if work.back is None else {work.back: None}
-        return after, replace(assignment, revised=again)
+        return work.finished()
 
 
 class _Work:
@@ -190,15 +187,17 @@ class _Work:
         )
         drift, limits = drift_of(memory, self.pose), stage.limits
         self.model: Model = (*drift, *stage.motion, stage.chances[1] / stage.chances[3])
-        self.given = scan.landmark.copy()
-        self.given[scan.direct[scan.direct >= 0]] = UNLABELLED
-        issued = memory.known.label[np.isfinite(memory.known.odds)]
-        if (taken := is_among(self.given, issued)).any():
-            found = f"association at {scan.time} s: found the label {self.given[taken][0]}"
-            expected = "expected one that is not given to another landmark already"
-            raise InputError(f"{found}, {expected}; add a number to yours, such as 1000000")
+        self.given, self.labels = scan.landmark.copy(), memory.labels
+        self.states = self.given.max(initial=UNLABELLED) > UNLABELLED
+        if self.states:
+            self.given[scan.direct[scan.direct >= 0]] = UNLABELLED
+            self.labels = max(memory.labels, int(self.given.max()))
+            issued = memory.known.label[np.isfinite(memory.known.odds)]
+            if (taken := is_among(self.given, issued)).any():
+                found = f"association at {scan.time} s: found the label {self.given[taken][0]}"
+                expected = "expected one that is not given to another landmark already"
+                raise InputError(f"{found}, {expected}; add a number to yours, such as 1000000")
         self.label, self.merge, self.fits = self.given.copy(), [], self.given == UNLABELLED
-        self.labels = max(memory.labels, int(self.given.max(initial=0)))
         self.callers = dict(memory.callers)
         self.numbers, self.named = scan.numbers, np.full(scan.direct.size, UNLABELLED)
         self.moves = {*scan.moving_callers.tolist()}
@@ -208,7 +207,8 @@ class _Work:
         self.rows = rows_of_scan(scan, most, limits.assumed)
         self.new: list[int] = []
         self.doubted = self.moves | {n for n, caller in self.callers.items() if caller.failed}
-        self.before, self.watch, self.known = self.joint, memory.watch, memory.known
+        self.before, self.known = self.joint, memory.known
+        self.confirmed = self.known.label[self.known.confirmed]
         self.back: int | None = None
         self.blind, self.begins = False, not memory.watch.lost
 
@@ -241,39 +241,49 @@ class _Work:
 
     def match_all(self) -> None:
         """Match the measurements of each caller with landmarks, the vehicle's own first."""
-        for number in sorted({*self.scan.caller.tolist()}):
+        called, memory = sorted({*self.scan.caller.tolist()}), self.memory
+        for number in called:
             self.match(number)
+        size = max(self.scan.direct.size, memory.known.source.shape[1], len(memory.watch.hits))
+        numbers = range(max(size, 1 + max((OWN, *called, *self.callers))))
+        where = {number: self._where(caller.label) for number, caller in self.callers.items()}
+        self.where = np.array([OWN_CALL, *(where.get(n, UNPLACED) for n in numbers[1:])])
+        judged = {OWN, *(number for number, at in where.items() if at >= 0)} & {*called}
+        masks = [[number in some for number in numbers] for some in (judged, self.moves)]
+        self.judged, self.roving = np.array(masks)
 
     def watch_calls(self) -> None:
         """Judge each call by its measurements of old landmarks; repair a failed call or pose."""
-        judged, where = self._calls()
-        fixed, watched = judged & ~self._moves(judged.size), self._observed(judged, where)
-        watched = watched._replace(times=np.append(watched.times[1:], self.scan.time))
+        self.watch, ratio = self._observed()
+        if self.watch.lost or ratio.max() >= watch.BOUND:
+            self.watch = self._repaired(self.watch, ratio)
+
+    def _repaired(self, watched: Watched, ratio: Float[np.ndarray, "c w"]) -> Watched:
+        """Repair a failed call or pose, by the ratios of failures; return the later watch."""
+        fixed = self.judged & ~self.roving
         least = np.where(fixed, 1, WINDOW + 1)
         for number in {*self.callers} & {*np.flatnonzero(fixed).tolist()}:
             row = self._direct(number)
             fits = row >= 0 and self.label[row] == self.callers[number].label
             least[number] = watch.SPOILT if fits else WINDOW // 2
-        ratio = watch.ratios(tuple(self.known), self._old(), self.memory.scan)
-        ratio[self._moves(judged.size)] = 0.0
         calls, since, pose = watch.failed(watched, ratio, least)
         fits = bool((ratio[fixed, -1] < 0.0).any()) and not calls
         if watched.lost and self.scan.landmark.size and not fits:
-            joint, times, lost = self._placed_again(), watched.times, watched.lost + 1
+            joint, lost = self._placed_again(), watched.lost + 1
             self.blind = joint is None and lost <= watch.SETTLED
             self.begins = joint is None and not self.blind
             self._match_again(joint or self.before)
-            watched = watch.of_calls(where.size, self.memory.watch)
-            watched = self._observed(judged, where) if joint else watched
-            watched = watched._replace(times=times, lost=0 if self.begins else lost)
+            again = self._observed()[0] if joint else self.memory.watch
             self.known.past[:] *= not self.begins
-        elif calls and self.back is None:
-            watched = self._alarmed(watched, calls, since, pose)
-        elif watched.lost and ratio[:, -watched.lost :].sum(axis=0).min() <= -watch.BOUND:
+            return again._replace(times=watched.times, lost=0 if self.begins else lost)
+        if calls and self.back is None:
+            return self._alarmed(watched, calls, since, pose)
+        if watched.lost and ratio[:, -watched.lost :].sum(axis=0).min() <= -watch.BOUND:
             pose = np.flatnonzero(watched.alarms[:, 1] == watch.POSE)[-1]
-            watched.alarms[pose, 2], watched = 1.0, watched._replace(lost=0)
+            watched = watched._replace(alarms=watched.alarms.copy(), lost=0)
+            watched.alarms[pose, 2] = 1.0
             self.known.past[..., :-1] = 0.0
-        self.watch = watched
+        return watched
 
     def _alarmed(self, watched: Watched, calls: list[int], since: int, pose: bool) -> Watched:
         """Report a failure of the pose or of calls; set failed callers aside, since its scan."""
@@ -299,49 +309,33 @@ class _Work:
 
     def _placed_again(self) -> JointGaussian | None:
         """Return the joint Gaussian with the pose that the scan has on the old map, if any."""
-        (judged, where), at, rows, heard = self._calls(), self._old(), self.rows, []
-        for number in np.flatnonzero(judged & ~self._moves(judged.size)).tolist():
+        where, rows, heard, known = self.where, self.rows, [], self.known
+        for number in np.flatnonzero(self.judged & ~self.roving).tolist():
             row = self._direct(number)
             if number == OWN or (row >= 0 and where[number] < self.before.mean.size):
                 used = rows.with_way & (rows.caller == number)
                 used[row] &= number == OWN
                 direct = np.array([rows.bearing[row], rows.bearing_std[row]])
                 heard.append((number, self._some(used), direct, int(where[number])))
-        watched, old = watch.of_calls(where.size, self.memory.watch), at >= 0
-        placed = at[old], self.known.source[old], heard
+        watched, at = watch.of_calls(where.size, self.memory.watch), self._place(known.label)[1]
+        old = known.confirmed & (at >= 0)
+        placed = at[old], known.source[old], heard
         return watch.placed_again(watched, self.before, *placed, self.stage.chances)
 
-    def _observed(self, judged: Bool[np.ndarray, " c"], where: Int[np.ndarray, " c"]) -> Watched:
-        """Record which old landmarks each call has detected; return the watch with the counts."""
-        known = existence.with_new(self.memory.known, [], self.memory.scan, judged.size)
-        rows = self.rows
-        watched = watch.of_calls(judged.size, self.memory.watch)
-        std = np.where(rows.usable, rows.bearing_std, math.nan)
-        label = np.where(self.fits, self.label, UNLABELLED)
-        heard = label, rows.caller, rows.sure, rows.bearing, std, *rows[3:5], rows.clutter
-        chances, place = (*self.stage.chances[:4], math.inf), self._place(known.label, where)
-        placed = self.joint.covariance, place, judged, heard, chances
-        past, self.missed = watch.observed(tuple(known), watched[:4], *placed)
-        self.known = known._replace(past=past)
-        return watched
-
-    def _old(self) -> Int[np.ndarray, " l"]:
-        """Return the confirmed landmarks' joint-mean indices; -1 for others."""
-        at = places_of(self.memory.known.label, self.joint.landmark)
-        return np.where(self.memory.known.confirmed, at, -1)
-
-    def _calls(self) -> tuple[Bool[np.ndarray, " c"], Int[np.ndarray, " c"]]:
-        """Return whether to judge each call by this scan, and callers' joint-mean indices."""
-        scan, source = self.scan, self.memory.known.source
-        size = max(1 + scan.caller.max(initial=0), scan.direct.size, source.shape[1])
-        size = max(size, len(self.memory.watch.hits), 1 + max(self.callers, default=0))
-        where, judged = np.full(size, UNPLACED), np.zeros(size, np.bool_)
-        where[OWN] = OWN_CALL
-        for number, caller in self.callers.items():
-            where[number] = self._where(caller.label)
-        for number in {*scan.caller.tolist()}:
-            judged[number] = number == OWN or where[number] >= 0
-        return judged, where
+    def _observed(self) -> tuple[Watched, Float[np.ndarray, "c w"]]:
+        """Record which old landmarks each call has detected; return the watch, and its ratios."""
+        memory, rows = self.memory, self.rows
+        known = existence.with_new(memory.known, [], memory.scan, self.where.size)
+        label = np.where(self.fits, self.label, UNLABELLED) if self.states else self.label
+        heard = label, rows.caller, rows.sure, rows.usable, *rows[1:5], rows.clutter
+        chances, place = (*self.stage.chances[:4], math.inf), self._place(known.label)
+        placed = self.joint.covariance, place, self.judged, heard, chances, memory.scan
+        hits, asked, found, expected, past, self.missed, ratio = watch.observed(
+            tuple(known), memory.watch[:4], *placed
+        )
+        self.known, watched = known._replace(past=past), memory.watch
+        times = np.append(watched.times[1:], self.scan.time)
+        return Watched(hits, asked, found, expected, times, *watched[5:]), ratio
 
     def match(self, number: int) -> None:
         """Match a caller's measurements with landmarks; begin landmarks where none fits."""
@@ -351,19 +345,18 @@ class _Work:
         caller = number, self._direct(number), at
         if number in self.moves and at >= 0:
             self._follow_turn(number, at)
-        rows, chances, known = tuple(self.rows), self.stage.chances, self.memory.known
-        joint = self._joint()
+        rows, chances = tuple(self.rows), self.stage.chances
+        joint = self.joint.landmark, self.joint.mean, self.joint.covariance
         used, costs, near = compared(rows, joint, self.moving, caller, chances)
-        stated = used[self.given[used] != UNLABELLED]
+        stated = used[self.given[used] != UNLABELLED] if self.states else used[:0]
         wrong = stated.size > 0 and self._refuted(costs, used)
-        matched = used, self.stage.match(costs), near
-        confirmed = known.label[known.confirmed]
+        matched, confirmed = (used, self.stage.match(costs), near), self.confirmed
         begun, count = label_matched(self.label, rows, joint, confirmed, matched, caller, chances)
         if stated.size:
             begun = begun[(self.given[begun] == UNLABELLED) & (not wrong)]
             begun = np.append(begun, self._stated(stated))
         strayed = begun.size and number in self.doubted and self._is_elsewhere(number, count)
-        if self.begins and not strayed:
+        if begun.size and self.begins and not strayed:
             self._begin(number, begun)
 
     def _refuted(self, costs: Float[np.ndarray, "r n"], used: Int[np.ndarray, " r"]) -> bool:
@@ -459,34 +452,29 @@ class _Work:
         )
         remove = tuple(sorted(gone.tolist()))
         merge = (*self.merge, *merge)
-        return after, Assignment(label=self.label, remove=remove, merge=merge, scan=scan)
+        again = {} if self.back is None else {self.back: None}
+        found = {"label": self.label, "remove": remove, "merge": merge, "scan": scan}
+        return after, Assignment(**found, revised=again)
 
     def _judged(self) -> tuple[Known, Int[np.ndarray, " l"]]:
         """Return all landmark records with updated log odds, and joint-mean indices or -1."""
         scan, rows = self.memory.scan, self.rows
-        _, callers = self._calls()
-        given = self.given[~is_among(self.given, np.append(self._callers_labels(), UNLABELLED))]
-        new = self.new + sorted({*given.tolist()} - {*self.known.label.tolist()})
-        known = existence.with_new(self.known, new, scan, callers.size)
-        known = existence.stated(existence.merged(known, self.merge), given)
-        missed = dict(zip(self.known.label.tolist(), self.missed.tolist(), strict=True))
-        chances = np.array([missed.get(label, 1.0) for label in known.label.tolist()])
+        known = existence.with_new(self.known, self.new, scan, self.where.size)
+        missed = np.append(self.missed, np.ones(len(self.new))) if self.new else self.missed
+        if self.states:
+            given = {*self.given.tolist()} - {UNLABELLED, *self._callers_labels().tolist()}
+            known = existence.with_new(known, sorted(given - {*known.label.tolist()}), scan, 1)
+            known = existence.merged(known, self.merge)
+            known = existence.stated(known, np.array([*given], np.int64))
+            each = dict(zip(self.known.label.tolist(), self.missed.tolist(), strict=True))
+            missed = np.array([each.get(label, 1.0) for label in known.label.tolist()])
         heard = self.label, rows.caller, rows.level_db, rows.surety
-        place = self._place(known.label, callers)
-        return existence.judged(known, heard, place, chances, scan), place[1]
+        place = self._place(known.label)
+        return existence.judged(known, heard, place, missed, scan), place[1]
 
-    def _place(
-        self, label: Int[np.ndarray, " l"], callers: Int[np.ndarray, " c"]
-    ) -> existence.Place:
+    def _place(self, label: Int[np.ndarray, " l"]) -> existence.Place:
         """Return the joint mean, and indices in it of landmarks and callers."""
-        at = places_of(label, self.joint.landmark)
-        return self.joint.mean, at, callers, self._moves(callers.size)
-
-    def _moves(self, calls: int) -> Bool[np.ndarray, " c"]:
-        """Return whether each caller moves."""
-        moves = np.zeros(calls, np.bool_)
-        moves[[*self.moves]] = True
-        return moves
+        return self.joint.mean, places_of(label, self.joint.landmark), self.where, self.roving
 
     def _doubles(self, known: Known, at: Int[np.ndarray, " l"]) -> tuple[tuple[int, int], ...]:
         """Return the pairs of duplicate landmarks to merge now, as (older, newer) labels."""
@@ -518,10 +506,6 @@ class _Work:
         direct = self.scan.direct
         return int(direct[number]) if number < direct.size else -1
 
-    def _joint(self) -> Joint:
-        """Return the joint Gaussian's labels, mean and covariance, for compiled functions."""
-        return self.joint.landmark, self.joint.mean, self.joint.covariance
-
     def _some(self, rows: Bool[np.ndarray, " m"]) -> Rows:
         """Return the measurements of this scan that a mask selects."""
         return Rows(*part_of(self.rows, np.flatnonzero(rows), 0.0))
@@ -544,9 +528,11 @@ class _Work:
         if row < 0:
             return True
         if at >= 0 and number not in self.moves:
-            part, there = part_of(self.rows, np.array([row]), 0.0), np.array([at])
-            costs = pair_costs(part, *self._joint()[1:], there, UNPLACED, self.stage.chances)
-            if costs[0, 0] == math.inf:
+            rows, joint = self.rows, self.joint
+            columns = rows.bearing, rows.bearing_std, rows.way, rows.way_std, rows.clutter
+            part = tuple(column[row : row + 1] for column in columns)
+            placed = joint.mean, joint.covariance, np.array([at]), UNPLACED
+            if pair_costs(part, *placed, self.stage.chances)[0, 0] == math.inf:
                 return False
         self.label[row] = label
         return True

@@ -35,7 +35,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Bool, Complex, Float, Int
 
-from pipistrelle.estimation.beliefs import JointGaussian
+from pipistrelle.estimation.beliefs import JointGaussian, is_among
 from pipistrelle.estimation.catalogue import GATE as CONFIDENCE
 from pipistrelle.estimation.data_association.existence import (
     BINS,
@@ -109,60 +109,69 @@ def observed(
     judged: Bool[np.ndarray, " c"],
     heard: tuple[np.ndarray, ...],
     chances: PlainChances,
-) -> tuple[Float[np.ndarray, "l c w"], Float[np.ndarray, " l"]]:
+    now: Whole,
+) -> tuple[np.ndarray, ...]:
     """Add a scan's detections of old landmarks to sums, the first four columns of `Watched`.
 
-    Returns the later `existence.Known.past`, and the probability of a miss of all landmarks.
-    ``heard``: label and caller of measurements, whether they are precise, then the columns of
-    `pairs.Rows`.
+    Returns the sums, the later `existence.Known.past`, the probability of a miss of all landmarks,
+    and `ratios`, 0 for callers that move. ``heard``: label and caller of measurements, whether they
+    are precise, and usable, then the columns of `pairs.Rows`.
     """
-    known, (hits, asked, found, expected), (mean, at, callers, _) = Known(*columns), sums, place
-    label, caller, sure, bearing, bearing_std, way, way_std, clutter = heard
-    past, missed, old = np.zeros_like(known.past), np.ones(at.size), known.confirmed & (at >= 0)
-    past[..., :-1] = known.past[..., 1:]
+    known, (mean, at, callers, moves) = Known(*columns), place
+    label, caller, sure, usable, bearing, bearing_std, way, way_std, clutter = heard
+    (hits, asked), (found, expected) = np.zeros((2, moves.size, BINS)), np.zeros((2, moves.size))
+    hits[: len(sums[0])], asked[: len(sums[1])] = sums[0], sums[1]
+    found[: len(sums[2])], expected[: len(sums[3])] = sums[2], sums[3]
+    past, missed = np.empty_like(known.past), np.ones(at.size)
+    past.reshape(-1)[:-1], old = known.past.reshape(-1)[1:], known.confirmed & (at >= 0)
+    past[..., -1] = 0.0
     p, bins = probabilities(hits, asked, known.source, place)
     for c in np.flatnonzero(judged):
-        rows, strays, silent = np.flatnonzero(caller == c), 0.0, np.zeros(at.size)
+        rows, silent = np.flatnonzero(caller == c), np.zeros(at.size)
+        seen = is_among(known.label, label[rows])
+        past[:, c, -1] = old & seen
+        found[c] += (old & seen).sum()
+        strays = (sure[rows] & ~is_among(label[rows], known.label[old])).sum()
+        quiet, rows = np.flatnonzero(old & ~seen & (p[:, c] > 0.0)), rows[usable[rows]]
         part = bearing[rows], bearing_std[rows], way[rows], way_std[rows], clutter[rows]
-        for m in rows:
-            strays += 1.0 if sure[m] and label[m] not in known.label[old] else 0.0
+        costs = pair_costs(part, mean, covariance, at[quiet], callers[c], chances)
+        for k in range(quiet.size):
+            if not (costs[:, k] < np.inf).any():
+                silent[quiet[k]] = p[quiet[k], c]
         for n in np.flatnonzero(at >= 0):
-            here, seen = bins[n, c], known.label[n] in label[rows]
+            here = bins[n, c]
             if here >= 0 and known.count[n] >= LASTING:
                 asked[c, here] += 1.0
-                hits[c, here] += 1.0 if seen else 0.0
-            if seen and old[n]:
-                past[n, c, -1] = 1.0
-                found[c] += 1.0
-                expected[c] += p[n, c]
-            elif not seen and p[n, c] > 0.0:
+                hits[c, here] += 1.0 if seen[n] else 0.0
+            if not seen[n]:
                 missed[n] *= (1.0 - p[n, c]) ** (1.0 / PERSISTENCE)
-                costs = pair_costs(part, mean, covariance, at[n : n + 1], callers[c], chances)
-                if old[n] and not (costs < np.inf).any():
-                    expected[c] += p[n, c]
-                    silent[n] = p[n, c]
+            expected[c] += p[n, c] if old[n] and seen[n] else silent[n]
         share = min(strays / max(silent.sum(), 1e-9), 1.0)
-        for n in np.flatnonzero(silent):
-            past[n, c, -1] = share * math.log1p(-silent[n])
-    return past, missed
+        past[:, c, -1] += share * np.log1p(-silent)
+    ratio = ratios(past, known.born, old, now)
+    for c in np.flatnonzero(moves):
+        ratio[c] = 0.0
+    return hits, asked, found, expected, past, missed, ratio
 
 
 @kernel
 def ratios(
-    columns: tuple[np.ndarray, ...], at: Int[np.ndarray, " l"], now: Whole
+    past: Float[np.ndarray, "l c w"],
+    born: Int[np.ndarray, " l"],
+    old: Bool[np.ndarray, " l"],
+    now: Whole,
 ) -> Float[np.ndarray, "c w"]:
     """Return the log likelihood ratio of a failure of each call in each of the last scans."""
-    known = Known(*columns)
-    total = np.zeros(known.past.shape[1:])
-    for n in np.flatnonzero(at >= 0):
+    total, detected = np.zeros(past.shape[1:]), -log_ratio(0.0)
+    for n in np.flatnonzero(old):
         for c in range(len(total)):
-            silent, each = 0.0, 0.0
-            for k in range(WINDOW - 1, max(WINDOW - now + known.born[n], 0) - 1, -1):
-                value = known.past[n, c, k]
-                if value > 0.0:
-                    silent, each = -math.inf, -log_ratio(0.0)
-                elif value < 0.0 and silent > -math.inf:
-                    silent += value
+            silent, each, first = 0.0, 0.0, max(WINDOW - now + born[n], 0)
+            for k in range(WINDOW - 1, first - 1, -1):
+                if past[n, c, k] > 0.0:
+                    total[c, first : k + 1] += detected
+                    break
+                if past[n, c, k] < 0.0:
+                    silent += past[n, c, k]
                     each = log_ratio(math.exp(silent))
                 total[c, k] += each
     return total
