@@ -328,10 +328,9 @@ def as_one_place(folder):
 
 
 def test_pure_noise_passes_at_the_false_alarm_probability(tmp_path):
-    folder = foreign(
-        tmp_path / "tape", rate=200_000, frequency=40e3, duration=6e-4, amplitude=0.0,
-        calls=tuple(range(1000, 400_000, 20_000)),
-    )  # fmt: skip
+    quiet = {"rate": 200_000, "frequency": 40e3, "duration": 6e-4, "amplitude": 0.0}
+    quiet["calls"] = tuple(range(1000, 400_000, 20_000))
+    folder = foreign(tmp_path / "tape", **quiet)
     as_one_place(folder)
     rate = 1e-3
     config = Config(detection=DetectionConfig(false_alarm=rate, peak_db=-0.01))
@@ -341,10 +340,7 @@ def test_pure_noise_passes_at_the_false_alarm_probability(tmp_path):
     tests = 4 * lags
     seen = sum(len(np.unique(one.delay)) for one in found)
     assert 0.2 * rate * tests < seen < 1.0 * rate * tests + 5.0 * np.sqrt(rate * tests)
-    louder = foreign(
-        tmp_path / "loud", rate=200_000, frequency=40e3, duration=6e-4, amplitude=0.0,
-        calls=tuple(range(1000, 400_000, 20_000)), noise=0.03,
-    )  # fmt: skip
+    louder = foreign(tmp_path / "loud", noise=0.03, **quiet)
     as_one_place(louder)
     _, loud = heard(louder, config)
     assert abs(sum(len(one.delay) for one in loud) - sum(len(one.delay) for one in found)) < 30
