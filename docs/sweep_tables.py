@@ -10,10 +10,10 @@ and prints how many rows sweeps give, and how many of these overlap.
 
 import sys
 import tomllib
-from pathlib import Path
 
 import numpy as np
 import polars as pl
+from association_tables import FILTERS, trials_of
 
 from pipistrelle.experiments.hearing.listening import listen
 from pipistrelle.experiments.hearing.scenario import world_of
@@ -24,7 +24,6 @@ TONES = {"emitter.call": "tone", "beacon.call": "tone"}
 CALLS = {"tones": TONES, "tones amid the bands": TONES | CENTRES, "sweeps": {}}
 BEAMS = (180, 33, 11)
 COLUMNS = [(way, beam) for way in ("active", "fused") for beam in BEAMS] + [("passive", None)]
-FILTERS = {"iekf": "invariant EKF", "smoother": "smoother, at the end"}
 LABELS = {"known": "", "marginal": ", no labels"}
 
 
@@ -109,7 +108,7 @@ def main(*given):
     if len(given) == 1:
         print_rows(int(given[0]))
         return
-    trials = [pl.read_parquet(Path(one) / "trials" / "*.parquet") for one in given]
+    trials = [trials_of([one]) for one in given]
     both = set.intersection(*({*one["iteration"]} for one in trials))
     sweeps, tones = (one.filter(pl.col("iteration").is_in(list(both))) for one in trials)
     studies = {"tones": tones, "sweeps": sweeps}
