@@ -97,7 +97,7 @@ def print_table(trials, cell):
                     known = known.filter(pl.col("iteration").is_in(found["iteration"].to_list()))
                     told = "-" if found.is_empty() else cell(known, found)
                     cells.append("as above" if same else told)
-                first = "" if timing else "bearings alone, "
+                first = "" if timing else "bearings only, "
                 print(f"| {first}{words}, `{method}` | " + " | ".join(cells) + " |")
 
 

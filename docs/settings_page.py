@@ -14,9 +14,9 @@ ALL_DRAWN = "any number"
 WORDS = {"string": "a folder", "file": "a file", "boolean": "`true` or `false`"}
 """Settings that are no numbers; text that is free is the folder of a world, or names topics."""
 TABLES = {
-    CALLERS: "tables, see [below](#several-callers)",
-    OWN: "tables, see [below](#one-estimators-alone)",
-    SETTINGS: "a name, see [below](#settings-by-name)",
+    CALLERS: "tables, see [Callers](callers.md)",
+    OWN: "tables, see [below](#settings-of-a-single-estimator)",
+    SETTINGS: "a name, see [below](#presets)",
 }
 """What settings take that are no single value."""
 SIGN = re.compile("([≥>≤<]) ")
@@ -24,8 +24,8 @@ UNIT = re.compile(r" ?\[((?!0 to 1)[^]]+)\]")
 
 
 def add_settings(app, docname, content):
-    """Put every setting where the page asks for them."""
-    if docname == "settings":
+    """Put every setting, and every key of a caller, where a page asks for them."""
+    if docname in ("settings", "callers"):
         content[0] = content[0].replace(PLACE, markdown()).replace(CALLER, callers())
 
 

@@ -53,7 +53,7 @@ def test_the_import_contracts_are_kept():
 
 def test_contributing_lists_the_rooms_with_their_docstrings():
     page = (ROOT / "CONTRIBUTING.md").read_text()
-    rows = re.findall(r"^\| `(\w+)` \| (.*) \|$", page[page.index("## Rooms") :], re.MULTILINE)
+    rows = re.findall(r"^\| `(\w+)` \| (.*) \|$", page, re.MULTILINE)
     doors = {room: import_module(f"pipistrelle.{room}").__doc__ or "" for room in ROOMS}
     assert rows == [(room, doc.splitlines()[0] if doc else "") for room, doc in doors.items()]
     assert all(doors.values()), "every room says what it is"

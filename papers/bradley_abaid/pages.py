@@ -1,4 +1,4 @@
-"""The tables of docs/findings.md, made from what is kept of the whole studies.
+"""The tables of docs/findings.md and readings.md, made from what is kept of the whole studies.
 
     python papers/bradley_abaid/pages.py
 
@@ -19,7 +19,7 @@ from pipistrelle.report.sentences import FILTERS, FITTED, TABLE_II
 from pipistrelle.report.variables import amount
 
 ROOT = Path(__file__).parents[2]
-PAGES = ("docs/findings.md",)
+PAGES = ("docs/findings.md", "papers/bradley_abaid/readings.md")
 STUDIES = {"paper": "`paper`", "least": "least misfit", "physics": "`physics`"}
 """The whole studies, and how the tables call them."""
 ANSWER = {True: "yes", False: "no", None: "open"}

@@ -19,8 +19,8 @@ FOUND = {
 }
 
 
-def findings() -> str:
-    return (ROOT / "docs/findings.md").read_text(encoding="utf-8")
+def readings() -> str:
+    return (PAPER / "readings.md").read_text(encoding="utf-8")
 
 
 @pytest.mark.parametrize("study", STUDIES)
@@ -29,8 +29,9 @@ def test_the_study_was_whole(study):
     assert (found["worlds_done"], found["worlds_planned"], found["trials"]) == (115, 115, 5750)
 
 
-def test_the_tables_of_the_page_are_written_from_the_studies():
-    pages, text = papers_module("pages"), findings()
+@pytest.mark.parametrize("page", papers_module("pages").PAGES)
+def test_the_tables_of_a_page_are_written_from_the_studies(page):
+    pages, text = papers_module("pages"), (ROOT / page).read_text(encoding="utf-8")
     assert text.count("<!-- begin: ") == text.count("<!-- end: ") > 0
     assert pages.filled(text) == text
 
@@ -57,7 +58,7 @@ def test_a_kept_study_gives_the_verdicts_again(study, tmp_path):
 def test_the_noise_table_matches_the_experiment():
     with (PAPER / "noise.csv").open(encoding="utf-8") as file:
         table = list(csv.DictReader(file))
-    lines = findings().split("| noise of bearings |")[1].split("\n\n")[0].splitlines()[3:]
+    lines = readings().split("| noise of bearings |")[1].split("\n\n")[0].splitlines()[3:]
     assert len(lines) == len(table) == 4
     for line, row in zip(lines, table, strict=True):
         assert f"| {row['left_out_ekf']} / {row['left_out_fastslam']} |" in line
@@ -67,7 +68,7 @@ def test_the_noise_table_matches_the_experiment():
 
 
 def test_every_variant_of_the_study_is_listed_with_its_numbers():
-    table = findings().split("| variant of `physics` |")[1].split("\n\n")[0].splitlines()[2:]
+    table = readings().split("| variant of `physics` |")[1].split("\n\n")[0].splitlines()[2:]
     with (PAPER / "variants.csv").open(encoding="utf-8") as file:
         variants = list(csv.DictReader(file))
     told = {tuple(cell.strip() for cell in line.split("|")[2:5]) for line in table}

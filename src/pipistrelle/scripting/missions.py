@@ -103,7 +103,7 @@ def _far_off(trials: Sequence[TrialResult]) -> Iterator[str]:
             yield (
                 f"{trial.strategy} {short_name(trial.filter)}: its position error, {error:.3g} m, "
                 f"is {times} the bound, {bound:.3g} m; what serves each estimator is in "
-                "docs/estimators.md"
+                "docs/choose_estimator.md"
             )
 
 

@@ -449,7 +449,8 @@ def test_steps_without_number_are_refused_before_they_fill_the_memory(tmp_path):
 
 
 def test_the_logs_on_the_pages_of_the_documentation_are_sound(tmp_path):
-    page = (Path(__file__).parents[3] / "docs" / "log_format.md").read_text()
+    docs = Path(__file__).parents[3] / "docs"
+    page = "".join((docs / name).read_text() for name in ("your_log.md", "log_format.md"))
     files = re.findall(r"^`([a-z]+\.[a-z]+)`\n\n```[a-z]+\n(.+?)^```", page, re.M | re.S)
     assert [name for name, _ in files] == ["log.toml", "odometry.csv", "measurements.csv"]
     for name, text in files:
