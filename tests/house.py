@@ -6,7 +6,7 @@ import re
 import sys
 import tomllib
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from functools import cache
 from pathlib import Path
 from typing import NamedTuple
@@ -42,7 +42,7 @@ IDIOM = re.compile(
     r"|\bas (it|they) (is|was|are|were|has|have)\b",
     re.IGNORECASE,
 )
-"""Words that are counted in whole docstrings."""
+"""Words that are counted in whole docstrings and in pages."""
 
 TEST = re.compile(r" *def (test_\w+)\(")
 """The line that begins a test."""
@@ -191,10 +191,17 @@ def files_in_cycles(graph: dict[str, set[str]]) -> int:
     return sum(module in reached(module) for module in graph)
 
 
+def idiom_per_1000_words(texts: Iterable[str]) -> float:
+    """Return how often the words of `IDIOM` occur in texts without code, per 1,000 words."""
+    text = re.sub(r"(?ms)^```.*?^```|^\s*(>>>|\.\.\.)[^\n]*$", "", "\n".join(texts))
+    words = re.findall(r"[A-Za-z][A-Za-z'-]*", text)
+    return round(1000 * len(IDIOM.findall(text)) / max(len(words), 1), 1)
+
+
 def measure(root: Path = ROOT) -> House:
-    """Measure `src` and `tests` below a folder."""
+    """Measure `src`, `tests` and the pages below a folder."""
     count: Counter[str] = Counter()
-    words = idiom = 0
+    texts: list[str] = []
     flagged, replaced = [], []
     source = root / "src" / "pipistrelle"
     paths = sorted(source.rglob("*.py"))
@@ -219,9 +226,7 @@ def measure(root: Path = ROOT) -> House:
         place = path.relative_to(root).as_posix()
         for line, name, docstring in docstrings(tree):
             first = docstring.split("\n")[0]
-            plain = re.sub(r"(?m)^\s*(>>>|\.\.\.).*$", "", docstring)
-            words += len(re.findall(r"[A-Za-z][A-Za-z'-]*", plain))
-            idiom += len(IDIOM.findall(plain))
+            texts.append(docstring)
             if rules := broken_rules(first):
                 count[f"first lines of {in_a_room}"] += 1
                 flagged.append(Flagged(f"{place}:{line} {name}", first, rules))
@@ -240,12 +245,15 @@ def measure(root: Path = ROOT) -> House:
             name = TEST.match(row)
             if name and (rules := broken_rules(name[1].replace("_", " "))):
                 count["names of tests"] += 1
-                place = path.relative_to(root).as_posix()
-                flagged.append(Flagged(f"{place}:{number}", name[1], rules))
+                where = f"{path.relative_to(root).as_posix()}:{number}"
+                flagged.append(Flagged(where, name[1], rules))
     measures: dict[str, float] = dict.fromkeys(budgets(), 0) | count
     measures["words against the glossary"] = len(replaced)
     measures["files in cycles of imports"] = files_in_cycles(graph)
-    measures["idiom per 1,000 words"] = round(1000 * idiom / max(words, 1), 1)
+    measures["idiom per 1,000 words"] = idiom_per_1000_words(texts)
+    pages = (*root.glob("README.md"), *sorted((root / "docs").glob("*.md")))
+    texts = [page.read_text(encoding="utf-8") for page in pages]
+    measures["idiom per 1,000 words of pages"] = idiom_per_1000_words(texts)
     return House(measures, flagged + replaced)
 
 
