@@ -2,8 +2,8 @@ r"""
 One echo
 ========
 
-A bat calls into the dark, and a twig answers. How does a robot hear an answer that is weaker than
-the hiss of its own microphones? All else on this ladder stands on one call, one post and one echo.
+A vehicle calls, and a post reflects the sound. How can a robot detect an echo that is weaker than
+the noise of its microphones? This tutorial follows a single call.
 """
 
 import matplotlib.pyplot as plt
@@ -24,10 +24,10 @@ tone, c = config.emitter.frequency, config.air.sound_speed
 distance, angle, speed = 8.0, np.radians(10.0), 0.75
 
 # %%
-# A vehicle drives along x and calls through a round opening, a piston. A post stands 8 m off, 10°
-# to the left. Sound spreads on its way there and again on its way back, the air swallows a share
-# of every metre, and the beam sends less to the side than ahead. What the post throws back is
-# counted in the call's level; 0 dB is the noise in a sample of a microphone. The echo is below it.
+# A vehicle drives along x and calls through a circular piston. A post is 8 m away, 10° to the
+# left. The sound spreads on both ways, the air absorbs a part of it, and the beam is weaker to
+# the side. The reflection by the post is part of the call's level. 0 dB is the noise of a sample.
+# The echo is below it.
 
 piston = {"radius": config.emitter.radius, "frequency": tone, "speed_of_sound": c}
 air = config.air.model_dump(exclude={"speed_of_sound", "spreading"})
@@ -44,9 +44,9 @@ print(*(f"{name} {part:.1f} dB" for name, part in account.items()), sep=", ")
 print(f"after {1e3 * delay:.1f} ms, {heard_tone - tone:+.0f} Hz: {level_db:.1f} dB")
 
 # %%
-# The *matched filter* knows what was called. It adds the 560 samples of a call's 2.8 ms up, each
-# turned as the call was; the echo grows, noise hardly does. That gains 10 log₁₀ 560 = 27.5 dB. Who
-# drives towards an echo hears it higher than it was called, and loses some of that: here 2.7 dB.
+# The *matched filter* correlates the samples with the call. It adds the 560 samples of the call's
+# 2.8 ms in phase, so the echo grows and the noise hardly does: a gain of 10 log₁₀ 560 = 27.5 dB.
+# The Doppler shift of the echo costs 2.7 dB of it.
 
 echo = Arrivals(
     delay=np.array([delay]),
@@ -81,10 +81,10 @@ panel.set_xlabel("time since the call [ms]; dotted: the echo begins")
 plt.show()
 
 # %%
-# How high does the peak stand above the noise?
+# What is the level of the peak over the noise?
 
 answer = float(20.0 * np.log10(np.abs(heard["matched filter"]).max()))
 print(f"{answer:.1f} dB")
 
 # %%
-# One microphone tells how far away the post is, not where. :doc:`02_one_frame` asks forty.
+# A microphone gives the distance of the post, not its direction. :doc:`02_one_frame` uses forty.

@@ -2,9 +2,9 @@ r"""
 One frame
 =========
 
-Every half second the vehicle and a beacon call at once, and forty microphones record what comes
-back: a *frame*. From it the vehicle has to tell who called, from where each sound comes, and how
-far away that is. Here is one frame, sample by sample.
+Every half second the vehicle and a beacon call at the same time, and forty microphones record the
+echoes: a *frame*. The detector finds the caller, bearing and delay of each sound. This tutorial
+computes a frame, sample by sample.
 """
 
 import matplotlib.pyplot as plt
@@ -24,10 +24,10 @@ config = Config()
 own, c = config.emitter, config.air.sound_speed
 
 # %%
-# The vehicle is at the origin and heads along x, among three landmarks and the beacon. An *arrival*
-# is one sound on one path: an echo of the vehicle's call, as in :doc:`01_one_echo`, or the beacon's
-# call, straight or by way of a landmark. Landmark 3 is behind the vehicle, which calls forward
-# only: of that one it hears nothing but the beacon's echo. Number 4 is the beacon itself.
+# The vehicle is at the origin and heads along x, among three landmarks and the beacon. An
+# *arrival* is a sound on a single path: an echo of the vehicle's call, as in :doc:`01_one_echo`,
+# or the beacon's call, direct or by way of a landmark. Landmark 3 is behind the vehicle, which
+# calls forwards, so it gives only an echo of the beacon's call. Landmark 4 is the beacon itself.
 
 pose, velocity = np.zeros(3), np.array([0.75, 0.0])
 landmarks = np.array([[6.0, 1.5], [4.0, -1.0], [-5.0, 3.0]])
@@ -43,10 +43,10 @@ for i in np.argsort(arrivals.delay):
     )
 
 # %%
-# Four arrays of ten microphones, a face to each side. The two calls differ in their tone, so a
-# matched filter for each parts them. Its energy over the ten of a face is compared with a threshold
-# that noise alone passes once in a million tests; where it is passed, the phases from microphone
-# to microphone say from where.
+# There are four arrays of ten microphones, a face to each side. The two calls have different
+# tones, so a matched filter for each separates them. Its energy over the ten microphones of a
+# face is compared with a threshold that noise passes once in a million tests. Where it passes,
+# the phases between the microphones give the bearing.
 
 layout, settled = square_of_four(config.receiver), sampling(config, callers)
 rng = np.random.default_rng(config.seed)
@@ -61,8 +61,8 @@ finder = detector(config, layout, settled.tones)
 found = detect(matched, finder, start=start, interval=1.0 / settled.rate, pulse=length)
 
 # %%
-# The front face; dots are detections. Where a call of one tone begins and ends it leaks into the
-# other, 33 dB weaker but above the threshold: the detector must know.
+# The figure shows the front face; dots are detections. At the start and end of a call its tone
+# leaks into the other filter, 33 dB weaker. The detector discards this leakage.
 
 plt.rcParams.update(STYLE)
 figure, axes = plt.subplots(figsize=(8.0, 3.2), layout="constrained")
@@ -79,12 +79,12 @@ figure.legend(loc="outside upper center", ncols=3)
 plt.show()
 
 # %%
-# Where the vehicle itself called, a detection has a range: half the way that sound goes in its
-# delay. Landmark 1 stands 6.18 m away. How far off is its range?
+# A detection of the vehicle's own call has a range: half the distance that sound travels in its
+# delay. Landmark 1 is 6.18 m away. What is the error of its range?
 
 ranges = 0.5 * c * found.delay[found.caller == 0]
 answer = float(np.min(np.abs(ranges - np.hypot(6.0, 1.5))))
 print(f"{100 * answer:.1f} cm")
 
 # %%
-# Bearings and ranges, twice a second, of posts that nobody knows: :doc:`03_one_mission`.
+# The next step is a map from bearings and ranges, twice a second: :doc:`03_one_mission`.

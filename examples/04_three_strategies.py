@@ -2,26 +2,25 @@ r"""
 Three strategies
 ================
 
-The vehicle calls ahead only, and hears what stands in its beam. But it is not alone: a beacon
-calls, too, from where it stands, and its sound comes back from every post around. What does the
-vehicle know that listens to someone else's calls as well as its own?
+The vehicle calls forwards and measures landmarks in its beam. A beacon also calls, and every
+landmark reflects its sound. What does the vehicle gain by listening to these calls?
 """
 
 import pipistrelle
 
 # %%
-# *Active* sensing is that of :doc:`03_one_mission`: its own echoes, range and bearing. *Passive*
-# sensing takes the beacon's calls and their echoes, bearings alone, for nobody tells it when or
-# where the beacon called. *Fused* sensing takes both. One world, one drive, one recording: what
-# differs is what is made of it.
+# *Active* sensing, as in :doc:`03_one_mission`, uses the vehicle's own echoes: range and bearing.
+# *Passive* sensing uses the beacon's calls and their echoes: only bearings, as the time and
+# position of the call are unknown. *Fused* sensing uses both. All three use the same world, drive
+# and recording.
 
 done = pipistrelle.run(settings="paper", seed=7, duration=62.5)
 figure = done.figure()
 
 # %%
-# A landmark that was only ever heard passively is a *ray*, drawn as the row of Gaussians that it
-# is: somewhere along there. When the vehicle has moved, other bearings cross it, and one of the row
-# is left. The beam is drawn as a wedge, the beacon as a star.
+# A landmark with passive measurements only is a *ray*, drawn as a row of Gaussians along its
+# bearing. When the vehicle has moved, other bearings cross it, and a single Gaussian remains. The
+# beam is a wedge, the beacon a star.
 
 for score in done.summary.iter_rows(named=True):
     print(
@@ -32,12 +31,12 @@ for score in done.summary.iter_rows(named=True):
     )
 
 # %%
-# Six times as many measurements, a fuller map, and yet, in this world, no better track: a bearing
-# says less than a range, and this filter trusts bearings too much. Without ``settings="paper"`` the
-# one that serves best is taken, :doc:`/estimators` says why. Whether listening makes a *better* map
-# is no question for one world; :doc:`08_your_own_study` asks several.
+# There are six times as many measurements and more landmarks, and in this world no better
+# trajectory: a bearing contains less information than a range, and this filter is overconfident
+# in bearings. The default settings are better, see :doc:`/choose_estimator`. A single world
+# cannot answer whether listening improves a map; :doc:`08_your_own_study` uses several.
 #
-# How many landmarks has the fused vehicle heard of that its own calls never found?
+# How many landmarks does fused sensing have that active sensing lacks?
 
 heard = done.landmarks.drop_nulls("x_m")
 known = {way: set(rows["landmark"]) for (way,), rows in heard.group_by("strategy")}
@@ -45,4 +44,4 @@ answer = len(known["fused"] - known["active"])
 print(answer)
 
 # %%
-# Chance has placed these landmarks. In :doc:`05_your_own_world` you do.
+# In :doc:`05_your_own_world` you place the landmarks.

@@ -2,9 +2,8 @@ r"""
 Your own world
 ==============
 
-So far, chance has placed the landmarks and a circle was driven. Your question has a place of its
-own: a corridor, an orchard, a tank. A world is a folder of small text files, and what they leave
-out is drawn as ever. Here are twelve posts in a corridor, driven to and fro.
+Until now landmarks were random and the course a circle. A world of your own is a folder of small
+text files; missing parts are drawn. This world is a corridor with twelve posts, driven to and fro.
 """
 
 from pathlib import Path
@@ -13,9 +12,9 @@ from tempfile import TemporaryDirectory
 import pipistrelle
 
 # %%
-# ``landmarks.csv`` says what reflects; a column more, and one post is a drum, 20 cm in radius and
-# much louder. ``path.csv`` here has way-points, for which a driver steers. ``world.toml`` has the
-# settings that belong to the place, and who calls: instead of the beacon, a mate behind the wall.
+# ``landmarks.csv`` has the reflectors; by a further column a post is a drum of 20 cm radius and
+# much louder. ``path.csv`` has way-points, and the vehicle steers along them. ``world.toml`` has
+# the settings of the world and its callers: a caller behind the wall instead of the beacon.
 
 posts = [(x, y) for x in (-10, -6, -2, 2, 6, 10) for y in (-2.5, 2.5)]
 rows = [f"{i},{x},{y},{0.2 if i == 7 else 0.025}" for i, (x, y) in enumerate(posts, 1)]
@@ -29,7 +28,7 @@ format = 1
 air.relative_humidity = 0.8
 
 [[callers]]
-name = "mate"
+name = "siren"
 frequency = 30e3
 level_db = 42.8
 place = [0.0, 9.0]
@@ -37,8 +36,8 @@ place = [0.0, 9.0]
 }
 
 # %%
-# All that :doc:`04_three_strategies` asked can be asked of this place, and answered. A setting of
-# yours is a keyword, two underscores between section and name: these wheels slip a little less.
+# The questions of :doc:`04_three_strategies` can be asked of this world. A setting is a keyword,
+# with two underscores between section and name: here the wheels slip less.
 
 with TemporaryDirectory() as folder:
     for name, text in files.items():
@@ -49,12 +48,12 @@ with TemporaryDirectory() as folder:
 figure = done.figure()
 
 # %%
-# What else a folder may hold, callers on the move among it, :doc:`/worlds` says. How far off is
-# the worst of the twelve posts, on the fused map?
+# See :doc:`/worlds` for the other parts of a world, such as moving callers. What is the largest
+# error of the twelve posts on the fused map?
 
 mapped = done.landmarks.filter(strategy="fused", status="full")
 answer = mapped.filter(mapped["landmark"] <= len(posts))["error_m"].max()
 print(f"{answer:.2f} m; map RMSE {done.summary['map_rmse_m'].round(2).to_list()} m")
 
 # %%
-# Here the sound is simulated. Where a sonar of yours has heard it: :doc:`06_your_own_log`.
+# Here the sound is simulated. For measurements of your own sonar see :doc:`06_your_own_log`.

@@ -2,10 +2,10 @@ r"""
 Your own log
 ============
 
-Nobody needs the simulator who has a robot. Whoever knows roughly how a vehicle moved, and has
-bearings, or bearings and ranges, of landmarks that can be told apart, has all that the filters ask
-for. This drive is made up in plain NumPy, without a line of Pipistrelle, and written down as a log:
-a folder of text files, as your own recorder may write it.
+Recorded drives need no simulator. The estimators need the approximate motion of a vehicle, and
+bearings, with or without ranges, of landmarks with labels. This drive is made in plain NumPy,
+without Pipistrelle, and written as a log: a folder of text files, as your own recorder may write
+it.
 """
 
 from pathlib import Path
@@ -16,9 +16,9 @@ import numpy as np
 import pipistrelle
 
 # %%
-# A robot drives two rounds among six posts; its wheels do not quite do as they are told. It sees
-# posts up to 60° off its heading: how far away they are only up to 4 m, else their bearing alone,
-# and the field of the range stays empty. Places are complex numbers here.
+# A robot drives two rounds among six posts with noise on its wheels. It measures posts up to 60°
+# off its heading. Ranges are measured up to 4 m; beyond that the field of the range is empty.
+# Positions are complex numbers here.
 
 rng = np.random.default_rng(7)
 posts = np.array([4.0, 6.0 + 5.0j, 1.0 + 7.0j, -3.0 + 5.0j, -4.0 + 1.0j, -2.0j])
@@ -37,8 +37,8 @@ for k in range(1, 601):
             measured.append(f"{0.1 * k:.1f},{label},{bearing:.4f},{near}")
 
 # %%
-# Three files make a log. Two more hold the truth, where somebody knows it: for scoring, no filter
-# ever reads it. What else may stand there, and poses as odometry, :doc:`/log_format` says.
+# Three files make a log. Two more contain the truth, if it is known: they are for scoring, and no
+# filter reads them. See :doc:`/your_log` for poses as odometry and other options.
 
 files = {
     "log.toml": """format = 1
@@ -65,11 +65,11 @@ print("\n".join(files["measurements.csv"].splitlines()[:5]))
 figure = done.figure()
 
 # %%
-# On a command line it is ``pipistrelle slam FOLDER``. What comes back is what a mission gives, and
-# what :doc:`03_one_mission` said of it holds. How far off are the posts on the map?
+# The command is ``pipistrelle slam FOLDER``. The result has the same form as that of
+# :doc:`03_one_mission`. What is the error of the posts on the map?
 
 answer = done.summary["map_rmse_m"][0]
 print(f"{answer:.3f} m, {done.summary['landmarks_full'][0]} posts")
 
 # %%
-# So a drive is at hand, simulated or recorded. :doc:`07_your_own_filter` maps it by other means.
+# A simulated or recorded drive can be mapped by other estimators: :doc:`07_your_own_filter`.

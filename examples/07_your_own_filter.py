@@ -2,10 +2,10 @@ r"""
 Your own filter
 ===============
 
-What is a range worth, and what is the sonar worth at all? Ask a filter that does not use it. An
+What is a range worth, and what is the sonar worth at all? A filter without it shows this. An
 estimator has three methods: ``init`` takes the start, ``predict`` the controls of a frame,
-``update`` what was heard in it. Each gives back a new belief. Whatever has the three is tried as
-the package's own are: in missions, on logs, in studies.
+``update`` the scan. Each returns a new belief. Such a class runs in missions, on logs and in
+studies.
 """
 
 from dataclasses import dataclass
@@ -17,9 +17,8 @@ from pipistrelle.detection.scans import with_columns
 from pipistrelle.estimation.ekf.filter import EkfSlam
 
 # %%
-# The EKF's first two methods will do for both. *Dead reckoning* hears nothing: it is what every
-# filter must beat. The other takes its bearings and forgets its ranges, as if it did not know when
-# it had called.
+# The EKF's first two methods serve both new filters. *Dead reckoning* ignores all scans: every
+# filter should be better. The other uses bearings and ignores ranges.
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -35,7 +34,7 @@ class BearingsOnly(EkfSlam):
 
 
 # %%
-# Beside the EKF they map the world of :doc:`03_one_mission`, from one and the same recording.
+# With the EKF they map the world of :doc:`03_one_mission` from the same recording.
 
 filters = ["ekf", BearingsOnly, DeadReckoning]
 asked = {"settings": "paper", "seed": 7, "strategies": "active", "duration": 62.5}
@@ -43,11 +42,11 @@ done = pipistrelle.run(filters=filters, **asked)
 figure = done.figure()
 
 # %%
-# Ranges hold the size of the map; without them it drifts, most posts stay rays, and those that are
-# placed are far off: bearings of a narrow beam, all ahead, hardly cross. Dead reckoning knows that
-# it knows little: its errors are the largest, and within their band.
+# Ranges determine the scale of the map. Without them it drifts, most posts remain rays, and
+# placed ones have large errors, because bearings of a narrow beam hardly cross. Dead reckoning
+# has the largest errors, and they are within their band.
 #
-# How many times as far off is who does not listen?
+# What is the ratio of its error to that of the EKF?
 
 error = dict(done.summary.select("filter", "position_rmse_m").iter_rows())
 for name, value in error.items():
@@ -56,7 +55,7 @@ answer = error["__main__:DeadReckoning"] / error["ekf"]
 print(f"{answer:.1f} times")
 
 # %%
-# A class in a file of your own, ``mine.py``, goes by the name ``mine:DeadReckoning`` on the command
-# line and in plans. :doc:`/extending` has the contract, and the other parts that can be replaced.
+# A class in ``mine.py`` has the name ``mine:DeadReckoning`` on the command line and in plans. See
+# :doc:`/extending` for the interface, and for the other parts that can be replaced.
 #
-# One world, though, is an anecdote: :doc:`08_your_own_study`.
+# A single world is an anecdote: :doc:`08_your_own_study`.

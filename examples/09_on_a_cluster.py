@@ -2,10 +2,9 @@ r"""
 The same on a cluster
 =====================
 
-A thousand worlds are too many for one laptop. They need nothing of each other, so they may be tried
-by as many machines as there are. But is what comes of it the same? Elsewhere it hangs on the number
-of workers, or on who was first. Here every random number is drawn by its seed, its world and its
-purpose: it cannot.
+A thousand worlds are too many for a laptop. Worlds are independent, so any number of machines can
+run them. Is the result the same? Every random number is keyed by seed, world and purpose, so it
+does not depend on the workers or their order.
 """
 
 from pathlib import Path
@@ -30,13 +29,13 @@ grid."beacon.level_db" = [36.0, 48.0]
 """
 
 # %%
-# It is done three times. By one process. In three *shards*, each of which does every third world of
-# one folder: so do machines that share a disk, by ``pipistrelle study PLAN --shard 0/16``. And by a
-# Dask cluster (``pip install 'pipistrelle[cluster]'``), here of two workers on this machine;
-# elsewhere ``scheduler`` is the address of yours, ``tcp://HOST:PORT``.
+# It runs three times: in a single process; in three *shards*, each with every third world of a
+# shared folder, as on machines with a shared disk (``pipistrelle study PLAN --shard 0/16``); and
+# on a Dask cluster (``pip install 'pipistrelle[cluster]'``) of two workers on this machine. For
+# another cluster, ``scheduler`` is its address, ``tcp://HOST:PORT``.
 #
-# Workers are processes, which import the script that starts them: what starts them stands under
-# ``if __name__ == "__main__"``.
+# Workers are processes that import the script, so the study is started below ``if __name__ ==
+# "__main__"``.
 
 if __name__ == "__main__":
     found = {}
@@ -67,5 +66,5 @@ if __name__ == "__main__":
     print(f"{answer} of {len(tables)} differ in any bit of {tables[0].width} columns")
 
 # %%
-# The paper's question is answered so, as often as one likes. What it left out, *when* an echo
-# comes: :doc:`10_when_not_only_where`.
+# The next tutorial uses the delay of an echo, which the paper does not:
+# :doc:`10_when_not_only_where`.

@@ -1,10 +1,10 @@
 r"""
-When, not only where
-====================
+Excess paths
+============
 
-Someone else's echo tells a bearing and no range, for nobody knows when he called. But his call also
-comes straight, before all its echoes, and how much later an echo is tells how much longer its way
-was: an *excess path*. No clock is asked.
+The echo of a beacon's call gives a bearing and no range, as the time of the call is unknown. But
+the call also arrives directly, before its echoes. The delay of an echo after it gives the *excess
+path*: how much longer the path of the echo is. No common clock is needed.
 """
 
 from dataclasses import replace
@@ -23,8 +23,8 @@ from pipistrelle.figures.style import INK, STRATEGY_COLOURS, STYLE
 from pipistrelle.geometry import range_and_bearing
 
 # %%
-# The vehicle stands at the origin. It has placed two callers, labels 1 and 2, to some decimetres,
-# and hears of landmark 3 for the first time, by an echo of each of their calls.
+# The vehicle is at the origin. It has placed two callers, labels 1 and 2, to some decimetres, and
+# measures landmark 3 for the first time, by an echo of each call.
 
 vehicle = np.zeros(3)
 callers, landmark = np.array([[8.0, 1.0], [-3.0, 6.0]]), np.array([4.0, 7.0])
@@ -36,9 +36,9 @@ stds = {"range_std": 0.2, "bearing_std": 0.05, "excess_path_std": 0.05}
 known = slam.update(start, make_scan(0.0, np.array([1, 2]), bearings, range=ranges, **stds))
 
 # %%
-# A bearing alone makes a ray: members, any of which may be the landmark. The first excess path, e,
-# draws an ellipse about the vehicle and the caller. It crosses the bearing in one place: there the
-# landmark is, as surely as the caller is. The ellipse of the second caller crosses there, too.
+# A bearing without range makes a ray of hypotheses. The first excess path, e, gives an ellipse
+# around vehicle and caller. It crosses the bearing at the landmark, with the uncertainty of the
+# caller. The second caller's ellipse crosses there as well.
 
 excess_paths = np.array([excess_path_of(vehicle[:2], landmark, caller) for caller in callers])
 _, bearing = range_and_bearing(vehicle, landmark[None])
@@ -52,9 +52,9 @@ for count in range(3):
     beliefs.append(slam.update(known, replace(scan, callers=labels)))
 
 # %%
-# Left: the bearing, dotted, its ray, and where the caller's ellipse crosses both: the landmark. By
-# delay alone, right: two callers' ellipses cross there, and where the roughest bearing says no.
-# Faint: the same if the callers stood elsewhere. Dashed: the sound's way, as long over all of it.
+# Left: the bearing (dotted), its ray, and the point where the ellipse crosses both. Right:
+# without bearing, two ellipses cross at the landmark and at a second point, which a coarse
+# bearing excludes. Faint: other positions of the callers. Dashed: the sound path.
 
 plt.rcParams.update(STYLE)
 figure, panels = plt.subplots(1, 2, figsize=(8.0, 4.2), layout="constrained", sharey=True)
@@ -83,7 +83,7 @@ panels[0].set_ylabel("y [m]")
 plt.show()
 
 # %%
-# How surely is its place known, with two excess paths? (:doc:`11_without_labels`: which is it?)
+# What is the standard deviation of its position then? (Next: :doc:`11_without_labels`.)
 
 spread = beliefs[-1].landmarks().covariance[2]
 answer = float(np.sqrt(np.linalg.eigvalsh(spread)[-1]))

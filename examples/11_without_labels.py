@@ -2,9 +2,9 @@ r"""
 A log without labels
 ====================
 
-A lidar or a radar sees posts, but not which: no row says of which landmark it is, and some rows are
-of none. This is a made-up drive like that of :doc:`06_your_own_log`, with the labels left out, and
-Pipistrelle has to say who is who.
+A lidar or a radar detects posts without identifying them, and some rows belong to no post. This
+simulated drive is like that of :doc:`06_your_own_log` without the labels. An association decides
+which landmark each row belongs to.
 """
 
 from pathlib import Path
@@ -17,9 +17,9 @@ import pipistrelle
 from pipistrelle.evaluation.association import gospa
 
 # %%
-# A robot drives two rounds among twelve posts. Its lidar sits 0.3 m ahead of the axle, and sees
-# posts nearer than 6 m, within 80° to either side: of ten it misses one, and in each scan there is
-# a row of nothing on the average. The field of the label stays empty. Places are complex numbers.
+# A robot drives two rounds among twelve posts. Its lidar is 0.3 m ahead of the axle and detects
+# posts nearer than 6 m, within 80° to either side. It misses a tenth of them, and each scan has a
+# row of clutter on average. The field of the label is empty. Positions are complex numbers here.
 
 rng = np.random.default_rng(7)
 posts = rng.uniform(-7.0, 8.0, 12) + 1j * rng.uniform(-5.0, 10.0, 12)
@@ -39,7 +39,7 @@ for k in range(1, 601):
             measured.append(f"{0.1 * k:.1f},,{angle:.4f},{max(distance, 0.1):.3f}")
 
 # %%
-# What the lidar sees and how often, ``log.toml`` says (:doc:`/log_format`).
+# ``log.toml`` describes the lidar (:doc:`/log_format`).
 
 files = {
     "log.toml": """format = 1
@@ -65,8 +65,8 @@ with TemporaryDirectory() as folder:
     done = pipistrelle.slam(folder, filters="iekf", association={"method": "marginal"})
 
 # %%
-# On a command line it is ``pipistrelle slam FOLDER --filter iekf --association.method marginal``.
-# Its landmarks have numbers in the order in which they were first seen.
+# The command is ``pipistrelle slam FOLDER --filter iekf --association.method marginal``.
+# Landmarks are numbered in the order of their first measurement.
 
 found = np.array([*zip(done.landmarks["x_m"], done.landmarks["y_m"], strict=True)])
 figure, axes = plt.subplots(figsize=(5.0, 5.0), layout="constrained")
@@ -78,7 +78,7 @@ axes.legend()
 plt.show()
 
 # %%
-# How far off are the posts on the map, and are there any that are missing, or none?
+# What is the error of the posts on the map, and are any missing or false?
 
 score = gospa(found, np.column_stack((posts.real, posts.imag)), cutoff=1.0)
 answer = score.error / np.sqrt(len(found) - score.false)
