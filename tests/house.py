@@ -253,7 +253,7 @@ def measure(root: Path = ROOT) -> House:
     measures["idiom per 1,000 words"] = idiom_per_1000_words(texts)
     pages = (*root.glob("README.md"), *sorted((root / "docs").glob("*.md")))
     texts = [page.read_text(encoding="utf-8") for page in pages]
-    measures["idiom per 1,000 words of pages"] = idiom_per_1000_words(texts)
+    measures["idiom of pages per 1,000 words"] = round(idiom_per_1000_words(texts))
     return House(measures, flagged + replaced)
 
 
