@@ -101,9 +101,9 @@ def test_the_search_by_sectors_finds_the_peaks_of_all_beams():
     recorder.add(envelopes, echoes(settled, delay, bearing, np.ones(60), -10.0), lags, 2e-3)
     heard = filters.outputs(envelopes, lags, 1.0, recorder.noise(lags, 7))[0]
     numbers, whole = beams.find_wide(heard, wide, 2e-3, filters.cut)
-    sound, all_beams = beams._padded(heard, wide.margin).T, np.zeros(lags)
-    for b in range(lags):
-        at = float(b + wide.margin)
+    more, all_beams = wide.margin + beams.TAPS, np.zeros(lags)
+    sound = np.pad(heard, ((0, 0), (more, more)))
+    for b, at in enumerate(more + np.arange(float(lags))):
         powers = [beams._power(sound, at, n, wide.beams, wide.call) for n in wide.beams.bearing]
         all_beams[b] = max(powers)
     peaks = beams._peaks(all_beams, wide.threshold, wide.lobes, wide.cut_lobes, filters.cut)

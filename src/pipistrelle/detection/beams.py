@@ -17,9 +17,8 @@ falls off three times.
 .. math:: |z(\phi, t)| \le \sum_m w_m |y_m(t - a_m)| ,
 
 which is computed for all beams of a sector at once, as their delays are equal to half a lag. Beams
-are summed only at lags at which it reaches the threshold: in noise, a twentieth. Half lags lose a
-little of a call, and leave out noise: where this may have hidden a peak, they are summed again by
-exact delays.
+are summed only at lags at which it reaches the threshold: in noise, a thirtieth. Half lags lose a
+little of a call, and leave out noise: beams that this may have hidden are summed by exact delays.
 
 **Loudness** of a lag is the largest :math:`|z|^2` over the directions. In noise of unit variance z
 is complex normal at every direction, and the maximum of such a process exceeds h, per lag, with
@@ -96,6 +95,7 @@ from pipistrelle.config import Config
 from pipistrelle.detection.direct import MIN_EDGE_ENERGY_OF_BEAM, front_edge
 from pipistrelle.detection.matched import reach_of
 from pipistrelle.detection.noise import (
+    CHUNK,
     NOISE_QUANTILE,
     bearing_std,
     delay_std,
@@ -113,8 +113,9 @@ DIVISIONS = 8
 """Divisions of a lag in the search for the start of a tone."""
 FINEST = 1e-4
 """Smallest step of the search, in lags."""
-RARE = 40.0
-"""Lobes this many noise powers below the loudest are ignored: odds of 1 to 1e17."""
+RARE = 20.0
+"""Lobes this many noise powers below the loudest are ignored: odds of 1 to 5e8, which add 0.15 mrad
+at most to a standard deviation."""
 TAPS, PARTS, BETA = 12, 256, 8.0
 """Windowed sinc: number of taps, positions between two outputs, shape of its Kaiser window."""
 MARGIN = 2.0
@@ -133,9 +134,9 @@ class Beams(NamedTuple):
     """Directions, microphone positions and weights of the beams of a group of microphones."""
 
     bearing: Float[np.ndarray, " n"]
-    """Directions that are scanned [rad]."""
+    """Directions that are scanned, off the normal of a line on a face [rad]."""
     position: Float[np.ndarray, "k 2"]
-    """Positions of the microphones, relative to the beams' centre [m]."""
+    """Positions of the microphones, relative to the beams' centre and the normal [m]."""
     weight: Float[np.ndarray, " k"]
     """Weight of each output; the squares of all sum to 1."""
     speed_of_sound: float
@@ -165,9 +166,9 @@ class Wide(NamedTuple):
     sine_limit: float
     """Sine of the largest angle off the normal that counts; 2 for an omnidirectional group."""
     normal: float
-    """Normal of a line on a face [rad]; NaN for an omnidirectional group."""
+    """Normal of a line on a face [rad]; 0 for an omnidirectional group."""
     middle: Float[np.ndarray, "2"]
-    """Middle of the microphones, the beams' centre, in the vehicle's frame [m]."""
+    """Middle of the microphones, the beams' centre, relative to the normal [m]."""
     call: _Call
     band: Band
     doppler_std: float
@@ -179,10 +180,10 @@ class Wide(NamedTuple):
     """Lag of a sector at each microphone, less the centre's, in half lags."""
     noise_std: Float[np.ndarray, " s"]
     """Standard deviation of a sector's noise, as half lags are means of two."""
-    phases: Complex[np.ndarray, "n k"]
-    """Factor of each microphone, for each beam."""
+    phases: Float[np.ndarray, "2 k n"]
+    """Factor of each microphone, for each beam: real and imaginary parts."""
     margin: int
-    """Lags of silence that every microphone needs at each end."""
+    """Upper bound of any microphone's time lead over the beams' centre, in lags."""
     loss: float
     """Least power of a call from a beam's direction, relative to the sum by exact delays."""
     slack: float
@@ -200,32 +201,28 @@ def wide_of(config: Config, layout: Layout | Scattered, group: int, call: Call, 
     """
     rate, c = config.receiver.sample_rate, config.assumed_sound_speed
     normal, (place, gain) = float(layout.normal[group]), layout.places(group)
-    weight = gain / np.linalg.norm(gain)
+    weight, around = gain / np.linalg.norm(gain), math.isnan(normal)
+    turn = 0.0 if around else normal
+    place = place @ np.array([[math.cos(turn), -math.sin(turn)], [math.sin(turn), math.cos(turn)]])
     middle = weight**2 @ place
     position = place - middle
     band, tone = band_of(call, rate), isinstance(call, ToneBurst)
-    around = math.isnan(normal)
-    limit = math.radians(config.detection.scan_limit_deg)
-    fine = np.linspace(-np.pi, np.pi, 3601) if around else normal + np.linspace(-limit, limit, 1801)
+    limit = math.pi if around else math.radians(config.detection.scan_limit_deg)
+    fine = np.linspace(-limit, limit, 3601 if around else 1801)
     wave = math.hypot(2.0 * np.pi * band.centre, band.spread) / c
     slope = wave * np.sqrt(spread_towards(fine, position, weight))
     looks = np.concatenate(([0.0], np.cumsum(0.5 * (slope[1:] + slope[:-1]) * np.diff(fine))))
     count = max(math.ceil(looks[-1] / BEAM_STEP), 8) + (0 if around else 1)
     even = np.linspace(0.0, looks[-1], count + 1 if around else count)
     moving = 2.0 * abs(config.scenario.speed) / c / math.sqrt(2.0)
-    beams = Beams(
-        bearing=np.interp(even, looks, fine)[:count],
-        position=position,
-        weight=weight,
-        speed_of_sound=c,
-        loudest_noise=loudest_noise(weight.size),
-    )
+    bearing, noise = np.interp(even, looks, fine)[:count], loudest_noise(weight.size)
+    beams = Beams(bearing, position, weight, c, noise)
     interval, pulse = step / rate, max(round(call.duration * rate / step), 1)
     carrier = call.frequency if tone else carrier_of(band, interval)
     wide = Wide(
         threshold=loudest_by_chance(config.detection.false_alarm, looks[-1], weight.size),
         sine_limit=2.0 if around else math.sin(math.radians(config.detection.angle_limit_deg)),
-        normal=normal,
+        normal=turn,
         middle=middle,
         call=_Call(carrier, tone, pulse, interval, _LINEAR if tone else _SINC),
         band=band,
@@ -271,12 +268,13 @@ def _sectors_of(
     left = np.where(odd[sector], np.interp(error, off, between), np.interp(error, off, alike))
     left = np.abs(left @ beams.weight**2) / noise_std[sector]
     loss = float(np.min(left**2))
+    phases = (beams.weight * np.exp(-2j * np.pi * carrier * early)).T
     return {
         "begin": np.array([*begin, len(early)]),
         "late": late.astype(np.int64),
         "noise_std": noise_std,
-        "phases": (beams.weight * np.exp(-2j * np.pi * carrier * early)).astype(np.complex64),
-        "margin": TAPS + _margin(beams, interval),
+        "phases": np.stack((phases.real, phases.imag)).astype(np.float32),
+        "margin": math.ceil(_lead(beams, interval)) + 2,
         "loss": loss,
         "slack": math.sqrt((loss - 1.0) * math.log(1.0 - NOISE_QUANTILE)),
     }
@@ -306,11 +304,13 @@ def edge_around(
     matched: Complex[np.ndarray, "k l"], wide: Wide, b: int, bearing: float
 ) -> tuple[float, float]:
     """Return start and std of a tone [lags] in the beam to a detection's bearing (`front_edge`)."""
-    pulse, sound = wide.call.pulse, _padded(matched, wide.margin).T
-    low = max(b - 3 * pulse, 0)
+    pulse, more = wide.call.pulse, wide.margin + TAPS
+    low, bearing = max(b - 3 * pulse, 0), bearing - wide.normal
     beam = np.empty(min(b + pulse, matched.shape[1]) - low, dtype=np.complex128)
+    sound = np.empty((len(matched), beam.size + 2 * more), dtype=np.complex64)
+    _cut_out(np.ascontiguousarray(matched, dtype=np.complex64), low - more, sound)
     for k in range(beam.size):
-        z, _, noise = _output(sound, float(wide.margin + low + k), bearing, wide.beams, wide.call)
+        z, _, noise = _output(sound, float(more + k), bearing, wide.beams, wide.call)
         beam[k] = z / math.sqrt(noise)
     alone = beam[:, np.newaxis, np.newaxis, np.newaxis]
     lag, std = front_edge(alone, b - low, 0, 0, pulse, MIN_EDGE_ENERGY_OF_BEAM)
@@ -330,36 +330,43 @@ def find_wide(
     """
     if not matched.shape[1]:
         return np.empty((6, 0)), np.empty(0, dtype=bool)
-    sound, call = _padded(matched, wide.margin), wide.call
-    least = math.sqrt(wide.loss * wide.threshold)
-    loudness = _refined(sound, _loudness(sound, wide, least**2), least - wide.slack, wide)
-    peaks = _peaks(loudness, wide.threshold, wide.lobes, wide.cut_lobes, cut)
-    numbers = _rows(sound.T, peaks + wide.margin, wide)
-    numbers[0] += start - (cut + wide.margin) * call.interval
+    numbers, peaks = _search(np.ascontiguousarray(matched, dtype=np.complex64), wide, cut)
+    numbers[0] += start - cut * wide.call.interval
     whole = (cut <= peaks) & (peaks < matched.shape[1] - cut)
-    if math.isnan(wide.normal):
+    if wide.sine_limit > 1.0:
         return numbers, whole
     numbers[5] = wrap(numbers[1] - wide.normal)
     seen = np.abs(np.sin(numbers[5])) <= wide.sine_limit
     return numbers[:, seen], whole[seen]
 
 
+@kernel
+def _search(
+    matched: Complex[np.ndarray, "k l"], wide: Wide, cut: Whole
+) -> tuple[Float[np.ndarray, "6 m"], Int[np.ndarray, " m"]]:
+    """Return the rows of all calls in the outputs, and their lags."""
+    loudness = _loudness(matched, wide, wide.threshold)
+    peaks = _peaks(loudness, wide.threshold, wide.lobes, wide.cut_lobes, cut)
+    return _rows(matched, peaks, wide), peaks
+
+
+@no_alloc
+def _cut_out(
+    matched: Complex[np.ndarray, "k l"], first: Whole, part: Complex[np.ndarray, "k n"]
+) -> None:
+    """Write the outputs from a lag on, and silence beyond the record."""
+    lags = matched.shape[1]
+    low, high = max(first, 0), min(first + part.shape[1], lags)
+    part[:] = 0.0
+    for m in range(len(part)):
+        for b in range(low, high):
+            part[m, b - first] = matched[m, b]
+
+
 def _lead(beams: Beams, interval: float) -> float:
     """Return the largest time lead of a microphone over the beams' centre, in lags."""
     farthest = float(np.linalg.norm(beams.position, axis=1).max())
     return farthest / beams.speed_of_sound / interval
-
-
-def _margin(beams: Beams, interval: float) -> int:
-    """Return an upper bound, in lags, of any microphone's time lead over the beams' centre."""
-    return math.ceil(_lead(beams, interval)) + 2
-
-
-def _padded(matched: Complex[np.ndarray, "k l"], margin: int) -> Complex[np.ndarray, "k n"]:
-    """Surround the matched-filter outputs with silence, in single precision."""
-    sound = np.zeros((len(matched), matched.shape[1] + 2 * margin), dtype=np.complex64)
-    sound[:, margin:-margin] = matched
-    return sound
 
 
 def _sinc() -> Float[np.ndarray, "p t"]:
@@ -374,7 +381,7 @@ _SINC, _LINEAR = _sinc(), np.array([[1.0, 0.0], [0.0, 1.0]])
 
 @no_alloc
 def _output(
-    matched: Complex[np.ndarray, "l k"], at: float, bearing: float, beams: Beams, call: _Call
+    matched: Complex[np.ndarray, "k l"], at: float, bearing: float, beams: Beams, call: _Call
 ) -> tuple[complex, float, float]:
     """Return a beam's output at a bearing and a fractional lag, its energy, and noise variance."""
     ahead, left = math.cos(bearing), math.sin(bearing)
@@ -389,7 +396,7 @@ def _output(
         share, y = part - row, 0.0j
         for t in range(taps):
             weight = (1.0 - share) * call.taps[row, t] + share * call.taps[row + 1, t]
-            y += weight * matched[k - taps // 2 + 1 + t, m]
+            y += weight * matched[m, k - taps // 2 + 1 + t]
         turn = -2.0 * math.pi * call.frequency * early
         total += beams.weight[m] * y * complex(math.cos(turn), math.sin(turn))
         energy += y.real * y.real + y.imag * y.imag
@@ -400,7 +407,7 @@ def _output(
 
 @no_alloc
 def _power(
-    matched: Complex[np.ndarray, "l k"], at: float, bearing: float, beams: Beams, call: _Call
+    matched: Complex[np.ndarray, "k l"], at: float, bearing: float, beams: Beams, call: _Call
 ) -> float:
     """Return a beam's power at a bearing and a fractional lag, in units of its noise variance."""
     z, _, noise = _output(matched, at, bearing, beams, call)
@@ -417,7 +424,7 @@ def _moved(before: float, here: float, after: float) -> float:
 
 @no_alloc
 def _climb(
-    matched: Complex[np.ndarray, "l k"],
+    matched: Complex[np.ndarray, "k l"],
     at: float,
     bearing: float,
     step: float,
@@ -443,55 +450,35 @@ def _climb(
 
 @no_alloc
 def _lobes(
-    matched: Complex[np.ndarray, "l k"],
+    matched: Complex[np.ndarray, "k l"],
     at: float,
     power: Float[np.ndarray, " n"],
     faintest: float,
-    step: float,
-    beams: Beams,
-    call: _Call,
+    known: tuple[float, float],
+    wide: Wide,
     lobes: Float[np.ndarray, "4 n"],
 ) -> tuple[Whole, Whole]:
     """Write lag, bearing, power and step of a scan's lobes; return the loudest's index, and count.
 
-    ``power``: of each beam at the lag; ``faintest``: least of a lobe; ``step``: of a climb [rad],
-    0 for half the distance of two beams.
+    ``power``: of each beam at the lag; ``faintest``: least of a lobe; ``known``: bearing of a lobe
+    to be left out, or NaN, and the step of a climb [rad], or 0 for half the distance of two beams.
     """
+    (besides, step), beams = known, wide.beams
     count, loudest, n = 0, 0, power.size
     for i in range(n):
         before = power[i - 1] if i > 0 else -1.0
         after = power[i + 1] if i + 1 < n else -1.0
-        if power[i] > before and power[i] >= after and power[i] >= faintest:
+        same = abs(wrap_angle(beams.bearing[i] - besides)) < 4.0 * step
+        if power[i] > before and power[i] >= after and power[i] >= faintest and not same:
             near = i + 1 if i + 1 < n else i - 1
             half = 0.5 * abs(wrap_angle(beams.bearing[near] - beams.bearing[i]))
             lobes[3, count] = step if step > 0.0 else half
             lobes[0, count], lobes[1, count], lobes[2, count] = _climb(
-                matched, at, beams.bearing[i], lobes[3, count], beams, call
+                matched, at, beams.bearing[i], lobes[3, count], beams, wide.call
             )
             loudest = count if lobes[2, count] > lobes[2, loudest] else loudest
             count += 1
     return loudest, count
-
-
-@no_alloc
-def _ambiguity(
-    bearing: float,
-    top: float,
-    noise: float,
-    lobes: Float[np.ndarray, "4 n"],
-    near: float,
-) -> float:
-    """Return a bearing's variance from the odds that another lobe of the scan is the true source.
-
-    Of a lobe and its power; lobes nearer than `near` [rad] are the same.
-    """
-    odds, square = 0.0, 0.0
-    for k in range(lobes.shape[1]):
-        off = wrap_angle(lobes[1, k] - bearing)
-        if abs(off) >= near:
-            share = math.exp(min(lobes[2, k] - top, 0.0) / noise)
-            odds, square = odds + share, square + share * off * off
-    return square / (1.0 + odds)
 
 
 @no_alloc
@@ -504,7 +491,7 @@ def _write_row(
 ) -> None:
     """Write delay, bearing, power and standard deviations of a detection.
 
-    ``lobe``: bearing, power and power over the noise; ``square``: see `_ambiguity`.
+    ``lobe``: bearing, power and power over the noise; ``square``: its variance by other lobes.
     """
     (bearing, top, over), beams, band, call = lobe, wide.beams, wide.band, wide.call
     cosine, sine, c = math.cos(bearing), math.sin(bearing), beams.speed_of_sound
@@ -522,7 +509,7 @@ def _write_row(
     std = bearing_std(over, wave / c, 12.0 * spread)
     std = min(math.hypot(std, math.sqrt(square)), UNKNOWN)
     row[0] = at * call.interval + (wide.middle[0] * cosine + wide.middle[1] * sine) / c
-    row[1], row[2], row[3] = wrap_angle(bearing), top, std
+    row[1], row[2], row[3] = wrap_angle(bearing + wide.normal), top, std
     aside = (wide.middle[1] * cosine - wide.middle[0] * sine) / c * std
     row[4] = math.hypot(late, aside)
     row[5] = math.atan(xy / spread)
@@ -530,42 +517,49 @@ def _write_row(
 
 @kernel
 def _rows(
-    slow: Complex[np.ndarray, "l k"], peaks: Int[np.ndarray, " m"], wide: Wide
+    matched: Complex[np.ndarray, "k l"], peaks: Int[np.ndarray, " m"], wide: Wide
 ) -> Float[np.ndarray, "6 m"]:
     """Return delay, bearing, power and standard deviations of the call at each peak.
 
     The lag is not yet the peak's, and another of several nearly equal lobes may be the loudest at
-    its own time: the top of each is computed. No peak is within a margin of the
-    ends.
+    its own time: the top of each is computed.
     """
-    beams, call, margin = wide.beams, wide.call, wide.margin
+    beams, call, last = wide.beams, wide.call, matched.shape[1] - 1
+    near = wide.margin + TAPS + reach_of(call.pulse) + 2
+    sound = np.empty((len(matched), 2 * near + 1), dtype=np.complex64)
     numbers, power = np.empty((6, peaks.size)), np.empty(beams.bearing.size)
-    lobes, last = np.empty((4, power.size)), len(slow) - margin - 1
+    lobes, sums = np.empty((4, power.size)), np.empty((2, power.size), dtype=np.float32)
     for i in range(peaks.size):
-        at = float(peaks[i])
-        for n in range(power.size):
-            power[n] = _power(slow, at, beams.bearing[n], beams, call)
-        best, _ = _lobes(slow, at, power, LOBE * power.max(), 0.0, beams, call, lobes)
-        at = min(max(lobes[0, best], float(margin)), float(last))
+        at, first = float(near), peaks[i] - near
+        _cut_out(matched, first, sound)
+        for s in range(len(wide.late)):
+            _scan(sound, near, s, wide, sums, power)
+        best, _ = _lobes(sound, at, power, LOBE * power.max(), (math.nan, 0.0), wide, lobes)
+        at = min(max(lobes[0, best], float(-first)), float(last - first))
         bearing, top, step = lobes[1, best], lobes[2, best], lobes[3, best]
         if call.tone:
-            at = _start(slow, peaks[i], bearing, beams, call, (margin, last))
-            _, bearing, top = _climb(slow, at, bearing, step, beams, call)
-        _, energy, least = _output(slow, at, bearing, beams, call)
+            at = _start(sound, near, bearing, beams, call, (max(-first, 0), last - first))
+            _, bearing, top = _climb(sound, at, bearing, step, beams, call)
+            for n in range(power.size):
+                power[n] = _power(sound, at, beams.bearing[n], beams, call)
+        _, energy, least = _output(sound, at, bearing, beams, call)
         over = over_noise(top, energy / least, beams.weight.size, beams.loudest_noise)
         noise = top / (over + 1.0)
-        for n in range(power.size):
-            power[n] = _power(slow, at, beams.bearing[n], beams, call)
-        faintest = 0.8 * top - RARE * noise
-        _, count = _lobes(slow, at, power, faintest, step, beams, call, lobes)
-        square = _ambiguity(bearing, top, noise, lobes[:, :count], 4.0 * step)
-        _write_row((bearing, top, over), square, at, wide, numbers[:, i])
+        faintest = 0.8 * (top - RARE * noise)
+        _, count = _lobes(sound, at, power, faintest, (bearing, step), wide, lobes)
+        odds, square = 0.0, 0.0
+        for k in range(count):
+            off = wrap_angle(lobes[1, k] - bearing)
+            if abs(off) >= 4.0 * step:  # else the same lobe
+                share = math.exp(min(lobes[2, k] - top, 0.0) / noise)
+                odds, square = odds + share, square + share * off * off
+        _write_row((bearing, top, over), square / (1.0 + odds), first + at, wide, numbers[:, i])
     return numbers
 
 
 @no_alloc
 def _start(
-    matched: Complex[np.ndarray, "l k"],
+    matched: Complex[np.ndarray, "k l"],
     b: Whole,
     bearing: float,
     beams: Beams,
@@ -604,115 +598,101 @@ def _modulus(z: complex) -> float:
 
 
 @no_alloc
-def _hear(
+def _scan(
     matched: Complex[np.ndarray, "k l"],
     b: Whole,
-    late: Int[np.ndarray, " k"],
-    heard: Complex[np.ndarray, " k"],
+    s: Whole,
+    wide: Wide,
+    sums: Float[np.ndarray, "2 n"],
+    power: Float[np.ndarray, " n"],
 ) -> None:
-    """Write each microphone's output at a lag and its delay in half lags."""
-    for m in range(late.size):
-        k = b + (late[m] >> 1)
-        heard[m] = matched[m, k]
-        if late[m] & 1:
-            heard[m] = np.float32(0.5) * (heard[m] + matched[m, k + 1])
-
-
-@no_alloc
-def _beam_power(phases: Complex[np.ndarray, " k"], heard: Complex[np.ndarray, " k"]) -> float:
-    """Return the power of a beam's sum."""
-    real, imaginary = np.float32(0.0), np.float32(0.0)
-    for m in range(heard.size):
-        real += phases[m].real * heard[m].real - phases[m].imag * heard[m].imag
-        imaginary += phases[m].real * heard[m].imag + phases[m].imag * heard[m].real
-    return float(real * real + imaginary * imaginary)
+    """Write the power of each beam of a sector at a lag, by delays rounded to half lags."""
+    real, imaginary = sums
+    first, last = wide.begin[s], wide.begin[s + 1]
+    for n in range(first, last):
+        real[n], imaginary[n] = np.float32(0.0), np.float32(0.0)
+    for m in range(len(matched)):
+        late = wide.late[s, m]
+        k = b + (late >> 1)
+        heard = matched[m, k]
+        if late & 1:
+            heard = np.float32(0.5) * (heard + matched[m, k + 1])
+        x, y, cosine, sine = heard.real, heard.imag, wide.phases[0, m], wide.phases[1, m]
+        for n in range(first, last):
+            real[n] += cosine[n] * x - sine[n] * y
+            imaginary[n] += cosine[n] * y + sine[n] * x
+    scale = 1.0 / wide.noise_std[s] ** 2
+    for n in range(first, last):
+        power[n] = scale * (real[n] * real[n] + imaginary[n] * imaginary[n])
 
 
 @kernel
 def _loudness(
     matched: Complex[np.ndarray, "k l"], wide: Wide, threshold: float
 ) -> Float[np.ndarray, " l"]:
-    """Return the power of the loudest beam at lags where moduli reach the threshold; else 0.
+    """Return the power of the loudest beam at lags where it may reach the threshold; else 0.
 
-    `matched` has silent margins. Delays are rounded to half lags.
+    Sought by delays rounded to half lags, and computed by exact delays.
     """
-    (microphones, lags), margin, least = matched.shape, wide.margin, math.sqrt(threshold)
-    moduli = np.empty((microphones, 2, lags), dtype=np.float32)
-    for m in range(microphones):
-        sound, weight = matched[m], np.float32(wide.beams.weight[m])
-        whole, half = moduli[m]
-        for b in range(lags):
-            whole[b] = weight * _modulus(sound[b])
-        for b in range(lags - 1):
-            half[b] = np.float32(0.5) * weight * _modulus(sound[b] + sound[b + 1])
-    total, heard = np.empty(lags, dtype=np.float32), np.empty(microphones, dtype=np.complex64)
-    test, size = np.empty(lags + 1, dtype=np.int64), lags - 2 * margin
-    loudness = np.zeros(size)
-    for s in range(len(wide.late)):
-        total[:] = 0.0
+    (microphones, lags), margin, f = matched.shape, wide.margin + TAPS, np.float32
+    tile = np.empty((microphones, CHUNK + 2 * margin + 1), dtype=np.complex64)
+    moduli = np.empty((2, microphones, tile.shape[1]), dtype=np.float32)
+    totals, most = np.empty((len(wide.late), CHUNK), dtype=np.float32), np.empty(CHUNK, dtype=f)
+    loudness, bearing, power = np.zeros(lags), wide.beams.bearing, np.empty(wide.begin[-1])
+    sums, inverse = np.empty((2, power.size), dtype=f), (1.0 / wide.noise_std).astype(np.float32)
+    least = math.sqrt(wide.loss * threshold)
+    for start in range(0, lags, CHUNK):
+        _cut_out(matched, start - margin, tile)
         for m in range(microphones):
-            late = wide.late[s, m]
-            row = moduli[m, late & 1, margin + (late >> 1) :]
-            for b in range(size):
-                total[b] += row[b]
-        faintest, count = np.float32(least * wide.noise_std[s]), 0
-        for b in range(size):
-            test[count] = margin + b
-            count += total[b] >= faintest
-        for b in test[:count]:
-            _hear(matched, b, wide.late[s], heard)
-            for n in range(wide.begin[s], wide.begin[s + 1]):
-                power = _beam_power(wide.phases[n], heard) / wide.noise_std[s] ** 2
-                loudness[b - margin] = max(loudness[b - margin], power)
-    return loudness
-
-
-@kernel
-def _refined(
-    matched: Complex[np.ndarray, "k l"],
-    rough: Float[np.ndarray, " l"],
-    faintest: float,
-    wide: Wide,
-) -> Float[np.ndarray, " l"]:
-    """Return the loudness by exact delays at possible peaks and their neighbours; 0 between.
-
-    A rough amplitude below `faintest` cannot become loud enough.
-    """
-    loudness = np.zeros(rough.size)
-    heard, power = np.empty(len(matched), dtype=np.complex64), np.empty(len(wide.phases))
-    for b in np.flatnonzero(rough >= faintest**2):
-        beside = wide.loss * rough[max(b - 1, 0) : b + 2].max()
-        if math.sqrt(rough[b]) < math.sqrt(beside) - 2.0 * wide.slack:
-            continue
-        for near in range(max(b - 1, 0), min(b + 2, rough.size)):
-            if loudness[near] > 0.0:
+            sound, weight = tile[m], f(wide.beams.weight[m])
+            whole, half = moduli[0, m], moduli[1, m]
+            for b in range(whole.size):
+                whole[b] = weight * _modulus(sound[b])
+            for b in range(whole.size - 1):
+                half[b] = f(0.5) * weight * _modulus(sound[b] + sound[b + 1])
+        most[:] = f(0.0)
+        for s in range(len(totals)):
+            total = totals[s]
+            total[:] = f(0.0)
+            for m in range(microphones):
+                late = wide.late[s, m]
+                row = moduli[late & 1, m, margin + (late >> 1) :]
+                for b in range(CHUNK):
+                    total[b] += row[b]
+            for b in range(CHUNK):
+                total[b] *= inverse[s]
+                most[b] = max(most[b], total[b])
+        for b in range(min(CHUNK, lags - start)):
+            if most[b] < f(least):
                 continue
-            for s in range(len(wide.late)):
-                _hear(matched, near + wide.margin, wide.late[s], heard)
-                for n in range(wide.begin[s], wide.begin[s + 1]):
-                    power[n] = _beam_power(wide.phases[n], heard) / wide.noise_std[s] ** 2
-            least = max(math.sqrt(power.max()) - 2.0 * wide.slack, faintest)
-            for n in range(power.size):
-                if math.sqrt(power[n]) >= least:
-                    at, bearing = float(near + wide.margin), wide.beams.bearing[n]
-                    exact = _power(matched.T, at, bearing, wide.beams, wide.call)
-                    loudness[near] = max(loudness[near], exact)
+            power[:] = 0.0
+            for s in range(len(totals)):
+                if totals[s, b] >= f(least):
+                    _scan(tile, margin + b, s, wide, sums, power)
+            best, at = power.argmax(), float(margin + b)
+            if math.sqrt(power[best]) >= least - wide.slack:
+                loudest = _power(tile, at, bearing[best], wide.beams, wide.call)
+                for n in range(power.size):
+                    floor = max(math.sqrt(loudest), least) - wide.slack
+                    if n != best and power[n] >= floor * floor:
+                        exact = _power(tile, at, bearing[n], wide.beams, wide.call)
+                        loudest = max(loudest, exact)
+                loudness[start + b] = loudest
     return loudness
 
 
 def _lobes_of(call: Call, wide: Wide, step: int, rate: float) -> Float[np.ndarray, " l"]:
     """Return a call's highest side lobes by lag from its peak, relative to the peak's power."""
     interval, sent, beams = step / rate, replica(call, rate), wide.beams
-    reach = math.ceil(sent.size / step) + 2 * _margin(beams, interval)
+    reach = math.ceil(sent.size / step) + 2 * wide.margin
     count, most = window_lags(4 * reach), np.zeros(reach)
     length, (middle, low, high) = count * interval, bins_of(wide.band, count, interval)
     bins = middle + np.arange(low, high + 1)
     own, place = np.fft.fft(sent, step * count)[bins].conj(), bins / length
     early, share = _leads(beams, beams.bearing), beams.weight**2
-    facing = wide.normal if not math.isnan(wide.normal) else 0.0
     spectra = np.zeros((len(early), count), dtype=np.complex64)
     for angle in _ANGLES:
-        off = _leads(beams, np.array([facing + angle])) - early
+        off = _leads(beams, np.array([angle])) - early
         first, turn = np.exp(2j * np.pi * off * place[0]), np.exp(2j * np.pi * off / length)
         answer = [
             (share * at) @ np.vander(to, bins.size, increasing=True)
@@ -737,7 +717,7 @@ def _cut_lobes_of(call: Call, wide: Wide, step: int, rate: float) -> Float[np.nd
     from its peak it is no louder than the loudest of them.
     """
     sent = replica(call, rate)
-    margin = 2 * _margin(wide.beams, step / rate)
+    margin = 2 * wide.margin
     reach, count = math.ceil(sent.size / step), 8 * sent.size
     most = np.ones((PARTS_CUT + 1, reach + margin))
     frequency = np.arange(count) * rate / count

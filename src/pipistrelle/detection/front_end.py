@@ -347,7 +347,7 @@ class Finders:
         The detectors of tones come first, and include the vehicle even if it is silent.
         """
         heard = (one for one in reversed(self.finders) if caller in one.callers)
-        return next(one for one in heard if one.group == group or isinstance(one.members, slice))
+        return next(one for one in heard if one.group == group or one.faces == slice(None))
 
 
 FrontEnd = Detector | Finders
@@ -384,7 +384,7 @@ def front_end(
         return detector(lines, layout, tones)
     step = lag_step(sent, rate) if wide else blocks_of(rate, pulse, tones)[0]
     talk, silent = cross_talk(sent, rate) if wide else np.zeros((tones.size, tones.size)), 0 in wide
-    found, around = [], []
+    found, around, equal = [], [], {}
     if len(narrow) > silent:
         found = list(_tone_finders(lines, layout, tones[narrow], narrow))
     if isinstance(layout, Scattered):
@@ -398,12 +398,16 @@ def front_end(
     each = product(heard.tolist(), around), product(wide, range(layout.normal.size))
     for caller, g in chain(*each):
         row, members = layout.members(g)
+        if np.ptp(members) == members.size - 1:  # a view of the outputs, not a copy
+            members = slice(int(members[0]), int(members[-1]) + 1)
         if caller in heard:
             wave = config.assumed_sound_speed / tones[narrow].max()
             _refuse_far_apart(layout.places(g)[0], wave, where)
-        one, gain = wide_of(config, layout, g, sent[caller], step), layout.places(g)[1]
+        one = equal.get(caller) or wide_of(config, layout, g, sent[caller], step)
+        if isinstance(layout, Layout):  # all faces are equal
+            one = equal[caller] = one._replace(normal=float(layout.normal[g]))
         alone = Finder(np.array([caller]), g, slice(row, row + 1), members, one, np.zeros(2))
-        found.append(((one.threshold - 1.0) / np.sum(gain**2), alone))
+        found.append(((one.threshold - 1.0) / np.sum(layout.places(g)[1] ** 2), alone))
     return Finders(
         finders=tuple(finder for _, finder in found),
         narrow=narrow,

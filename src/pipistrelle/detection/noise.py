@@ -110,16 +110,17 @@ def delay_std(power: float, pulse: Whole) -> float:
     return math.sqrt(0.25 * lags + 1.625 * lags * lags)
 
 
-_CHUNK = 256
+CHUNK = 256
+"""Lags in a piece that stays in the cache."""
 
 
 @kernel
 def energy_of(parts: Float[np.ndarray, " i"], elements: Whole) -> Float[np.ndarray, " t"]:
     """Return each output's energy, summed over elements; real and imaginary parts alternate."""
     energy = np.empty(parts.size // (2 * elements))
-    square = np.empty(_CHUNK * elements)  # stays in the cache
-    for start in range(0, energy.size, _CHUNK):
-        done = energy[start : start + _CHUNK]
+    square = np.empty(CHUNK * elements)  # stays in the cache
+    for start in range(0, energy.size, CHUNK):
+        done = energy[start : start + CHUNK]
         part = parts[2 * elements * start :]
         for i in range(done.size * elements):
             square[i] = part[2 * i] * part[2 * i] + part[2 * i + 1] * part[2 * i + 1]
