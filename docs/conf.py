@@ -1,6 +1,5 @@
 """Settings of the documentation; `./dev docs` builds it, warnings as errors."""
 
-import os
 import re
 import sys
 from importlib import import_module
@@ -18,7 +17,6 @@ BENCHMARKS = ROOT / "benchmarks" / "latest.json"
 sys.path.insert(0, str(ROOT))
 
 mpl.use("Agg")
-os.environ["DASK_LOGGING__DISTRIBUTED"] = "warning"  # a tutorial starts a cluster
 
 project = "Pipistrelle"
 author = "The Pipistrelle developers"
@@ -79,7 +77,7 @@ def figures_of_block(block, block_vars, gallery_conf):
 sphinx_gallery_conf = {
     "examples_dirs": "../examples",
     "gallery_dirs": "gallery",
-    "filename_pattern": r"/\d\d_",
+    "filename_pattern": r"/\d\d_(?!on_a_cluster)",  # which would start processes
     "ignore_pattern": r"__init__\.py",
     "within_subsection_order": "FileNameSortKey",
     "image_scrapers": (figures_of_block,),
