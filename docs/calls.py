@@ -63,9 +63,11 @@ class Ear:
         blocks = round(14e-3 / settled.interval)
         samples = record_samples(blocks, echoes, self.face, settled).real
         samples = samples + rng.normal(scale=0.5, size=samples.shape)
+        channel = np.arange(samples.shape[2])[np.newaxis]
         start, interval = settled.pulse * settled.interval, self.filters.step / settled.rate
         lags = {"start": start, "interval": interval, "pulse": self.filters.pulse}
-        found = find_calls(self.filters(samples), self.end, **lags, cut=self.filters.cut)
+        matched = self.filters(samples[:, 0], channel)
+        found = find_calls(matched, self.end, **lags, cut=self.filters.cut)
         strong = found.power > 0.25 * found.power.max(initial=0.0)
         return found.delay[strong], found.delay_std[strong]
 

@@ -335,7 +335,7 @@ def heard(arrivals, layout, name="linear", rng=None, milliseconds=8.0, **more):
     """Return the matched outputs of arrivals, the lags and the front end."""
     config, settled, filters = setting(name, **more)
     blocks = round(milliseconds * 1e-3 / settled.interval)
-    matched = in_bands(filters, record_samples(blocks, arrivals, layout, settled, rng), 1.0)
+    matched = in_bands(filters, record_samples(blocks, arrivals, layout, settled, rng))
     start, interval = settled.pulse * settled.interval, filters.step / settled.rate
     return matched, Lags(start, interval, filters.pulse), config
 
@@ -489,7 +489,7 @@ def passed(layout, chance, name="linear", tests=12_000, threshold=None):
     nothing, rng = sweeps([], [], [], settled), np.random.default_rng(3)
     wide = wide_of(config, LAYOUTS[layout], 0, settled.calls[0], filters.step)
     blocks = round(8 * tests * filters.step / settled.block) + 2 * settled.pulse
-    matched = in_bands(filters, record_samples(blocks, nothing, LAYOUTS[layout], settled, rng), 1.0)
+    matched = in_bands(filters, record_samples(blocks, nothing, LAYOUTS[layout], settled, rng))
     least = threshold or wide.threshold
     outputs = np.ascontiguousarray(matched[:, 0, 0].T)
     loudness = _loudness(outputs, wide, least)[100:-100:8]
@@ -521,9 +521,7 @@ def test_noise_correlates_between_lags_as_the_calls_autocorrelation():
     _, settled, filters = setting()
     rng, count = np.random.default_rng(5), 400_000
     nothing = sweeps([], [], [], settled)
-    matched = in_bands(filters, record_samples(count // 40, nothing, FACE, settled, rng), 1.0)[
-        :, 0, 0
-    ]
+    matched = in_bands(filters, record_samples(count // 40, nothing, FACE, settled, rng))[:, 0, 0]
     sent = replica(settled.calls[0], settled.rate)
     own = np.correlate(sent, sent, mode="full")[sent.size - 1 :] / np.sum(np.abs(sent) ** 2)
     assert np.mean(np.abs(matched) ** 2) == pytest.approx(1.0, abs=0.01)
@@ -559,7 +557,7 @@ def test_a_tone_and_a_sweep_are_heard_side_by_side_and_leave_little_in_each_othe
     )
     samples = record_samples(60, both, FACE, settled, np.random.default_rng(1))
     lags = Lags(settled.pulse * settled.interval, filters.step / settled.rate, filters.pulse)
-    found = find_calls(in_bands(filters, samples, 1.0), end, **lags._asdict())
+    found = find_calls(in_bands(filters, samples), end, **lags._asdict())
     assert found.caller.tolist().count(1) == 1
     beacon = int(np.flatnonzero(found.caller == 1)[0])
     assert found.direct.detection.tolist() == [-1, beacon]

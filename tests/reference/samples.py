@@ -40,6 +40,12 @@ def filter_samples(samples, *, calls, rate, noise_std):
     )
 
 
-def in_bands(filters, samples, noise_std=1.0):
-    """Return the outputs of `BandFilters` at lags at which whole calls are recorded."""
-    return filters(samples, noise_std)[filters.cut : -filters.cut]
+def around(filters, samples):
+    """Return the outputs of `BandFilters` for samples of faces."""
+    channel = np.arange(samples[0].size).reshape(samples[0].shape)
+    return filters(samples.reshape(len(samples), -1), channel)
+
+
+def in_bands(filters, samples):
+    """Return its outputs at lags at which whole calls are recorded."""
+    return around(filters, samples)[filters.cut : -filters.cut]

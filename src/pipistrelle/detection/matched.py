@@ -10,7 +10,7 @@ from functools import lru_cache
 from itertools import pairwise
 
 import numpy as np
-from jaxtyping import Complex, Float
+from jaxtyping import Complex, Float, Int
 
 from pipistrelle.acoustics.call import (
     Call,
@@ -131,11 +131,13 @@ class Workspace:
     def __init__(self) -> None:
         self._flat: dict[str, np.ndarray] = {}
 
-    def array(self, name: str, shape: tuple[int, ...]) -> Complex[np.ndarray, "..."]:
+    def array(
+        self, name: str, shape: tuple[int, ...], kind: np.dtype | type = np.complex128
+    ) -> Complex[np.ndarray, "..."]:
         """Return a named work array in a given shape; its content is undefined."""
         size = math.prod(shape)
         if name not in self._flat or self._flat[name].size < size:
-            self._flat[name] = np.empty(size + size // 4, dtype=np.complex128)
+            self._flat[name] = np.empty(size + size // 4, kind)
         return self._flat[name][:size].reshape(shape)
 
 
@@ -166,6 +168,10 @@ def filter_blocks(
     return matched
 
 
+GROUP = 8
+"""Channels that are transformed together, so that caches hold them."""
+
+
 class BandFilters:
     """Matched filters for several calls, each in its band, of samples or of spectra.
 
@@ -185,27 +191,38 @@ class BandFilters:
         self._weights = lru_cache(maxsize=None)(self._weights_of)
 
     def __call__(
-        self, samples: Float[np.ndarray, "t f e"], noise_std: float = 1.0
+        self,
+        samples: Float[np.ndarray, "t m"],
+        channel: Int[np.ndarray, "f e"],
+        gain: float | Float[np.ndarray, "c f e"] = 1.0,
+        mean: float | Float[np.ndarray, " m"] = 0.0,
+        room: Workspace | None = None,
     ) -> Complex[np.ndarray, "l f c e"]:
-        """Correlate real samples with each call, as if silence surrounded them.
+        """Correlate real samples, less their mean, with each call, as if silence surrounded them.
 
-        Output `cut` + i is of a call that starts at sample i * `step`. `noise_std`: of one complex
-        sample, so that real ones have half of it. Noise has unit variance. If there are fewer
+        Output `cut` + i is of a call that starts at sample i * `step`. Real noise with a standard
+        deviation of a half has unit variance in the outputs, times their `gain`. If there are fewer
         samples than a call, the output is empty.
         """
         from scipy.fft import rfft
 
-        whole, shape = (len(samples) - self.length) // self.step + 1, samples.shape[1:]
-        if whole < 1:
-            return np.empty((0, shape[0], len(self.calls), shape[1]), dtype=np.complex64)
-        more, lags = self.cut * self.step, window_lags(whole + 3 * self.cut)
-        silent = np.zeros((math.prod(shape), lags * self.step), np.result_type(samples, np.float32))
-        silent[:, more : more + len(samples)] = samples.reshape(len(samples), -1).T
-        heard, factor = rfft(silent, axis=1), 2.0 / self.rate
-        bins = (bins_of(band, lags, self.interval) for band in self._bands)
-        spectra = [(heard, middle, factor) for middle, *_ in bins]
-        outputs = self._filtered(spectra, lags, noise_std)[..., : whole + 2 * self.cut]
-        return outputs.reshape(len(self.calls), *shape, -1).transpose(3, 1, 0, 2)
+        whole, each = (len(samples) - self.length) // self.step + 1, channel.ravel()
+        more, lags = self.cut * self.step, window_lags(max(whole, 0) + 3 * self.cut)
+        kind, count = np.result_type(samples, "c8"), whole + 2 * self.cut if whole > 0 else 0
+        shape = len(self.calls), each.size, count
+        outputs = np.empty(shape, kind) if room is None else room.array("matched", shape, kind)
+        bins = [bins_of(band, lags, self.interval) for band in self._bands]
+        gain = np.broadcast_to(gain, (len(self.calls), *channel.shape)).reshape(*shape[:2], 1)
+        gain, mean = gain.astype(samples.dtype), np.broadcast_to(mean, samples.shape[1:])
+        mean = mean[each, np.newaxis].astype(samples.dtype)
+        silent = np.zeros((GROUP, lags * self.step), samples.dtype)
+        for now in (slice(first, first + GROUP) for first in range(0, each.size, GROUP)):
+            heard = silent[: each[now].size, more : more + len(samples)]
+            np.subtract(samples.T[each[now]], mean[now], out=heard)
+            heard = rfft(silent[: len(heard)], axis=1)
+            found = self._filtered([(heard, one[0], 2.0 / self.rate) for one in bins], lags, 1.0)
+            np.multiply(found[..., :count], gain[:, now], out=outputs[:, now])
+        return outputs.reshape(len(self.calls), *channel.shape, count).transpose(3, 1, 0, 2)
 
     def outputs(
         self,

@@ -53,15 +53,11 @@ def own(tmp_path_factory):
 
 def words(settings):
     """Format settings as command-line flags."""
-    return [
-        word
-        for section, table in settings.items()
-        for key, value in table.items()
-        for word in (
-            f"--{section}.{key.replace('_', '-')}",
-            *map(str, value if isinstance(value, tuple) else (value,)),
-        )
-    ]
+    flags = []
+    for section, table in settings.items():
+        for key, value in table.items():
+            flags += [f"--{section}.{key.replace('_', '-')}", *map(str, np.atleast_1d(value))]
+    return flags
 
 
 def frames_of_run(settings=None, named=None):
@@ -204,9 +200,7 @@ def test_sixteen_bits_and_flac_give_nearly_the_same_detections(tmp_path):
 @pytest.mark.parametrize("faces", [True, False])
 def test_a_point_simulated_by_another_program_is_located(tmp_path, faces):
     log, found = heard(foreign(tmp_path / "tape", place=(1.5, 0.9), faces=faces))
-    assert [scan.time for scan in log] == [10.0 + s / 192e3 for s in (1000, 25e3, 47e3)] or (
-        len(log) == 3
-    )
+    assert len(log) == 3
     for scan in log:
         loudest = int(scan.level_db.argmax())
         assert abs(scan.bearing[loudest] - np.arctan2(0.9, 1.5)) < 0.02
@@ -313,12 +307,13 @@ def test_hear_refuses_more_calls_of_a_period_than_memory_holds(tmp_path):
 def test_hear_refuses_a_sole_call_at_the_end_of_the_sound(tmp_path):
     folder = foreign(tmp_path / "tape")
     samples = soundfile.info(folder / "tape.wav").frames
-    (folder / "calls.csv").write_text(f"sample\n{samples - 100}\n")
-    refused(folder, "calls.csv", "100 samples follow the first")
-    (folder / "calls.csv").write_text(f"sample\n1000\n{samples}\n")
-    refused(folder, "calls.csv, line 3", "outside the sound")
-    (folder / "calls.csv").write_text("sample\n-1\n1000\n")
-    refused(folder, "calls.csv, line 2", "outside the sound")
+    for rows, where, why in (
+        (f"{samples - 100}", "", "100 samples follow the first"),
+        (f"1000\n{samples}", ", line 3", "outside the sound"),
+        ("-1\n1000", ", line 2", "outside the sound"),
+    ):
+        (folder / "calls.csv").write_text(f"sample\n{rows}\n")
+        refused(folder, f"calls.csv{where}", why)
 
 
 def as_one_place(folder):

@@ -158,7 +158,7 @@ def dense_matched(call, delay, snr_db=25.0, seed=None):
     filters = BandFilters(settled.calls, settled.rate)
     lags |= {"interval": filters.step / settled.rate, "pulse": 560 // filters.step}
     end = front_end(DENSE, layout, settled.tones, calls=settled.calls)
-    return in_bands(filters, signal, 1.0), lags, end
+    return in_bands(filters, signal), lags, end
 
 
 @pytest.mark.parametrize(("call", "width"), [(ToneBurst, 2.8e-3), (Sweep, 1.0e-4)])

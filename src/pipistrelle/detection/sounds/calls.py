@@ -24,7 +24,7 @@ from jaxtyping import Bool, Complex, Float, Int
 
 from pipistrelle.acoustics.call import Call, ToneBurst
 from pipistrelle.config import BLOCK
-from pipistrelle.detection.matched import BandFilters
+from pipistrelle.detection.matched import GROUP, BandFilters, Workspace
 from pipistrelle.detection.sounds.sound_file import FILE as ABOUT
 from pipistrelle.detection.sounds.sound_file import Description, Sound
 from pipistrelle.jit import kernel
@@ -55,8 +55,9 @@ class Blocks(NamedTuple):
 class ToneSums:
     """Converter of samples to block sums at each tone, for all channels, in units of the noise."""
 
-    apart, gaps = 1, 256
-    """Step between sums for the noise; most gaps between calls that are read for it."""
+    apart, gaps, cut = 1, 256, 0
+    """Step between sums for the noise; most gaps between calls that are read for it; sums at each
+    end at which a call is only partly in the record."""
 
     def __init__(self, blocks: Blocks, channel: Int[np.ndarray, "f e"]) -> None:
         self.blocks, self.channel = blocks, channel
@@ -144,21 +145,15 @@ class CallOutputs:
         self.mean = np.zeros(int(channel.max()) + 1)
         """Mean of each channel's samples, which is subtracted."""
 
-    def around(self, samples: Float[np.ndarray, "t m"]) -> Complex[np.ndarray, "l f c e"]:
-        """Return matched-filter outputs of the samples after a call; the samples begin with it.
+    def __call__(
+        self, samples: Float[np.ndarray, "t m"], room: Workspace | None = None
+    ) -> Complex[np.ndarray, "l f c e"]:
+        """Return the outputs of the samples after a call; the samples begin with the vehicle's.
 
         At `cut` lags of each end, only a part of a call is received.
         """
-        heard = samples[self.blocks.blank :]
-        heard = heard - self.mean.astype(heard.dtype)[: heard.shape[1]]
-        outputs = self._filters(heard[:, self.channel])
-        outputs *= self.gain.astype(np.float32)
-        return outputs
-
-    def __call__(self, samples: Float[np.ndarray, "t m"]) -> Complex[np.ndarray, "l f c e"]:
-        """Return the outputs of whole calls; the samples begin with the vehicle's."""
-        outputs = self.around(samples)
-        return outputs[self.cut : len(outputs) - self.cut]
+        heard, gain = samples[self.blocks.blank :], self.gain.swapaxes(0, 1)
+        return self._filters(heard, self.channel, gain, self.mean, room)
 
 
 FILE = "calls.csv"
@@ -172,8 +167,6 @@ ONSET = 0.35
 """Share of the usual amplitude of a leak or a trigger that counts as a call."""
 _STRETCH = 10.0
 """Time in which the vehicle calls at least once, if calls are sought in the sound [s]."""
-_LISTEN = 8
-"""Most channels in which leakage is sought."""
 _CHUNK = 1 << 21
 """Numbers that are read at a time to find calls."""
 
@@ -306,11 +299,11 @@ def _triggered(sound: Sound, channel: int, where: str, apart: int) -> Float[np.n
 def _leaks(sound: Sound, sent: Call, apart: int) -> Float[np.ndarray, " k"]:
     """Return the samples where the call leaks into the microphones, with a minimum gap."""
     filters = BandFilters((sent,), sound.rate)
+    channel = np.arange(0, sound.channels, math.ceil(sound.channels / GROUP))[np.newaxis]
     step, loudest = filters.step, []
     some = max(apart // step, 1)
     for first, samples in _pieces(sound, some * step, filters.length + step):
-        some_channels = samples[:, :: math.ceil(sound.channels / _LISTEN)]
-        outputs = filters((some_channels - some_channels.mean(axis=0))[:, np.newaxis])
+        outputs = filters(samples, channel, mean=samples.mean(axis=0))
         outputs = outputs[filters.cut : len(outputs) - filters.cut]
         level = np.sqrt((outputs.real**2 + outputs.imag**2).sum(axis=(1, 2, 3)))
         found = np.empty((-(-len(level) // some), 2))

@@ -63,8 +63,8 @@ def array_faults(hearing: Hearing) -> Iterator[str]:
     """Yield suggested corrections of ``array.csv`` that would explain the loudest echoes better."""
     heard: list[list[_Echo]] = [[] for _ in hearing.array.face]
     pairs: list[tuple[int, float, int, float]] = []
-    last = hearing.calls.sample.size - 1
-    for frame in hearing.frames(np.unique(np.linspace(0, last, CALLS).astype(np.int64)).tolist()):
+    for k in hearing.calls.spread(CALLS).tolist():
+        frame = hearing.frame(k)
         _collect(frame, hearing, heard)
         pairs += _pairs(frame, hearing)
     for g, echoes in enumerate(heard):
@@ -102,7 +102,7 @@ def _echo(frame: Frame, hearing: Hearing, d: int) -> _Echo | None:
     if wide is None:
         if not 0 <= round(at) < len(outputs):
             return None
-        return _Echo(hearing.blocks.tones[[caller]], outputs[[round(at)]])
+        return _Echo(hearing.sums.blocks.tones[[caller]], outputs[[round(at)]])
     c, far = wide.beams.speed_of_sound, np.linalg.norm(wide.beams.position, axis=1).max()
     toward = np.array([np.cos(found.bearing[d]), np.sin(found.bearing[d])])
     at -= wide.middle @ toward / c / frame.interval
@@ -182,7 +182,7 @@ def _directions(
     layout, speed = hearing.array.layout, hearing.config.assumed_sound_speed
     (place, gain), normal = layout.places(g), float(layout.normal[g])
     place = place - gain**2 @ place / np.sum(gain**2)
-    reach = np.linalg.norm(place, axis=1).max() * hearing.blocks.tones.max() / speed
+    reach = np.linalg.norm(place, axis=1).max() * hearing.sums.blocks.tones.max() / speed
     half = math.pi if math.isnan(normal) else 0.5 * math.pi
     bearing = 0.0 if math.isnan(normal) else normal
     bearing += np.linspace(-half, half, 201 + math.ceil(20.0 * math.pi * reach * half))

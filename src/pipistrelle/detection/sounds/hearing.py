@@ -60,6 +60,7 @@ from pipistrelle.detection.sounds.sound_file import (
     open_sound,
     recorded_array,
 )
+from pipistrelle.jit import kernel
 from pipistrelle.refusals import refusal
 
 GROUP, FIRST_GAPS = 64, 8
@@ -111,7 +112,8 @@ def _powers(
     """Return the powers of block sums in given sections of given gaps between calls, by section."""
     power: list[list[np.ndarray]] = [[] for _ in stretches]
     for samples in calls.gaps(sound, numbers):
-        heard = sums(samples)[:: sums.apart]
+        heard = sums(samples)
+        heard = heard[sums.cut : len(heard) - sums.cut : sums.apart]
         edges = np.linspace(0, len(heard), STRETCHES + 1).astype(np.int64)
         for stretch, part in zip(stretches, power, strict=True):
             some = heard[edges[stretch] : edges[stretch + 1]]
@@ -179,12 +181,9 @@ def _sums(
     """Return the products of all channel pairs at each delay, and the squares, summed over time."""
     lates = range(-LATEST, LATEST + 1)
     product, count = np.zeros((len(lates), used.size, used.size)), 0
-    source, power = np.zeros((len(lates), used.size)), np.zeros(used.size)
-    for k in calls.spread(GAPS):
-        first = int(calls.sample[k]) + blank
-        samples = sound.read(first, min(int(calls.length[k]) - blank, SAMPLES))
-        sound.refuse_odd(first, samples)
-        heard = samples[:, used].astype(np.float64)
+    source = np.zeros((len(lates), used.size))
+    for samples in calls.gaps(sound, calls.spread(GAPS)):
+        heard = samples[blank : blank + SAMPLES, used].astype(np.float64)
         if len(heard) <= 2 * LATEST:
             continue
         there = heard[LATEST : len(heard) - LATEST]
@@ -192,11 +191,26 @@ def _sums(
         for row, late in enumerate(lates):
             before = heard[LATEST - late : len(heard) - LATEST - late]
             before = before - before.mean(axis=0)
-            product[row] += before.T @ there
+            _add_products(before, there, product[row])
             source[row] += (before**2).sum(axis=0)
-        power += (there**2).sum(axis=0)
         count += len(there)
-    return product, source, power, count
+    return product, source, source[LATEST], count
+
+
+@kernel
+def _add_products(
+    before: Float[np.ndarray, "t m"], now: Float[np.ndarray, "t m"], sums: Float[np.ndarray, "m m"]
+) -> None:
+    """Add the products of all pairs of columns, summed over time, to the sums.
+
+    The threads of a matrix product would take ten times longer on a busy machine.
+    """
+    for t in range(len(now)):
+        row = now[t]
+        for i in range(row.size):
+            some, total = before[t, i], sums[i]
+            for j in range(row.size):
+                total[j] += some * row[j]
 
 
 Progress = Callable[[str, int, int], None]
@@ -232,11 +246,6 @@ class Hearing:
     own_clock: Bool[np.ndarray, " c"]
     """Whether each caller calls independently of the vehicle: its detections are left out."""
 
-    @property
-    def blocks(self) -> Blocks:
-        """Sample rate, block length and tones of a frame."""
-        return self.sums.blocks
-
     @classmethod
     def of(cls, folder: Path, sound: Sound, about: Description, config: Config) -> "Hearing":
         """Prepare an open recording: its microphones, calls, noise and detector."""
@@ -259,49 +268,30 @@ class Hearing:
         one = self.end.of(caller, group).detector if isinstance(self.end, Finders) else None
         return one if isinstance(one, Wide) and not one.call.tone else None
 
-    def frames(self, numbers: Sequence[int]) -> Iterator[Frame]:
-        """Yield matched-filter output and detections after some of the calls, numbered from 0."""
-        calls, room = self.calls, Workspace()
-        for k in numbers:
-            first = int(calls.sample[k])
-            samples = self.sound.read(first, int(calls.length[k]))
-            matched = self._matched(first, samples, room)
-            yield self._frame(float(calls.time[k]), matched)
+    def frame(self, k: int, room: Workspace | None = None) -> Frame:
+        """Return matched-filter output and detections after a call, numbered from 0."""
+        on, cut = self.sums.blocks, self.sums.cut
+        matched, time = self._matched(k, room or Workspace()), float(self.calls.time[k])
+        lags = {"start": on.blank / on.rate, "interval": on.interval}
+        found = find_calls(matched, self.end, **lags, pulse=on.pulse, cut=cut)
+        found = with_edge_floor(detections_at(found, ~self.own_clock[found.caller]), self.config)
+        scan, _ = unlabelled_scan(time, found, self.config, self.own_clock)
+        whole = matched[cut : len(matched) - cut]
+        return Frame(time, whole, **lags, detections=found, scan=scan)
 
-    def _matched(
-        self, first: int, samples: Float[np.ndarray, "t m"], room: Workspace
-    ) -> Complex[np.ndarray, "l f c e"]:
+    def _matched(self, k: int, room: Workspace) -> Complex[np.ndarray, "l f c e"]:
         """Return the matched-filter outputs after a call; raise if its samples are not finite."""
-        on, shape = self.blocks, self.sums.gain.shape
+        on, shape, first = self.sums.blocks, self.sums.gain.shape, int(self.calls.sample[k])
+        samples = self.sound.read(first, int(self.calls.length[k]))
         if isinstance(self.sums, CallOutputs):
             self.sound.refuse_odd(first, samples)
-            return self.sums.around(samples)
+            return self.sums(samples, room)
         count = max((len(samples) - on.blank) // on.block, 0)
         blocks = self.sums(samples, room.array("blocks", (count, *shape)))
         if not np.isfinite(blocks).all():
             self.sound.refuse_odd(first, samples)
         out = room.array("matched", (max(count - on.pulse + 1, 0), *shape))
         return filter_blocks(blocks, pulse=on.pulse, block=1, noise_std=1.0, out=out)
-
-    def _frame(
-        self,
-        time: float,
-        matched: Complex[np.ndarray, "l f c e"],
-    ) -> Frame:
-        """Detect the echoes of a call; return its frame with detections and unlabelled scan."""
-        on, cut = self.blocks, 0
-        if isinstance(self.sums, CallOutputs) and len(matched):
-            cut = self.sums.cut
-        start = on.blank / on.rate
-        found = find_calls(
-            matched, self.end, start=start, interval=on.interval, pulse=on.pulse, cut=cut
-        )
-        if self.own_clock.any():
-            found = detections_at(found, ~self.own_clock[found.caller])
-        found = with_edge_floor(found, self.config)
-        scan, _ = unlabelled_scan(time, found, self.config, self.own_clock)
-        matched = matched[cut : len(matched) - cut]
-        return Frame(time, matched, start, on.interval, found, scan)
 
 
 def prepared(
@@ -339,10 +329,11 @@ def hear_recording(
     """
     with open_sound(folder, about) as sound:
         hearing = Hearing.of(folder, sound, about, config)
-        numbers = frames(hearing.calls.sample.size)
-        odd = [*copied_channels(sound, hearing.calls, hearing.blocks.blank, hearing.array.used)]
-        for done, frame in enumerate(hearing.frames(numbers), start=1):
-            look(frame)
+        numbers, room = frames(hearing.calls.sample.size), Workspace()
+        after, used = hearing.sums.blocks.blank, hearing.array.used
+        odd = [*copied_channels(sound, hearing.calls, after, used)]
+        for done, k in enumerate(numbers, start=1):
+            look(hearing.frame(k, room))
             if progress:
                 progress("hearing", done, len(numbers))
     return odd

@@ -367,9 +367,10 @@ class Sound:
 
     def refuse_odd(self, first: int, samples: Float[np.ndarray, "t m"]) -> None:
         """Raise if samples are not finite, or larger than `LARGEST_SAMPLE`."""
-        odd = ~(np.abs(samples) <= LARGEST_SAMPLE)
-        if odd.any():
-            row, channel = (int(one[0]) for one in np.nonzero(odd))
+        largest = max(-samples.min(initial=0.0), samples.max(initial=0.0))
+        if not largest <= LARGEST_SAMPLE:
+            odd = np.nonzero(~(np.abs(samples) <= LARGEST_SAMPLE))
+            row, channel = (int(one[0]) for one in odd)
             number = int(np.searchsorted(self._begin, first + row, side="right")) - 1
             where = f"{self.paths[number]}, channel {channel + 1}"
             place = first + row - int(self._begin[number])
