@@ -13,8 +13,8 @@ from pipistrelle.detection.noise import BEARING_FLOOR, RANGE_FLOOR
 from pipistrelle.geometry import wrap
 from reference.sounds import write_beside
 
-RATE, TONE, LENGTH, C = 200_000, 35e3, 2.8e-3, 343.0
-"""Sample rate [Hz]; frequency [Hz] and duration [s] of the call; speed of sound [m/s]."""
+RATE, TONE, SWEEP, LENGTH, C = 200_000, 35e3, (60e3, 35e3), 2.8e-3, 343.0
+"""Sample rate; frequency of a tone, of a sweep's ends [Hz]; duration [s]; speed of sound [m/s]."""
 ROOM, CENTRE = np.array([9.0, 8.0]), np.array([4.2, 3.9])
 """Size of the room, and position of the array in it [m]."""
 TURN = np.arange(8) * np.pi / 4
@@ -45,7 +45,17 @@ ARRAYS = {
 }
 
 
-def heard(layout, bearing, distance, *, absorption=None, order=0, seconds=0.0):
+def waveform(call, time):
+    """Return a tone, or a sweep that fades in and out, at times since its start [s]."""
+    if call == "tone":
+        return np.cos(2.0 * np.pi * TONE * time)
+    low, high = min(SWEEP), max(SWEEP)
+    edge = np.clip(np.minimum(time, LENGTH - time) / (0.1 * LENGTH), 0.0, 1.0)
+    turns = high * time - 0.5 * (high - low) * time**2 / LENGTH
+    return np.sin(0.5 * np.pi * edge) ** 2 * np.cos(2.0 * np.pi * turns)
+
+
+def heard(layout, bearing, distance, *, call="tone", absorption=None, order=0, seconds=0.0):
     """Return each microphone's noise-free samples of a call from a given position.
 
     Faces receive nothing from behind. `absorption` is the share of the energy that a wall absorbs;
@@ -54,7 +64,7 @@ def heard(layout, bearing, distance, *, absorption=None, order=0, seconds=0.0):
     """
     import pyroomacoustics as pra
 
-    call = np.cos(2.0 * np.pi * TONE * np.arange(round(LENGTH * RATE)) / RATE)
+    sent = waveform(call, np.arange(round(LENGTH * RATE)) / RATE)
     if absorption is None:
         room, origin = pra.AnechoicRoom(2, fs=RATE), np.zeros(2)
     else:
@@ -62,7 +72,7 @@ def heard(layout, bearing, distance, *, absorption=None, order=0, seconds=0.0):
         room = pra.ShoeBox(ROOM, fs=RATE, materials=walls, max_order=order)
         origin = CENTRE
     toward = np.array([np.cos(bearing), np.sin(bearing)])
-    room.add_source(origin + distance * toward, signal=call)
+    room.add_source(origin + distance * toward, signal=sent)
     room.add_microphone_array((origin + layout.position).T)
     assert room.c == C
     room.simulate()
@@ -80,7 +90,7 @@ def noise_for(samples, snr_db):
     return np.sqrt(0.5 * energy[energy > 0.0].mean()) / 10.0 ** (snr_db / 20.0)
 
 
-def record(folder, name, sounds, noise_std, rng):
+def record(folder, name, sounds, noise_std, rng, call="tone"):
     """Write a recording of an array, with a call of the vehicle at the start of each sound."""
     import soundfile
 
@@ -93,6 +103,10 @@ def record(folder, name, sounds, noise_std, rng):
             calls.append(begin)
             begin += len(samples)
     write_beside(folder, TONE, LENGTH, C, array_text(microphones), calls, until=11 + begin // RATE)
+    if call == "sweep":
+        about = folder / "recording.toml"
+        key = f'call = "sweep"\nband = {list(SWEEP)}\ntaper = 0.2'
+        about.write_text(about.read_text().replace(f"frequency = {TONE}", key))
     return folder
 
 
@@ -110,20 +124,26 @@ FAR, CUT = 40.0, 0.1
 vehicle's call after the source's [s]."""
 
 
-def bounds(layout, bearing, snr_db):
-    """Return the Cramer-Rao bounds of bearing [rad] and, for block sums, of delay [s].
+def bounds(layout, bearing, snr_db, call="tone"):
+    """Return the Cramer-Rao bounds of bearing [rad] and, for a tone's block sums, of delay [s].
 
     They hold for a measurement, the mean over the faces that receive it.
     """
     across, late, faces = 0.0, 0.0, 0
+    spectrum = np.abs(np.fft.rfft(waveform(call, np.arange(round(LENGTH * RATE)) / RATE), RATE))
+    share, frequency = spectrum**2 / np.sum(spectrum**2), np.arange(spectrum.size)
+    centre = share @ frequency
+    width = np.sqrt(share @ (frequency - centre) ** 2)  # of a tone it is of its edges: none
+    wave = TONE if call == "tone" else np.hypot(centre, width)
     for g in range(layout.normal.size):
         if np.cos(bearing - layout.normal[g]) < np.cos(ANGLE_LIMIT):
             continue
         place = layout.position[layout.group == g]
         power = len(place) * 10.0 ** (snr_db / 10.0)
         spread = spread_towards(np.array([bearing]), place, np.full(len(place), len(place) ** -0.5))
-        across += 0.5 / (power * (2.0 * np.pi * TONE / C) ** 2 * spread[0])
-        late += 0.25 * LENGTH * 2e-4 / power
+        across += 0.5 / (power * (2.0 * np.pi * wave / C) ** 2 * spread[0])
+        exact = 0.5 / (2.0 * np.pi * width) ** 2
+        late += (0.25 * LENGTH * 2e-4 if call == "tone" else exact) / power
         faces += 1
     return np.sqrt(across) / faces, np.sqrt(late) / faces
 
@@ -137,7 +157,7 @@ def anywhere(layout, rng):
             return bearing
 
 
-def errors(folder, name, snr_db, places, draws, *, order=slice(None)):
+def errors(folder, name, snr_db, places, draws, *, call="tone", order=slice(None)):
     """Record and process a distant source; return errors of bearing and delay, a row each.
 
     The first two are in units of their bounds, the others of the measured standard deviations
@@ -147,19 +167,21 @@ def errors(folder, name, snr_db, places, draws, *, order=slice(None)):
 
     def sounds():
         for bearing, distance in truth:
-            samples, _ = heard(layout, bearing, distance)
+            samples, _ = heard(layout, bearing, distance, call=call)
             for _ in range(draws):
                 yield samples[round(CUT * RATE) :, order]
 
     truth = [(anywhere(layout, rng), FAR + rng.uniform(0.0, 0.07)) for _ in range(places)]
-    noise_std = noise_for(heard(layout, *truth[0])[0], snr_db)
-    rows, call = rows_of(record(folder, name, sounds(), noise_std, rng), places * draws)
-    loudest = np.lexsort((-rows["level_db"].to_numpy(), call))  # others are noise
-    rows = rows[loudest[np.unique(call[loudest], return_index=True)[1]]]
+    noise_std = noise_for(heard(layout, *truth[0], call=call)[0], snr_db)
+    tape = record(folder, name, sounds(), noise_std, rng, call)
+    rows, frame = rows_of(tape, places * draws)
+    loudest = np.lexsort((-rows["level_db"].to_numpy(), frame))  # others are noise
+    rows = rows[loudest[np.unique(frame[loudest], return_index=True)[1]]]
     bearing, distance = np.repeat(truth, draws, axis=0).T
-    least = np.array([bounds(layout, one, snr_db) for one in bearing]).T
+    least = np.array([bounds(layout, one, snr_db, call) for one in bearing]).T
     off = wrap(rows["bearing"].to_numpy() - bearing)
-    late = 2.0 * rows["range"].to_numpy() / C + 0.5 / RATE  # centre of a sample
+    half = 0.5 / RATE if call == "tone" else 0.0  # the centre of a sample
+    late = 2.0 * rows["range"].to_numpy() / C + half
     after = late + CUT - distance / C
     off_std = np.sqrt(rows["bearing_std"].to_numpy() ** 2 - BEARING_FLOOR[0] ** 2)
     after_std = np.sqrt(rows["range_std"].to_numpy() ** 2 - RANGE_FLOOR**2) * 2.0 / C
