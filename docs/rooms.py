@@ -1,4 +1,5 @@
-"""Print the tables of `arrays.md` anew: `.venv/bin/python docs/rooms.py`.
+"""Print the tables of `arrays.md` anew: `.venv/bin/python docs/rooms.py`; `docs/rooms.py sweeps`
+prints that of `calls.md`.
 
 Errors of bearings and delays from afar, without walls, in units of their bounds. And: a call from
 anywhere in a room of 9 by 8 m reaches a circle of eight microphones, and its walls throw it back
@@ -79,6 +80,23 @@ def in_bounds():
     print()
 
 
+def sweeps():
+    """Print errors of bearing and range of a sweep, in units of their bounds."""
+    from reference.rooms import errors
+
+    levels = (10.0, 15.0, 20.0, 25.0, 30.0)
+    print("| array | " + " | ".join(f"{one:g} dB" for one in levels) + " |")
+    print("|---|" + "--:|" * len(levels))
+    for name in ("square", "circle", "cross"):
+        cells = []
+        for snr_db in levels:
+            with TemporaryDirectory() as folder:
+                off = errors(Path(folder) / "tape", name, snr_db, 60, 5, call="sweep")
+            across, late, *_ = np.sqrt(np.mean(off**2, axis=1))
+            cells.append(f"{across:.2f}, {late:.2f}")
+        print(f"| {name} | {' | '.join(cells)} |", flush=True)
+
+
 def among_walls():
     """Print a row for each kind of walls."""
     print("| walls | rows | of no image | first row's bearing, rms | in deviations | delay, rms |")
@@ -90,5 +108,7 @@ def among_walls():
 
 
 if __name__ == "__main__":
+    if sys.argv[1:] == ["sweeps"]:
+        sys.exit(sweeps())
     in_bounds()
     among_walls()
