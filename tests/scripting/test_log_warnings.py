@@ -65,7 +65,7 @@ def test_units_are_asked_about_where_few_rows_of_an_association_are_on_the_map(
 @pytest.mark.parametrize(
     ("call", "repaired", "words"),
     [
-        (-1, True, ["where the odometry leads", "found again", "skid"]),
+        (-1, True, ["where the odometry leads", "found again", "skid", "less precise"]),
         (-1, False, ["where the odometry leads", "not to be trusted", "skid"]),
         (0, False, ["other calls' paths do", "not to be trusted", "range setting"]),
         (1, True, ["by 'mate'", "searched for again", "its name given to another"]),

@@ -228,7 +228,7 @@ def _refuted(trial: "TrialResult", recorded: "Log") -> Iterator[Question]:
             found = "no measurements fit the map from where the odometry leads"
             then, asked = (
                 "its pose was found again on the map",
-                "did it skid, slip, or was it moved?",
+                "did it skid, slip, was it moved, or is its odometry less precise than stated?",
             )
         elif call == OWN:
             found = "the ranges to the map's landmarks do not fit, other calls' paths do"

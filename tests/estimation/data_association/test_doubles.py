@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from pipistrelle.estimation.beliefs import JointGaussian
-from pipistrelle.estimation.data_association.existence import doubles
+from pipistrelle.estimation.data_association.existence import doubles, drifted
 
 OLD = np.array([[4.0, 1.0], [6.0, -2.0], [9.0, 3.0], [3.0, -4.0]])
 
@@ -25,9 +25,8 @@ def closed_loop(shift, drift_std, old=OLD, twice=4, std=0.03):
 def asked_of(joint, apart=None, asked=None):
     size = joint.landmark.size
     apart = np.eye(size, dtype=bool) if apart is None else apart
-    return doubles(
-        joint, 3 + 2 * np.arange(size), apart, np.arange(size) if asked is None else asked
-    )
+    asked = np.arange(size) if asked is None else asked
+    return doubles(joint, 3 + 2 * np.arange(size), apart, asked)
 
 
 @pytest.mark.parametrize("asked", [[4], [7], [0], [5, 6]])
@@ -38,6 +37,13 @@ def test_a_closed_loop_is_found_as_a_group_from_any_member(asked):
 
 def test_a_single_pair_after_a_long_drift_is_no_evidence():
     assert asked_of(closed_loop(np.array([2.5, -1.5]), drift_std=2.0, twice=1)) == []
+
+
+def test_a_loop_is_closed_after_more_drift_than_stated():
+    joint, born = closed_loop(np.array([2.5, -1.5]), drift_std=0.4), np.repeat([0, 50], 4)
+    places = joint, 3 + 2 * np.arange(8), np.eye(8, dtype=bool), np.arange(8)
+    assert asked_of(joint) == drifted(*places, (born, born + 60)) == []
+    assert sorted(drifted(*places, (born, born + 40))) == [(0, 4), (1, 5), (2, 6), (3, 7)]
 
 
 def test_one_pair_in_one_place_is_one_landmark():
@@ -58,10 +64,8 @@ def test_new_landmarks_elsewhere_are_not_forced_onto_old_ones():
     rng, merged = np.random.default_rng(11), 0
     for _ in range(100):
         joint = closed_loop(np.zeros(2), drift_std=0.5)
-        mean = joint.mean.copy()
-        mean[11:] = rng.uniform(-20.0, 20.0, 8)
-        merged += bool(asked_of(JointGaussian(
-            landmark=joint.landmark, mean=mean, covariance=joint.covariance)))  # fmt: skip
+        joint.mean[11:] = rng.uniform(-20.0, 20.0, 8)
+        merged += bool(asked_of(joint))
     assert merged <= 3
 
 

@@ -80,17 +80,12 @@ def test_scan_records_log_probability_of_misses_as_far_as_strays_may_be_of_them(
 
 def test_ratio_counts_each_landmark_once_and_by_scans_after_its_first():
     """Two scans: missed twice, missed then detected, detected then missed, first in the latter."""
-    miss, q, now = math.log(0.2), CHANCE, 90
+    miss, q, detected, now = math.log(0.2), CHANCE, math.log(CHANCE / (1.0 - CHANCE)), 90
     past = [[miss, miss], [miss, 1.0], [1.0, miss], [0.0, miss]]
     known = known_of(past, [3, 3, 3, now - 1])
     found = ratios(known.past, known.born, known.confirmed, now)[0, -2:]
-
-    def missed(m):
-        return math.log((1 - q + q * m) / (q + (1 - q) * m))
-
-    detected = math.log(q / (1 - q))
-    assert found[0] == pytest.approx(missed(0.04) + 2 * detected)
-    assert found[1] == pytest.approx(3 * missed(0.2) + detected)
+    missed = [math.log((1 - q + q * m) / (q + (1 - q) * m)) for m in (0.04, 0.2)]
+    assert found == pytest.approx([missed[0] + 2 * detected, 3 * missed[1] + detected])
 
 
 def drawn_past(rng, share, scans):

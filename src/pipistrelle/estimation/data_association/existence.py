@@ -23,10 +23,12 @@ landmarks. Each further pair of a group is tested given the pairs before, which 
 moved. Groups grow greedily; the best is accepted if it is 99 times likelier than distinct landmarks
 and than each contradicting group. Landmarks detected in a scan of the same caller are distinct
 (`Known.together`). Source: Neira & Tardos, IEEE Transactions on Robotics and Automation 17 (2001).
+Without a group, S is replaced by 16 S, as odometry may drift more than stated (`drifted`).
 """
 
 import math
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -36,7 +38,7 @@ from pipistrelle.detection.scans import OWN
 from pipistrelle.estimation.beliefs import JointGaussian, is_among
 from pipistrelle.estimation.session import REMEMBERED
 from pipistrelle.geometry import wrap_angle
-from pipistrelle.jit import Flag, Whole, kernel, no_alloc
+from pipistrelle.jit import Whole, kernel, no_alloc
 
 CHANCE = 0.1
 """Probability q of a detection by chance, and that a landmark is hidden."""
@@ -49,8 +51,6 @@ LEVEL_STD = 5.0
 LASTING = 12
 """Detections from which a landmark serves to learn detection probabilities, and is unconfirmed, not
 removed: except by levels of other callers only, as its position depends on theirs."""
-NEAR = 0.3
-"""Least distance for spherical spreading [m]."""
 FORGETTING = 0.2
 """Weight of the newest level in the mean."""
 PERSISTENCE = 5
@@ -258,14 +258,14 @@ def _spreading(caller: Whole, far: float, i: Whole, place: Place) -> float:
     """Return the loss of an echo's level by spherical spreading, via the landmark at i [dB].
 
     It is two-way for own calls, and for moving callers via the landmark, else from the landmark
-    only.
+    only; 0 within 1 m.
     """
-    loss = (40.0 if caller == OWN else 20.0) * math.log10(max(far, NEAR))
+    loss = (40.0 if caller == OWN else 20.0) * math.log10(max(far, 1.0))
     mean, _, callers, moves = place
     if moves[caller] and callers[caller] >= 0:
         j = callers[caller]
         there = math.hypot(mean[i] - mean[j], mean[i + 1] - mean[j + 1])
-        loss += 20.0 * math.log10(max(there, NEAR))
+        loss += 20.0 * math.log10(max(there, 1.0))
     return loss
 
 
@@ -308,6 +308,9 @@ LEAST_STD = 0.15
 """Least standard deviation of a difference along each axis [m], to allow for overconfident filters.
 """
 
+UNDERSTATED = 4.0
+"""Factor on the map's standard deviations that allows for a drift larger than stated."""
+
 Pairs = list[tuple[int, int]]
 
 
@@ -321,7 +324,8 @@ def asked_of(
     old = np.append(np.flatnonzero(old & told), np.flatnonzero(old & ~told))
     asked = np.zeros(old.size, np.bool_)
     for i, a in enumerate(old):
-        asked[i] = known.heard[a] == now and _is_due(known.count[a])
+        count = known.count[a]  # 4, 8, 16 and so on
+        asked[i] = known.heard[a] == now and count >= 4 and count & (count - 1) == 0
     apart = np.ones((old.size, old.size) if asked.any() else (0, 0), np.bool_)
     for i in range(apart.shape[0]):
         for j in range(i):
@@ -332,56 +336,51 @@ def asked_of(
     return old, apart, np.flatnonzero(asked)
 
 
-@no_alloc
-def _is_due(count: Whole) -> Flag:
-    """Return whether to test a landmark for duplicates: at 4, 8, 16 and so on detections."""
-    return count >= 4 and count & (count - 1) == 0
-
-
 def doubles(
     joint: JointGaussian,
     at: Int[np.ndarray, " l"],
     apart: Bool[np.ndarray, "l l"],
     asked: Int[np.ndarray, " a"],
+    least: float = 0.0,
 ) -> Pairs:
     """Find duplicate landmarks in a joint map; return pairs of their indices, lower first.
 
-    ``apart``: pairs known to be distinct; ``asked``: landmarks from which groups may grow.
+    ``apart``: pairs known to be distinct; ``asked``: landmarks from which groups may grow;
+    ``least``: further reduction of the cost by a group.
     """
     best: tuple[float, list[list[int]]] = 0.0, []
-    prior = 2.0 * math.log(_density(joint, at))
+    mean, covariance, pairs = joint.mean, joint.covariance, np.empty((at.size, 2), np.int64)
+    area = float(np.ptp(mean[at]) * np.ptp(mean[at + 1]))
+    prior = 2.0 * math.log(at.size / max(area, at.size / DENSEST))
     for number in asked.tolist():
-        groups = _groups(joint, at, apart, number, prior)
-        if not groups:
-            continue
-        cost, group = min(groups)
-        others = [other for other, pairs in groups if group[0] not in pairs]
-        limit = min(best[0], min([0.0, *others]) - LIKELIER)
+        groups = []
+        for first in begun(mean, covariance, at, apart, number).tolist():
+            cost, size = grown(mean, covariance, at, apart, tuple(first), prior, pairs)
+            groups.append((cost, pairs[:size].tolist()))
+        cost, group = min(groups, default=best)
+        others = [other for other, found in groups if group[0] not in found]
+        limit = min(best[0], min([0.0, *others]) - LIKELIER - least)
         if cost < limit:
             best = cost, group
     return _lower_first(best[1])
 
 
-def _density(joint: JointGaussian, at: Int[np.ndarray, " l"]) -> float:
-    """Return the density of landmarks in the map's bounding box [1/m^2], limited above."""
-    area = float(np.ptp(joint.mean[at]) * np.ptp(joint.mean[at + 1]))
-    return at.size / max(area, at.size / DENSEST)
-
-
-def _groups(
+def drifted(
     joint: JointGaussian,
     at: Int[np.ndarray, " l"],
     apart: Bool[np.ndarray, "l l"],
-    number: int,
-    prior: float,
-) -> list[tuple[float, list[list[int]]]]:
-    """Grow a group of pairs from each possible duplicate of a landmark; return costs and pairs."""
-    mean, covariance, pairs = joint.mean, joint.covariance, np.empty((at.size, 2), np.int64)
-    groups = []
-    for first in begun(mean, covariance, at, apart, number).tolist():
-        cost, size = grown(mean, covariance, at, apart, tuple(first), prior, pairs)
-        groups.append((cost, pairs[:size].tolist()))
-    return groups
+    asked: Int[np.ndarray, " a"],
+    lifetimes: tuple[Int[np.ndarray, " l"], Int[np.ndarray, " l"]],
+) -> Pairs:
+    """Find duplicates after a drift larger than stated, as `doubles` does.
+
+    ``lifetimes``: scans of the first and the last detection; landmarks of which one was last
+    detected before the first detection of the other are compared.
+    """
+    born, heard = lifetimes
+    before, wide = heard[:, np.newaxis] < born, UNDERSTATED**2 * joint.covariance
+    apart = apart | ~(before | before.T)  # and such a drift has the probability 0.01
+    return doubles(replace(joint, covariance=wide), at, apart, asked, LIKELIER)
 
 
 @kernel

@@ -482,7 +482,10 @@ class _Work:
         if not asked.size:
             return ()
         label = known.label[old].tolist()
-        pairs = existence.doubles(self.joint, at[old], apart, asked)
+        places = self.joint, at[old], apart, asked
+        pairs, lifetimes = existence.doubles(*places), (known.born[old], known.heard[old])
+        if not (pairs or self.watch.lost) and (pairs := existence.drifted(*places, lifetimes)):
+            self.watch = watch.alarmed(self.watch, WINDOW - 1, watch.POSE, repaired=True)
         return tuple((label[a], label[b]) for a, b in pairs)
 
     def _callers_labels(self) -> Int[np.ndarray, " c"]:
@@ -528,10 +531,8 @@ class _Work:
         if row < 0:
             return True
         if at >= 0 and number not in self.moves:
-            rows, joint = self.rows, self.joint
-            columns = rows.bearing, rows.bearing_std, rows.way, rows.way_std, rows.clutter
-            part = tuple(column[row : row + 1] for column in columns)
-            placed = joint.mean, joint.covariance, np.array([at]), UNPLACED
+            part = part_of(self.rows, np.array([row]), 0.0)
+            placed = self.joint.mean, self.joint.covariance, np.array([at]), UNPLACED
             if pair_costs(part, *placed, self.stage.chances)[0, 0] == math.inf:
                 return False
         self.label[row] = label
@@ -606,14 +607,14 @@ def association_of(config: Config, labels: int = 0) -> Association | None:
             detection=settings.detection,
             vague=vague,
         )
-        limits = Limits(
-            bearing_std=settings.bearing_std,
-            way_std=settings.way_std,
-            assumed=_assumed(config),
+        stds = {"bearing_std": settings.bearing_std, "way_std": settings.way_std}
+        return Sequential(
+            match=METHODS[name],
+            chances=tuple(chances),
+            limits=Limits(**stds, assumed=_assumed(config)),
+            motion=(told.caller_speed_std, told.caller_walk_std),
+            labels=labels,
         )
-        motion = told.caller_speed_std, told.caller_walk_std
-        numbers = {"chances": tuple(chances), "limits": limits, "motion": motion, "labels": labels}
-        return Sequential(match=METHODS[name], **numbers)
     if not names_class(name):
         expected = ", ".join(map(repr, [KNOWN, *METHODS]))
         raise InputError(f"association.method: found {name!r}, expected {expected} or module:Class")
