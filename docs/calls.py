@@ -196,7 +196,7 @@ def rows_of_pairs(ear, millimetres, other):
 def pairs():
     """Print the rows of two echoes, the first from 17 degrees: right, missed and false."""
     head = " | ".join(f"{far:g} mm" for far in DISTANCES_MM)
-    print(f"| second from | call | `overlaps` | {head} |")
+    print(f"| bearing of the second | call | `overlaps` | {head} |")
     print("|--:|---|---|" + "--:|" * len(DISTANCES_MM))
     for other in (-0.2, ANGLE):
         for kind in ("tone", "hyperbolic sweep"):
@@ -214,7 +214,7 @@ def main():
 
     plt.rcParams.update(STYLE)
     figure, (left, right) = plt.subplots(1, 2, figsize=(8.0, 3.2), layout="constrained")
-    print("| call | " + " | ".join(f"{snr:g} dB" for snr in SNR_DB) + " | two from |")
+    print("| call | " + " | ".join(f"{snr:g} dB" for snr in SNR_DB) + " | two separated from |")
     print("|---|" + "--:|" * (len(SNR_DB) + 1))
     for (name, call), colour in zip(CALLS.items(), STRATEGY_COLOURS.values(), strict=True):
         ear = Ear(call)

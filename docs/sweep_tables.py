@@ -39,7 +39,7 @@ def overlapping(rows, duration, speed):
 def print_rows(worlds):
     """Print rows, overlaps and false rows of a frame, as the wider calls of the plan give them."""
     table = tomllib.loads(find_plan("sweeps").read_text(encoding="utf-8"))
-    print("\n| rows of a frame | own call | beacon's | landmarks | overlap another | false |")
+    print("\n| measurements per frame | own call | beacon's | landmarks | overlapping | false |")
     print("|---|--:|--:|--:|--:|--:|")
     for name, given in CALLS.items():
         plan = plan_of(table | {"config": table["config"] | given, "grid": {"beamwidth": [33]}})
