@@ -372,7 +372,7 @@ def drifted(
     asked: Int[np.ndarray, " a"],
     lifetimes: tuple[Int[np.ndarray, " l"], Int[np.ndarray, " l"]],
 ) -> Pairs:
-    """Find duplicates after a drift larger than stated, as `doubles` does.
+    """Find duplicate landmarks after a drift larger than stated; return pairs of their indices.
 
     ``lifetimes``: scans of the first and the last detection; landmarks of which one was last
     detected before the first detection of the other are compared.
