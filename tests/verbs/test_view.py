@@ -268,13 +268,13 @@ def test_properties_of_an_array_are_printed(obey):
     assert told["microphones"] == "8"
     assert told["hears"] == "all around"
     assert float(told["aperture [m]"]) == pytest.approx(0.024, abs=1e-4)
-    assert told["bearings with a double"] == "0%"
+    assert told["ambiguous bearings"] == "0%"
 
 
 def test_every_bearing_of_a_line_array_is_ambiguous(obey):
     Path("line.csv").write_text(LINE)
     _, printed, _ = obey("array", "line.csv", "--frequency", "30e3")
-    assert "% of the bearings have a double" in printed
+    assert "% of the bearings are ambiguous" in printed
 
 
 def test_the_picture_is_written_where_it_is_asked_for_and_nothing_is_replaced(obey, refused):

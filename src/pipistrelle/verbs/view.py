@@ -195,7 +195,7 @@ def array(
             if pattern.alike > 0.0:
                 this, that = (f"{math.degrees(angle):.0f}°" for angle in pattern.worst)
                 put(
-                    f"{pattern.alike:.0%} of the bearings have a double, as {this} and {that}: to "
+                    f"{pattern.alike:.0%} of the bearings are ambiguous, as {this} and {that}: to "
                     f"{f'face {name}' if name else 'these microphones'} they sound nearly or quite "
                     "the same; the deviations of rows say so."
                 )
@@ -225,7 +225,7 @@ def _table(layout: "Scattered", patterns: "tuple[Pattern, ...]") -> str:
         "waves are plane from [m]": [f"{p.far_field:.3g}" for p in patterns],
         "beam's width [deg]": [_between(*p.width) for p in patterns],
         "highest other lobe [dB]": [f"{p.lobe_db:.1f}" for p in patterns],
-        "bearings with a double": [f"{p.alike:.0%}" for p in patterns],
+        "ambiguous bearings": [f"{p.alike:.0%}" for p in patterns],
         "least deviation at 20 dB [deg]": [_between(*p.std) for p in patterns],
     }
     heads = [["", *(name or "free" for name in layout.name)]]
