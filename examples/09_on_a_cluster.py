@@ -31,7 +31,7 @@ grid."beacon.level_db" = [36.0, 48.0]
 # %%
 # It runs three times: in a single process; in three *shards*, each with every third world of a
 # shared folder, as on machines with a shared disk (``pipistrelle study PLAN --shard 0/16``); and
-# on a Dask cluster (``pip install 'pipistrelle[cluster]'``) of two workers on this machine. For
+# on a Dask cluster (``pip install '.[cluster]'``) of two workers on this machine. For
 # another cluster, ``scheduler`` is its address, ``tcp://HOST:PORT``.
 #
 # Workers are processes that import the script, so the study is started below ``if __name__ ==
