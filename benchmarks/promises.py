@@ -9,7 +9,7 @@ Relation = Literal["<=", ">="]
 PROMISES: dict[str, tuple[str, float | None, Relation, float | None]] = {
     "frame_alone_ms": ("ms", 0.6, "<=", 0.25),
     "frame_amortised_ms": ("ms", 0.3, "<=", 0.1),
-    "sweeps_over_tones": ("1", 40.0, "<=", None),
+    "sweeps_over_tones": ("1", 30.0, "<=", None),
     "ekf_mission_ms": ("ms", 20.0, "<=", None),
     "fastslam_mission_ms": ("ms", 120.0, "<=", None),
     "study_minutes": ("min", 10.0, "<=", None),

@@ -54,7 +54,7 @@ from pipistrelle.estimation.smoother.records import (
 from pipistrelle.jit import Whole, no_alloc, optimised_once
 
 IN_ONE_WORLD = (
-    "The bound is the least root mean square without bias on a path: in one world luck may beat it."
+    "No unbiased estimate from past measurements has a smaller RMSE over worlds than the bound."
 )
 """Sentence shown with a bound beside errors."""
 NO_ROUTES: Mapping[int, np.ndarray] = MappingProxyType({})
