@@ -15,6 +15,8 @@ from pathlib import Path
 import matplotlib.pyplot as plt
 import numpy as np
 
+sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests"))
+
 PICTURE = Path(__file__).parent / "images" / "calls.png"
 SWEEP = {"call": "sweep", "taper": 0.2}
 CALLS = {
@@ -112,17 +114,12 @@ RATES, ALARMS, SAMPLES = (1e-2, 1e-3, 1e-4), 200, 100_000
 
 def arrays():
     """Return a face of the square, a circle and a cross."""
-    from pipistrelle.arrays.layout import Layout, layout_of, microphones_of, scattered
+    from pipistrelle.arrays.layout import Layout, layout_of, scattered
     from pipistrelle.config import Config
+    from reference.rooms import ARRAYS
 
-    turn, arm = np.arange(8) * np.pi / 4, np.array([-5, -3, -1, 1, 3, 5]) * 0.00175
-    circle = 0.012 * np.column_stack((np.cos(turn), np.sin(turn)))
-    cross = [*((a, 0.0) for a in arm), *((0.0, a) for a in arm)]
-    free = [
-        scattered(microphones_of([(x, y, 0.0, 0.0, "") for x, y in one])) for one in (circle, cross)
-    ]
     face = Layout(normal=np.zeros(1), position=layout_of(Config()).position)
-    return dict(zip(("square", "circle", "cross"), (face, *free), strict=True))
+    return {"square": face} | {name: scattered(ARRAYS[name]) for name in ("circle", "cross")}
 
 
 def passed(call, layout, chance):

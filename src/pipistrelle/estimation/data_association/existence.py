@@ -374,8 +374,8 @@ def drifted(
 ) -> Pairs:
     """Find duplicate landmarks after a drift larger than stated; return pairs of their indices.
 
-    ``lifetimes``: scans of the first and the last detection; landmarks of which one was last
-    detected before the first detection of the other are compared.
+    ``lifetimes``: scans of the first and of the last detection. Two landmarks are compared if the
+    last detection of the one is before the first detection of the other.
     """
     born, heard = lifetimes
     before, wide = heard[:, np.newaxis] < born, UNDERSTATED**2 * joint.covariance

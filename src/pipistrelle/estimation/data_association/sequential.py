@@ -597,9 +597,9 @@ def association_of(config: Config, labels: int = 0) -> Association | None:
     if name == KNOWN:
         return None
     if name in METHODS:
-        told, vague = config.filter, VAGUE / settings.clutter
-        if told.noise == "constant":  # no landmark is known better after one detection
-            vague = max(vague, BARELY * told.bearing_std * told.range_std)
+        stated, vague = config.filter, VAGUE / settings.clutter
+        if stated.noise == "constant":  # no landmark is known better after one detection
+            vague = max(vague, BARELY * stated.bearing_std * stated.range_std)
         chances = Chances(
             gate=GATE,
             clutter=settings.clutter,
@@ -612,7 +612,7 @@ def association_of(config: Config, labels: int = 0) -> Association | None:
             match=METHODS[name],
             chances=tuple(chances),
             limits=Limits(**stds, assumed=_assumed(config)),
-            motion=(told.caller_speed_std, told.caller_walk_std),
+            motion=(stated.caller_speed_std, stated.caller_walk_std),
             labels=labels,
         )
     if not names_class(name):
