@@ -299,7 +299,7 @@ def opened_sound(path: Path, where: str) -> "SoundFile":
     except ImportError:
         raise InputError(
             f"{where}: is read by the package soundfile, which is not installed; install it by "
-            "python -m pip install 'pipistrelle[sound]'"
+            "python -m pip install soundfile"
         ) from None
     check_ordinary(path)
     if not path.exists():

@@ -199,7 +199,7 @@ class Results:
             import xarray  # noqa: F401
         except ImportError as missing:
             raise InputError(
-                f"to_xarray: found no {missing.name}; install it: pip install 'pipistrelle[export]'"
+                f"to_xarray: found no {missing.name}; python -m pip install pandas pyarrow xarray"
             ) from None
         return self.tracks.to_pandas().set_index(["strategy", "filter", "time_s"]).to_xarray()
 

@@ -69,9 +69,9 @@ def _libraries() -> Iterator[tuple[str, str]]:
     for requirement in required:
         name = re.split(r"[^\w.-]", requirement, maxsplit=1)[0]
         extra = re.search(r"extra == ['\"]([\w-]+)", requirement)
-        whole = f"pipistrelle[{extra[1]}]" if extra else requirement
         beside = f" (extra {extra[1]})" if extra else ""
         try:
             yield name, version(name) + beside
         except PackageNotFoundError:
-            yield name, f"not found{beside}; python -m pip install '{whole}'"
+            asked = requirement.split(";")[0].strip()
+            yield name, f"not found{beside}; python -m pip install '{asked}'"

@@ -762,4 +762,4 @@ def test_a_bag_without_rosbags_is_refused_with_the_install_command(tmp_path, mon
     for name in [name for name in sys.modules if name.split(".")[0] == "rosbags"]:
         monkeypatch.delitem(sys.modules, name)
     monkeypatch.setitem(sys.modules, "rosbags", None)
-    refused(path, "needs rosbags", "pip install 'pipistrelle[ros]'")
+    refused(path, "needs rosbags", "pip install rosbags")

@@ -274,8 +274,7 @@ def need_rosbags(where: str) -> None:
         import rosbags.rosbag2  # noqa: F401
     except ImportError:
         raise InputError(
-            f"{where}: needs rosbags, which is not installed; "
-            "python -m pip install 'pipistrelle[ros]' installs it"
+            f"{where}: needs rosbags, which is not installed; python -m pip install rosbags"
         ) from None
 
 

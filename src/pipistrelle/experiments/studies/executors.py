@@ -173,7 +173,7 @@ def check_cluster(address: str) -> None:
     except ImportError as error:
         raise InputError(
             f"--scheduler {address}: needs Dask, which is not installed; "
-            "python -m pip install 'pipistrelle[cluster]'"
+            "python -m pip install dask distributed cryptography"
         ) from error
 
 
