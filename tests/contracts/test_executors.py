@@ -21,7 +21,7 @@ from urllib.request import urlopen
 import pytest
 
 from pipistrelle.config import InputError
-from pipistrelle.experiments.studies import executors, study
+from pipistrelle.experiments.studies import study
 from pipistrelle.experiments.studies.plan import plan_text
 from pipistrelle.experiments.studies.study import run_study
 from pipistrelle.experiments.studies.world import done_worlds
@@ -265,22 +265,22 @@ class Together(Mortal):
         return ended[iteration]
 
 
-PROCESSES = pytest.param(executors._pool, marks=pytest.mark.slow, id="processes")
+PROCESSES = pytest.param(study._pool, marks=pytest.mark.slow, id="processes")
 
 
 @pytest.mark.parametrize("pool", [Mortal, Together, PROCESSES])
 def test_a_world_that_kills_its_pool_twice_is_recorded_and_the_others_are_not(monkeypatch, pool):
-    monkeypatch.setattr(executors, "_pool", pool)
-    found = executors.in_processes(partial(fatal, {3}), lost, deque(range(6)), 2)
+    monkeypatch.setattr(study, "_pool", pool)
+    found = study.in_processes(partial(fatal, {3}), lost, deque(range(6)), 2)
     names = [(f"world {i}", "lost" if i == 3 else None) for i in range(6)]
     assert sorted(found) == [[name] for name in names]
 
 
 @pytest.mark.parametrize("pool", [Mortal, PROCESSES])
 def test_pools_that_finish_no_world_are_an_error(monkeypatch, pool):
-    monkeypatch.setattr(executors, "_pool", pool)
+    monkeypatch.setattr(study, "_pool", pool)
     with pytest.raises(InputError, match="their processes end before a world is done"):
-        list(executors.in_processes(partial(fatal, {0, 1}), lost, deque([0, 1]), 2))
+        list(study.in_processes(partial(fatal, {0, 1}), lost, deque([0, 1]), 2))
 
 
 def test_an_abandoned_world_counts_as_failed(plan, folder):
@@ -305,7 +305,7 @@ def test_an_interrupt_stops_the_workers_and_keeps_finished_worlds(plan, folder):
 
 @pytest.mark.parametrize("pool", [ThreadPoolExecutor, PROCESSES])
 def test_results_that_cannot_be_written_by_a_worker_end_the_study(plan, folder, monkeypatch, pool):
-    monkeypatch.setattr(executors, "_pool", pool)
+    monkeypatch.setattr(study, "_pool", pool)
 
     def spoil():
         (folder / "steps").rename(folder / "taken")
@@ -465,7 +465,7 @@ for address in sys.argv[1:]:
 
 @pytest.mark.slow
 def test_a_local_cluster_refuses_other_users_of_the_machine(dask):
-    with executors._client("local", 1) as client:
+    with study._client("local", 1) as client:
         known = client.scheduler_info()
         ((worker, about),) = known["workers"].items()
         doors = [client.scheduler.address, worker, about["nanny"]]
@@ -483,7 +483,7 @@ def test_a_local_cluster_refuses_other_users_of_the_machine(dask):
 @pytest.mark.slow
 @pytest.mark.parametrize("workers", [1, 3])
 def test_a_cluster_that_is_started_here_has_the_workers_that_were_asked_for(workers, dask):
-    with executors._client("local", workers) as client:
+    with study._client("local", workers) as client:
         assert len(client.scheduler_info(n_workers=-1)["workers"]) == workers
 
 
@@ -500,5 +500,5 @@ def test_a_missing_dask_is_named_with_its_fix(plan, folder, monkeypatch):
 
 @pytest.mark.slow
 def test_a_world_that_kills_every_worker_of_a_cluster_is_recorded_and_the_others_are_not(dask):
-    found = executors.on_cluster(partial(fatal, {1}), lost, deque(range(3)), 2, "local")
+    found = study.on_cluster(partial(fatal, {1}), lost, deque(range(3)), 2, "local")
     assert sorted(found) == [[("world 0", None)], [("world 1", "lost")], [("world 2", None)]]

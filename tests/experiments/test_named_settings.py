@@ -12,7 +12,7 @@ from pipistrelle.__main__ import main
 from pipistrelle.config import STRATEGIES, Config, InputError, ScenarioConfig
 from pipistrelle.estimation.catalogue import CATALOGUE
 from pipistrelle.experiments.named_settings import NAMES, PLANS, check_own, over_named, own_config
-from pipistrelle.experiments.results.tables import tum_text
+from pipistrelle.experiments.results.writing import tum_text
 from pipistrelle.experiments.runs.trial import run_mission
 from pipistrelle.experiments.studies.plan import cases_of, find_plan, plan_of, plan_text, read_plan
 from pipistrelle.settings import from_flags, known_settings, resolve

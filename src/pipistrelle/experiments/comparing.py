@@ -37,10 +37,11 @@ from pipistrelle.experiments.results.reading import (
     results_in,
 )
 from pipistrelle.experiments.studies.plan import RADIUS, Plan, PlannedCase, cases_of, plan_settings
-from pipistrelle.experiments.studies.study import load_study
-from pipistrelle.experiments.studies.world import check_world, done_worlds
+from pipistrelle.experiments.studies.study import load_finished
+from pipistrelle.experiments.studies.world import cell_of
 from pipistrelle.files import OwnFiles, drawn_files, read_file, spelt, without_links
 from pipistrelle.geometry import wrap
+from pipistrelle.settings import known_settings, leaves
 
 if TYPE_CHECKING:
     import polars as pl
@@ -53,8 +54,6 @@ SIGNIFICANCE = 0.05
 """Differences with a smaller p, corrected for all cases, are marked as shown."""
 ROUNDING = 1e-6
 """Paths that differ by less are of the same drive [m, rad]."""
-SIMPLE = (int, float, str, type(None))
-"""Types of the values that a table takes as they are."""
 NOT_SCORES = ("strategy", "filter", "ignored_rows", "online")
 """Other entries of an estimate in ``summary.json``."""
 README = """\
@@ -417,14 +416,7 @@ def _read(folder: Path) -> tuple[Plan, "pl.DataFrame"]:
     """Read a study's plan and its table of trials; raise InputError if a file was changed."""
     import polars as pl
 
-    worlds = sorted(done_worlds(folder))
-    if not worlds:
-        raise InputError(
-            f"{folder}: no world is done yet; `pipistrelle study` with -o {folder} goes on"
-        )
-    stored = load_study(folder)
-    for world in worlds:
-        check_world(folder, stored.plan, world)
+    stored = load_finished(folder)
     try:
         trials = stored.trials.collect()
         trials.select("case", "iteration", "status", "diverged", "beamwidth_deg", POSITION)
@@ -450,13 +442,10 @@ def _nothing_in_common(folders: Sequence[Path], plans: Sequence[Plan]) -> InputE
 
 def _values(case: PlannedCase, varied: Sequence[str]) -> dict[str, Any]:
     """Return a case's values of the varied settings; a passive case has no emitter radius."""
-    values, table = {}, case.config.model_dump(mode="json")
-    for name in varied:
-        value: Any = table
-        for part in name.split("."):
-            value = value[part]
-        values[name] = None if name == RADIUS and case.strategy == "passive" else value
-    return values
+    settings = leaves(case.config.model_dump(mode="json"), known_settings())
+    values = {".".join(key): value for key, value in settings}
+    values |= {RADIUS: None} if case.strategy == "passive" else {}
+    return {name: values[name] for name in varied}
 
 
 def _label(cases: Sequence[PlannedCase], varied: Sequence[str], widths: Mapping[int, float]) -> str:
@@ -551,10 +540,7 @@ def _judged(
                 "case": labels[number],
                 "strategy": case.strategy,
                 "filter": short_name(case.filter),
-                **{
-                    name: value if isinstance(value, SIMPLE) else json.dumps(value)
-                    for name, value in values[number].items()
-                },
+                **{name: cell_of(value) for name, value in values[number].items()},
                 "beamwidth_deg": widths.get(matches[number][0].number),
                 "score": one.by["score"],
                 "letter": LETTERS[one.b],

@@ -31,7 +31,7 @@ class Truth:
     callers: Mapping[int, Float[np.ndarray, "k 2"]] = field(default_factory=dict)
 
 
-NO_TRUTH = Truth(time=np.empty(0))
+NO_TRUTH = Truth(time=np.array([]))
 """A drive without ground truth."""
 
 

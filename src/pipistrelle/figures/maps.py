@@ -40,7 +40,7 @@ MIN_REACH = 0.05
 """Least reach of a window [m], for particles that coincide."""
 PATH_POSES = 60
 """Number of poses of a path in a window."""
-NOWHERE = np.full((1, 2), np.nan)
+NOWHERE = np.array([[np.nan, np.nan]])
 """A point that is not drawn."""
 LEFT, RIGHT, GAP = 0.76, 0.16, 0.2
 """Margins of a figure and the space between its columns [inch]."""

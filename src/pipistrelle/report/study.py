@@ -22,10 +22,9 @@ from pipistrelle.estimation.catalogue import CATALOGUE
 from pipistrelle.evaluation.scores import NOT_MEANS, SCORES
 from pipistrelle.experiments.hearing.scenario import Scenario, standing_landmarks, world_of
 from pipistrelle.experiments.studies.plan import MAKERS, RADIUS, Plan, cases_of, common
-from pipistrelle.experiments.studies.study import load_study
+from pipistrelle.experiments.studies.study import load_finished
 from pipistrelle.experiments.studies.world import (
     STEPS,
-    check_world,
     damaged,
     done_worlds,
     heard_settings,
@@ -318,17 +317,10 @@ def read_study(folder: Path) -> Study:
     """
     import polars as pl
 
-    stored = load_study(folder)
-    for world in sorted(done_worlds(folder)):
-        check_world(folder, stored.plan, world)
+    stored = load_finished(folder)
     try:
-        trials = stored.trials.collect()
-        if trials.is_empty():
-            raise InputError(
-                f"{folder}: no world is done yet; `pipistrelle study` with -o {folder} goes on"
-            )
-        steps, landmarks = stored.steps.collect(), stored.landmarks.collect()
-        return _study(stored.plan, trials, steps, landmarks)
+        tables = (table.collect() for table in (stored.trials, stored.steps, stored.landmarks))
+        return _study(stored.plan, *tables)
     except (OSError, pl.exceptions.PolarsError) as error:
         raise _unreadable(folder, stored.plan) from error
 

@@ -35,7 +35,7 @@ from pipistrelle.report.variables import (
     width_name,
     with_article,
 )
-from pipistrelle.settings import derived, known_settings
+from pipistrelle.settings import derived, known_settings, leaves
 
 MAX_COMBINATIONS = 6
 """Most combinations with a row each; of more, only those with an opposite effect have one."""
@@ -261,14 +261,8 @@ def not_the_papers_line(rows: list[dict[str, Any]]) -> str:
 
 def _asked(config: Config, grid: Mapping[str, Sequence[Any]]) -> dict[str, Any]:
     """Return every setting of a study except the seed, by dotted name, with all varied values."""
-    asked: dict[str, Any] = {}
-    table = config.model_dump(mode="json")
-    for key in known_settings():
-        value: Any = table
-        for part in key:
-            value = value[part]
-        asked[".".join(key)] = value
-    asked |= {".".join(key): value for key, value in derived(config).items()}
+    settings = dict(leaves(config.model_dump(mode="json"), known_settings())) | derived(config)
+    asked = {".".join(key): value for key, value in settings.items()}
     del asked["seed"]
     varied = {name: setting_variable(name, values).given for name, values in grid.items()}
     return asked | {RADIUS: [asked[RADIUS]]} | {name: [*given] for name, given in varied.items()}

@@ -31,8 +31,9 @@ from pipistrelle.estimation.data_association.sequential import association_of
 from pipistrelle.estimation.fastslam.filter import FastSlamBelief
 from pipistrelle.estimation.session import Session
 from pipistrelle.experiments.drives import NO_TRUTH, at_sensor, carried, vehicle_in
+from pipistrelle.experiments.hearing.trajectories import TIME_TOLERANCE
 from pipistrelle.experiments.named_settings import check_own, laid, over_named, own_config
-from pipistrelle.experiments.results.tables import landmark_table, path_table
+from pipistrelle.experiments.results.writing import landmark_table, path_table
 from pipistrelle.experiments.runs.replay import (
     LABELS,
     check_calibrated,
@@ -75,8 +76,6 @@ ROUNDING = float(np.finfo(float).eps) ** 0.5
 """Half of the digits of a number."""
 OWN_WORDS = ("filter", "config", "time", "kept")
 """Keywords that are not settings."""
-SAME_TIME = 1e-6
-"""Largest difference between the times of a scan and of the vehicle [s]."""
 COLUMNS = ("landmark", "bearing", "range", CALLER, *STATED)
 """Columns of a scan."""
 _NO_NUMBERS = (str, bytes, bool, np.bool_, complex, np.complexfloating)
@@ -312,7 +311,7 @@ class Slam:
         InputError
             For bad rows, or rows used before; nothing has changed then.
         """
-        if time is not None and abs((stamp := finite(time, "time")) - self._time) > SAME_TIME:
+        if time is not None and abs((stamp := finite(time, "time")) - self._time) > TIME_TOLERANCE:
             late = "the vehicle has moved on: leave out scans that come late"
             early = "move to it first, by a part of a step if need be"
             expected = f"{self._time} s, where the vehicle is"

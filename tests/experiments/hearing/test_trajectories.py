@@ -14,7 +14,6 @@ from pipistrelle.experiments.hearing.trajectories import (
     MAX_STEERING,
     Commands,
     Poses,
-    Waypoints,
     course_of,
     driven,
     steps_of,
@@ -46,7 +45,7 @@ def off_line(path, points):
 @pytest.mark.parametrize("motion", MODELS, ids=lambda m: m.model)
 @pytest.mark.parametrize("shape", SHAPES)
 def test_a_driver_keeps_near_the_line_whatever_the_noise(shape, motion):
-    points = course_of(ScenarioConfig(course=shape), motion).points
+    points = course_of(ScenarioConfig(course=shape), motion)
     for seed in range(3):
         path, controls = drive(None, motion, seed, course=shape, steps=1500)
         assert off_line(path[:, :2], points).max() < LOOK_AHEAD
@@ -61,10 +60,10 @@ def test_a_driver_keeps_near_the_line_whatever_the_noise(shape, motion):
 
 
 def test_a_front_wheel_turns_no_further_than_its_lock():
-    to_and_fro = Waypoints(points=np.array([[0.0, 0.0], [5.0, 0.0]]))
+    to_and_fro = np.array([[0.0, 0.0], [5.0, 0.0]])
     path, controls = drive(to_and_fro, BICYCLE, steps=200)
     assert np.abs(controls[:, 1]).max() == MAX_STEERING
-    assert off_line(path[:, :2], to_and_fro.points).max() < LOOK_AHEAD
+    assert off_line(path[:, :2], to_and_fro).max() < LOOK_AHEAD
 
 
 @pytest.mark.parametrize("motion", MODELS, ids=lambda m: m.model)
@@ -132,7 +131,7 @@ def test_a_time_that_is_a_steps_but_for_rounding_is_the_steps():
     assert steps_of(course, ScenarioConfig(step=0.1)) == 3
     _, controls = drive(course, still, steps=3, step=0.1)
     assert controls[:, 0].tolist() == [1.0, 2.0, 2.0]
-    line = Waypoints(points=np.array([[0.0, 0.0], [0.1 + 0.2, 0.0]]))
+    line = np.array([[0.0, 0.0], [0.1 + 0.2, 0.0]])
     assert 0.3 / 0.1 < 3.0 < (0.1 + 0.2) / 0.1
     assert steps_of(line, ScenarioConfig(step=0.1, speed=1.0)) == 3
 
@@ -146,7 +145,7 @@ def test_a_drive_longer_than_its_course_is_refused(more):
 
 @pytest.mark.parametrize("speed", [0.0, -0.75])
 def test_way_points_need_a_speed(speed):
-    points = Waypoints(points=np.array([[0.0, 0.0], [1.0, 0.0]]))
+    points = np.array([[0.0, 0.0], [1.0, 0.0]])
     with pytest.raises(InputError, match=r"scenario\.speed: found"):
         drive(points, BICYCLE, speed=speed)
     with pytest.raises(InputError, match=r"scenario\.speed: found"):
@@ -154,7 +153,7 @@ def test_way_points_need_a_speed(speed):
 
 
 def test_way_points_all_within_the_drivers_reach_are_circled_for_ever():
-    points = Waypoints(points=np.array([[0.0, 0.0], [0.3, 0.0], [0.0, 0.3]]))
+    points = np.array([[0.0, 0.0], [0.3, 0.0], [0.0, 0.3]])
     path, _ = drive(points, BICYCLE, steps=400)
     assert np.isfinite(path).all()
     assert np.hypot(*path[:, :2].T).max() < 3.0 * LOOK_AHEAD

@@ -16,7 +16,7 @@ from pipistrelle.config import (
     caller_names,
 )
 from pipistrelle.experiments.hearing.scenario import ALL_DRAWN, Scenario, World, world_of
-from pipistrelle.experiments.hearing.trajectories import Commands, Poses, Waypoints
+from pipistrelle.experiments.hearing.trajectories import Commands, Poses
 from pipistrelle.experiments.hearing.world_folder import (
     laid_over,
     named_world,
@@ -157,7 +157,7 @@ def test_columns_determine_the_kind_of_a_path(tmp_path):
     def course(text):
         return read_world(folder_with(tmp_path, path_csv=text)).course
 
-    assert isinstance(course("x,y\n0,0\n1,0\n"), Waypoints)
+    assert isinstance(course("x,y\n0,0\n1,0\n"), np.ndarray)
     commands = course("time,speed,steering\n5,1,0.1\n6,0,0\n")
     assert isinstance(commands, Commands)
     assert commands.time.tolist() == [0.0, 1.0]

@@ -16,7 +16,6 @@ from pipistrelle.detection.logs.bag import opened
 from pipistrelle.detection.logs.bag_log import read_poses
 from pipistrelle.experiments.results.ros import (
     POSE,
-    Told,
     correction_fields,
     header,
     map_fields,
@@ -174,5 +173,5 @@ def test_non_finite_landmarks_are_left_out_of_a_map():
 def test_a_field_that_no_message_has_is_refused(tmp_path):
     fields = pose_fields(0.0, "map", np.zeros(3), np.eye(3)) | {"twist": {}}
     with pytest.raises(ValueError, match="has no field twist"):
-        write_bag(tmp_path / "one.mcap", [Told("/pose", POSE, 0.0, fields)])
+        write_bag(tmp_path / "one.mcap", [("/pose", POSE, 0.0, fields)])
     assert list(tmp_path.iterdir()) == []

@@ -167,8 +167,8 @@ def _odometries(topics: Iterable[Topic], settings: BagConfig) -> list[str]:
 
 
 _TWIST = ("velocity", "angular_rate")
-_UPPER = (0, 1, 5, 7, 11, 35)
-"""Indices of x, y and yaw in a covariance of six variables: its upper triangle, row by row."""
+PLANE = (0, 1, 5)
+"""Indices of x, y and the rotation about z among the six coordinates of a ROS pose."""
 _UNKNOWN = 100.0
 """Variance of a velocity that means unknown [m^2/s^2], [rad^2/s^2]."""
 _STEEP = 0.1
@@ -369,11 +369,12 @@ def step_row(message: Message, settings: BagConfig) -> tuple[float, ...]:
     """Return time, pose, velocities and velocity covariance of an odometry message as a row."""
     content = message.content
     twist = content.twist.twist
-    stated = np.asarray(content.twist.covariance, dtype=float)[list(_UPPER)]
+    plane = np.reshape(content.twist.covariance, (6, 6)).astype(float)[np.ix_(PLANE, PLANE)]
+    stated = plane[np.triu_indices(3)]
     known = stated[0] > 0.0 and stated[5] > 0.0 and (np.abs(stated) < _UNKNOWN).all()
     pose = POSES["nav_msgs/msg/Odometry"](content)
     velocity = twist.linear.x, twist.linear.y, twist.angular.z
-    said = stated.tolist() if known and settings.covariances else [math.nan] * len(_UPPER)
+    said = stated.tolist() if known and settings.covariances else [math.nan] * stated.size
     return _time(message, settings), *pose, *velocity, *said
 
 

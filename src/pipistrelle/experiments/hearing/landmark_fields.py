@@ -10,8 +10,6 @@ from pipistrelle.config import InputError, ScenarioConfig
 
 MAX_DRAWS = 2000
 """Draws of one landmark after which a position counts as impossible."""
-MAX_COVERAGE = math.pi / math.sqrt(12.0)
-"""Largest share of the plane that equal discs can cover."""
 MAX_ROW_OFFSET = 0.1
 """Largest offset of a tree along and across its row, as a share of the distance between trees."""
 ROOM_SIZE = (0.75, 1.5)
@@ -124,7 +122,8 @@ def _refuse_crowd(setup: ScenarioConfig) -> None:
             f"scenario.radius, {setup.radius:g} m"
         )
     half = 0.5 * setup.spacing
-    most = MAX_COVERAGE * ((setup.radius + half) / max(half, 1e-100)) ** 2
+    most = math.pi / math.sqrt(12.0)  # the largest share of the plane that equal discs can cover
+    most *= ((setup.radius + half) / max(half, 1e-100)) ** 2
     if setup.field == "disc" and setup.landmarks > max(most, 1.0):
         raise _too_many(setup, f"at most {max(int(most), 1)} fit")
 

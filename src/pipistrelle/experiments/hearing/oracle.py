@@ -6,10 +6,8 @@ most clutter to a landmark. Without the oracle `estimation.data_association` lab
 receives beliefs and scans, never the truth.
 """
 
-from typing import NamedTuple
-
 import numpy as np
-from jaxtyping import Float, Int, Int8
+from jaxtyping import Float, Int
 
 from pipistrelle.acoustics.arrivals import Arrivals
 from pipistrelle.arrays.layout import Layout, Scattered
@@ -62,11 +60,10 @@ def label_detections(
     array([ 7, -1])
     """
     order = np.argsort(-detections.power, kind="stable")
-    true = _True(
-        arrivals.caller, arrivals.delay, arrivals.bearing, arrivals.level_db, arrivals.landmark
-    )
-    within = _Gates(gates.delay_gate * pulse, gates.bearing_gate, faintest_db)
-    return _label(order, tuple(detection_columns(detections)), tuple(true), layout.normal, within)
+    names = ("caller", "delay", "bearing", "level_db", "landmark")
+    true = tuple(getattr(arrivals, name) for name in names)
+    within = gates.delay_gate * pulse, gates.bearing_gate, faintest_db
+    return _label(order, tuple(detection_columns(detections)), true, layout.normal, within)
 
 
 def faintest_level_db(
@@ -85,53 +82,35 @@ def faintest_level_db(
     return float(10.0 * np.log10(per_sample) - margin_db)
 
 
-class _True(NamedTuple):
-    """Columns of the true arrivals, as arguments of the matching kernel."""
-
-    caller: Int8[np.ndarray, " a"]
-    delay: Float[np.ndarray, " a"]
-    bearing: Float[np.ndarray, " a"]
-    level_db: Float[np.ndarray, " a"]
-    landmark: Int[np.ndarray, " a"]
-
-
-class _Gates(NamedTuple):
-    """Limits of delay [s] and bearing [rad] for a match, and an arrival's least level [dB]."""
-
-    delay: float
-    bearing: float
-    faintest_db: float
-
-
 @kernel
 def _label(
     order: Int[np.ndarray, " d"],
     detections: tuple,
     arrivals: tuple,
     normal: Float[np.ndarray, " f"],
-    gates: _Gates,
+    gates: tuple[float, float, float],
 ) -> Int[np.ndarray, " d"]:
     """Return a label per detection by matching each to at most one arrival, strongest first."""
-    found, true = Columns(*detections), _True(*arrivals)
-    face, bearing = found.face, found.bearing
+    found, (caller, delay, bearing, level_db, landmark) = Columns(*detections), arrivals
+    face, (delay_gate, bearing_gate, faintest_db) = found.face, gates
     label = np.full(face.size, UNLABELLED, dtype=np.int64)
-    taken = np.zeros((normal.size, true.delay.size), dtype=np.bool_)
+    taken = np.zeros((normal.size, delay.size), dtype=np.bool_)
     for d in order:
         nearest, best = -1, np.inf
-        for a in range(true.delay.size):
-            late = abs(found.delay[d] - true.delay[a]) / gates.delay
-            if late > 1.0 or true.caller[a] != found.caller[d]:
+        for a in range(delay.size):
+            late = abs(found.delay[d] - delay[a]) / delay_gate
+            if late > 1.0 or caller[a] != found.caller[d]:
                 continue
-            if true.level_db[a] < gates.faintest_db or taken[face[d], a]:
+            if level_db[a] < faintest_db or taken[face[d], a]:
                 continue
             front = normal[face[d]]
             one_sided = front == front  # a NaN normal receives all around
-            if one_sided and abs(wrap_angle(true.bearing[a] - front)) > 0.5 * np.pi:
+            if one_sided and abs(wrap_angle(bearing[a] - front)) > 0.5 * np.pi:
                 continue
-            off = abs(wrap_angle(bearing[d] - true.bearing[a])) / gates.bearing
+            off = abs(wrap_angle(found.bearing[d] - bearing[a])) / bearing_gate
             if off <= 1.0 and late * late + off * off < best + _SAME_TIME:
                 nearest, best = a, late * late + off * off
         if nearest >= 0:
-            label[d] = true.landmark[nearest]
+            label[d] = landmark[nearest]
             taken[face[d], nearest] = True
     return label

@@ -24,7 +24,13 @@ from pipistrelle.estimation.motion import Motion
 from pipistrelle.experiments.drives import LabelledPoints
 from pipistrelle.experiments.hearing.caller_paths import Surroundings, callers_among, place_at
 from pipistrelle.experiments.hearing.landmark_fields import landmarks_in
-from pipistrelle.experiments.hearing.trajectories import Course, course_of, driven, true_motion
+from pipistrelle.experiments.hearing.trajectories import (
+    TIME_TOLERANCE,
+    Course,
+    course_of,
+    driven,
+    true_motion,
+)
 from pipistrelle.geometry import path_at, points_at, wrap
 from pipistrelle.settings import Layer
 
@@ -88,7 +94,7 @@ def draw_scenario(config: Config, rng: np.random.Generator, world: World = ALL_D
     setup, motion = config.scenario, true_motion(config.motion)
     time = np.arange(setup.steps + 1) * setup.step
     bias = (config.motion.speed_bias, config.motion.turn_bias)
-    course = world.course or course_of(setup, motion)
+    course = course_of(setup, motion) if world.course is None else world.course
     path, controls = driven(course, setup, motion, rng, bias)
     given = config.callers is None and world.callers is not None
     settings, first = world.callers if given else config.callers, deepcopy(rng)
@@ -194,17 +200,14 @@ def _place_beacon(
     )
 
 
-MICROSECOND = 1e-6
-"""Times are rounded to this, or to a control step within it [s]."""
-
-
 def calls_heard(
     scenario: Scenario, setup: ScenarioConfig, speed_of_sound: float
 ) -> list[tuple[float, int]]:
     """List calls of callers with separate clocks: (time of direct arrival [s], caller index).
 
-    Arrivals before the vehicle's first call, which begins the first frame, or after the end of the
-    path are excluded.
+    Times are rounded to microseconds, or to a control step within `TIME_TOLERANCE`. Arrivals before
+    the vehicle's first call, which begins the first frame, or after the end of the path are
+    excluded.
     """
     first, last = setup.steps_per_frame * setup.step, float(scenario.time[-1])
     calls: list[tuple[float, int]] = []
@@ -217,7 +220,7 @@ def calls_heard(
                 heard = caller.calls + np.hypot(*away.T) / speed_of_sound
             clock = scenario.time
             near = clock[np.abs(clock[:, np.newaxis] - heard).argmin(axis=0)]
-            heard = np.where(np.abs(near - heard) <= MICROSECOND, near, heard.round(6))
+            heard = np.where(np.abs(near - heard) <= TIME_TOLERANCE, near, heard.round(6))
             calls += [(time, j) for time in heard.tolist() if first <= time <= last]
     return sorted(calls)
 

@@ -37,14 +37,6 @@ class Commands:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Waypoints:
-    """A course along the closed line through way-points, repeated until the drive ends."""
-
-    points: Float[np.ndarray, "n 2"]
-    """At least two points [m]; the vehicle starts at the first."""
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
 class Poses:
     """A course given by timed poses [m, m, rad], and the controls that estimators assume."""
 
@@ -55,7 +47,10 @@ class Poses:
     """None: the controls that lead along the path, minus noise."""
 
 
-Course = Commands | Waypoints | Poses
+Waypoints = Float[np.ndarray, "n 2"]
+"""A course along the closed line through two points [m] or more, repeated until the drive ends; the
+vehicle starts at the first."""
+Course = Commands | Poses | Waypoints
 
 
 def true_motion(motion: MotionConfig) -> Motion:
@@ -81,12 +76,12 @@ def course_of(setup: ScenarioConfig, motion: Motion) -> Course:
     a = setup.extent
     if setup.course == "eight":
         t = np.linspace(0.0, 2.0 * np.pi, 96, endpoint=False)
-        return Waypoints(points=a * np.column_stack((np.sin(t), np.sin(t) * np.cos(t))))
+        return a * np.column_stack((np.sin(t), np.sin(t) * np.cos(t)))
     if setup.course == "corridor":
         side = 0.25 * setup.lane
-        return Waypoints(points=np.array([[-a, -side], [a, -side], [a, side], [-a, side]]))
+        return np.array([[-a, -side], [a, -side], [a, side], [-a, side]])
     if setup.course == "lawn-mower":
-        return Waypoints(points=_lanes(a, setup.lane))
+        return _lanes(a, setup.lane)
     turn = setup.steering
     if motion.model == "unicycle":
         turn = setup.speed * math.sin(setup.steering) / motion.wheelbase
@@ -99,9 +94,9 @@ def steps_of(course: Course, setup: ScenarioConfig) -> int:
 
     `setup` gives the length of a step and the speed between way-points.
     """
-    if isinstance(course, Waypoints):
+    if isinstance(course, np.ndarray):
         _check_speed(setup)
-        seconds = float(np.hypot(*np.diff(course.points, axis=0).T).sum()) / setup.speed
+        seconds = float(np.hypot(*np.diff(course, axis=0).T).sum()) / setup.speed
         return max(math.ceil(seconds / setup.step - TIME_TOLERANCE), 1)
     return math.floor(float(course.time[-1]) / setup.step + TIME_TOLERANCE)
 
@@ -120,17 +115,19 @@ def driven(
 
     Bradley & Abaid, Eq. (5).
     """
-    if not isinstance(course, Waypoints):
+    if not isinstance(course, np.ndarray):
         _check_length(course, setup)
     time = np.arange(setup.steps + 1) * setup.step
     if isinstance(course, Poses):
-        path = _poses_at(time, course)
+        path = path_at(time, course.time, course.path)
+        if np.array_equal(time, course.time[: len(time)]):  # recorded times: bit for bit
+            path = course.path[: len(time)].copy()
         if course.commands is not None:
             return path, _held(time, course.commands)
         return path, controls_between(path, setup.step, motion) - _noise(setup, motion, rng, bias)
     noise = _noise(setup, motion, rng, bias)
-    if isinstance(course, Waypoints):
-        return _steered(course.points, noise, setup, motion)
+    if isinstance(course, np.ndarray):
+        return _steered(course, noise, setup, motion)
     controls, path = _held(time, course), np.empty((setup.steps + 1, 3))
     path[0] = setup.start
     for k, control in enumerate(controls + noise):
@@ -156,13 +153,6 @@ def _held(time: Float[np.ndarray, " t"], commands: Commands) -> Float[np.ndarray
     """Return the controls of each step: the command in force when the step starts."""
     rows = np.searchsorted(commands.time, time[:-1] + TIME_TOLERANCE, side="right") - 1
     return commands.rows[rows]
-
-
-def _poses_at(time: Float[np.ndarray, " t"], course: Poses) -> Float[np.ndarray, "t 3"]:
-    """Interpolate a course's poses at given times, bit for bit at its recorded times."""
-    if np.array_equal(time, course.time[: len(time)]):
-        return course.path[: len(time)].copy()
-    return path_at(time, course.time, course.path)
 
 
 def _steered(

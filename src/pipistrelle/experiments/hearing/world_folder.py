@@ -22,13 +22,7 @@ from pipistrelle.config import CallerConfig, Config, InputError, Section, Target
 from pipistrelle.estimation.catalogue import SECTIONS
 from pipistrelle.experiments.hearing.caller_paths import routes_read
 from pipistrelle.experiments.hearing.scenario import Scenario, World
-from pipistrelle.experiments.hearing.trajectories import (
-    Commands,
-    Course,
-    Poses,
-    Waypoints,
-    steps_of,
-)
+from pipistrelle.experiments.hearing.trajectories import Commands, Course, Poses, steps_of
 from pipistrelle.files import read_file, read_text
 from pipistrelle.refusals import refusal, shown, table_refusal
 from pipistrelle.settings import (
@@ -146,7 +140,7 @@ def read_world(folder: Path) -> World:
     ...     _ = (Path(place) / "landmarks.csv").write_text("landmark,x,y\n1,2.5,0\n2,-1,4\n")
     ...     _ = (Path(place) / "path.csv").write_text("x,y\n-5,0\n5,0\n5,5\n")
     ...     world = read_world(Path(place))
-    >>> world.landmarks[1], world.course.points.shape, world.callers
+    >>> world.landmarks[1], world.course.shape, world.callers
     (array([-1.,  4.]), (3, 2), None)
     """
     if not folder.is_dir():
@@ -299,7 +293,7 @@ def _read_course(path: Path, config: Config) -> Course:
     table = read_table(path, columns)
     column = table.column
     if "time" not in columns:
-        return Waypoints(points=_waypoints(table))
+        return _waypoints(table)
     if len(table.line) < 2:
         raise refusal(path, "one row", "at least two: the last ends the drive", "add rows")
     check_unique(table, "time")

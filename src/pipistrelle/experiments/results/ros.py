@@ -9,16 +9,16 @@ import re
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from jaxtyping import Float
 
 from pipistrelle.detection.logs.bag import need_rosbags
-from pipistrelle.detection.logs.bag_log import after, inverse, planar
+from pipistrelle.detection.logs.bag_log import PLANE, after, inverse, planar
 from pipistrelle.estimation.catalogue import short_name
 from pipistrelle.experiments.results.scores import TrialResult
-from pipistrelle.experiments.results.tables import landmark_table
+from pipistrelle.experiments.results.writing import landmark_table
 from pipistrelle.refusals import refusal
 
 if TYPE_CHECKING:
@@ -31,20 +31,13 @@ BAG = "mission.mcap"
 POSE = "geometry_msgs/msg/PoseWithCovarianceStamped"
 MAP = "visualization_msgs/msg/MarkerArray"
 TRANSFORM = "geometry_msgs/msg/TransformStamped"
-_PLANE = (0, 1, 5)
-"""Indices of x, y and the rotation about z among the six coordinates of a ROS pose."""
 _NUMBERS = ("weight", "x_m", "y_m", "xx_m2", "xy_m2", "yy_m2")
 _COLORS = {"full": {"r": 0.0, "g": 0.6, "b": 0.5}, "partial": {"r": 0.9, "g": 0.6, "b": 0.0}}
 _END = 2**31
 
 
-class Told(NamedTuple):
-    """A message for a ROS bag, with its topic, type and time [s]."""
-
-    topic: str
-    type: str
-    time: float
-    fields: Fields
+Told = tuple[str, str, float, Fields]
+"""Topic, type, time [s] and fields of a message for a ROS bag."""
 
 
 def header(time: float, frame: str) -> Fields:
@@ -70,7 +63,7 @@ def pose_fields(
 ) -> Fields:
     """Convert a pose in the plane [m, m, rad] and its covariance to a `POSE` message."""
     six = np.zeros((6, 6))
-    six[np.ix_(_PLANE, _PLANE)] = covariance
+    six[np.ix_(PLANE, PLANE)] = covariance
     x, y, heading = map(float, pose)
     told = {"position": {"x": x, "y": y}, "orientation": _turn(heading)}
     return {"header": header(time, frame), "pose": {"pose": told, "covariance": six.ravel()}}
@@ -146,10 +139,10 @@ def told_of(trials: Sequence[TrialResult], frame: str = "map") -> Iterator[Told]
         for time, mean, covariance in rows:
             if np.isfinite(mean).all() and np.isfinite(covariance).all():
                 fields = pose_fields(time, frame, mean, covariance)
-                yield Told(f"/{trial.strategy}/{name}/pose", POSE, time, fields)
+                yield f"/{trial.strategy}/{name}/pose", POSE, time, fields
         end = float(track.time[-1])
         fields = map_fields(end, frame, landmark_table(track.landmarks, None))
-        yield Told(f"/{trial.strategy}/{name}/map", MAP, end, fields)
+        yield f"/{trial.strategy}/{name}/map", MAP, end, fields
 
 
 def write_bag(path: Path, messages: Sequence[Told]) -> None:
@@ -162,13 +155,13 @@ def write_bag(path: Path, messages: Sequence[Told]) -> None:
     with TemporaryDirectory(dir=path.parent) as room:
         writer = Writer(Path(room) / "bag", version=9, storage_plugin=StoragePlugin.MCAP)
         with writer:
-            for topic, kind in dict.fromkeys((one.topic, one.type) for one in messages):
+            for topic, kind in dict.fromkeys(message[:2] for message in messages):
                 qos = [_latched()] if kind == MAP else []
                 told = {"typestore": store, "offered_qos_profiles": qos}
                 known[topic] = writer.add_connection(topic, kind, **told)
-            for one in sorted(messages, key=lambda one: one.time):
-                data = store.serialize_cdr(_made(store, one.type, one.fields), one.type)
-                writer.write(known[one.topic], _stamp(one.time), data)
+            for topic, kind, time, fields in sorted(messages, key=lambda message: message[2]):
+                data = store.serialize_cdr(_made(store, kind, fields), kind)
+                writer.write(known[topic], _stamp(time), data)
         (Path(room) / "bag" / "bag.mcap").replace(path)
 
 

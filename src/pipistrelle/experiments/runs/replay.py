@@ -47,8 +47,7 @@ from pipistrelle.experiments.hearing.world_folder import read_world
 from pipistrelle.experiments.named_settings import Case, each_its_own
 from pipistrelle.experiments.results.reading import SUMMARY, Summary, read_summary
 from pipistrelle.experiments.results.scores import TrialResult, with_shared
-from pipistrelle.experiments.results.tables import tum_text
-from pipistrelle.experiments.results.writing import settings_hash
+from pipistrelle.experiments.results.writing import settings_hash, tum_text
 from pipistrelle.experiments.runs import truth_files
 from pipistrelle.experiments.runs.heard_world import Mission
 from pipistrelle.experiments.runs.trial import Watch, run_mission, try_trial

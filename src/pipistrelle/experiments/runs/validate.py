@@ -100,8 +100,6 @@ MANY_DOUBLES = 0.1
 """Share of ambiguous bearings that gives a warning."""
 CLOSEST = 0.25
 """Spacing of hydrophones, in wavelengths, below which a warning is given."""
-KILOHERTZ = 1e3
-"""Sonars call at 1 kHz to 1 MHz; smaller frequencies [Hz] were probably given in kilohertz."""
 
 
 @judging()
@@ -165,7 +163,10 @@ def warnings_of(config: Config, callers: Sequence[Caller] = ()) -> tuple[str, ..
 
 
 def _kilohertz(section: Section, place: str = "") -> list[str]:
-    """Return warnings about frequencies below 1 kHz, probably given in kilohertz."""
+    """Return warnings about frequencies below 1 kHz, probably given in kilohertz.
+
+    Sonars call at 1 kHz to 1 MHz.
+    """
     warnings = []
     for name, field in type(section).model_fields.items():
         key, value = f"{place}{name}", getattr(section, name)
@@ -174,10 +175,10 @@ def _kilohertz(section: Section, place: str = "") -> list[str]:
             if isinstance(one, Section):
                 inner = f"{key}.{number}." if isinstance(value, tuple) else f"{key}."
                 warnings += _kilohertz(one, inner)
-            elif "[Hz]" in (field.description or "") and one is not None and one < KILOHERTZ:
+            elif "[Hz]" in (field.description or "") and one is not None and one < 1e3:
                 warnings.append(
                     f"{key}: {one:g} Hz is below 1 kHz; is it in kHz? {one:g} kHz are "
-                    f"{KILOHERTZ * one:g} Hz"
+                    f"{1e3 * one:g} Hz"
                 )
     return warnings
 

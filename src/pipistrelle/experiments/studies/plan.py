@@ -579,12 +579,11 @@ def _values(path: Path, name: str, key: Key, values: Any, layer: Layer) -> tuple
         raise InputError(f"{where}: found {shown(values)}, expected a list of values")
     checked = []
     for value in values:
-        table: Any = resolve(layer | {key: Given(value, where)}).model_dump(mode="json")
-        for part in key:
-            table = table[part]
+        table = resolve(layer | {key: Given(value, where)}).model_dump(mode="json")
+        settled = dict(leaves(table, known_settings()))[key]
         if key == CALLERS:
-            table = [{k: v for k, v in each.items() if v is not None} for each in table]
-        checked.append(table)
+            settled = [{k: v for k, v in each.items() if v is not None} for each in settled]
+        checked.append(settled)
     _check_distinct(where, checked)
     return tuple(checked)
 

@@ -149,7 +149,7 @@ def world_schemas(plan: Plan) -> "dict[str, dict[str, Any]]":
 
     world = {"iteration": pl.Int32, "case": pl.Int16}
     grid = {
-        name: pl.Float64 if isinstance(_cell(values[0]), (int, float)) else pl.String
+        name: pl.Float64 if isinstance(cell_of(values[0]), (int, float)) else pl.String
         for name, values in plan.grid.items()
     }
     configs = [case.config for case in cases_of(plan)]
@@ -274,7 +274,7 @@ def _row(iteration: int, record: TrialRecord) -> dict[str, Any]:
         "case": case.number,
         "strategy": case.strategy,
         "filter": case.filter,
-        **{name: _cell(value) for name, value in case.values.items()},
+        **{name: cell_of(value) for name, value in case.values.items()},
         "beamwidth_deg": None if case.strategy == "passive" else degrees(beamwidth_of(case.config)),
         "seed": case.config.seed,
         "status": "failed" if record.row.get("error") else "done",
@@ -283,7 +283,7 @@ def _row(iteration: int, record: TrialRecord) -> dict[str, Any]:
     }
 
 
-def _cell(value: Any) -> Any:
+def cell_of(value: Any) -> Any:
     """Convert a varied value to a table cell: a number, or text."""
     return value if value is None or isinstance(value, (int, float, str)) else json.dumps(value)
 
@@ -292,7 +292,7 @@ TABLES = ("steps", "landmarks", "trials")
 """Names of the tables, in the order of writing."""
 _SUM = "pipistrelle.sha256.{}"
 """Key of a table's SHA-256 in the metadata of the trials' file."""
-_NO_SUM = "-" * 64
+_NO_SUM = "-" * len(sha256().hexdigest())
 """Placeholder for the SHA-256 of the trials' file while it is computed."""
 _WORLD, _PLAN = "pipistrelle.iteration", "pipistrelle.plan"
 """Metadata keys of the world's number and the plan's SHA-256."""
