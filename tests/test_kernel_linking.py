@@ -163,8 +163,7 @@ def by_a_numba_that_lacks(what, tmp_path, words, code):
 
 
 @pytest.mark.parametrize(
-    "what",
-    [pytest.param(w, marks=pytest.mark.slow) if w == "a module" else w for w in LACKING],
+    "what", [pytest.param(w, marks=pytest.mark.slow) if w == "a module" else w for w in LACKING]
 )
 def test_kernels_work_without_numbas_private_parts(tmp_path, what):
     (tmp_path / "linked.py").write_text(LINES)

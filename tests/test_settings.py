@@ -211,10 +211,7 @@ def test_a_path_without_utf8_is_reported_by_its_setting():
         resolve(from_flags({"callers": callers}))
 
 
-@pytest.mark.parametrize(
-    ("text", "value"),
-    [("2", 2.0), (".5", 0.5), ("1e-3", 1e-3), (" 4 ", 4.0)],
-)
+@pytest.mark.parametrize(("text", "value"), [("2", 2.0), (".5", 0.5), ("1e-3", 1e-3), (" 4 ", 4.0)])
 def test_the_environment_accepts_usual_spellings_of_numbers(text, value):
     assert resolve(from_environment({"PIPISTRELLE_RAYS__POWER": text})).rays.power == value
 
@@ -244,11 +241,7 @@ def test_text_and_lists_in_the_environment_are_spelled_as_in_files():
         ("PIPISTRELLE_SEED", "", "found '', expected a valid integer"),
         ("PIPISTRELLE_SEED", "3\nrays = 4", r"found '3\nrays = 4', expected a valid integer"),
         ("PIPISTRELLE_RAYS", "3", "found 3, expected a section of settings"),
-        (
-            "PIPISTRELLE_RAYS__POWR",
-            "3",
-            "no such setting; did you mean PIPISTRELLE_RAYS__POWER?",
-        ),
+        ("PIPISTRELLE_RAYS__POWR", "3", "no such setting; did you mean PIPISTRELLE_RAYS__POWER?"),
     ],
 )
 def test_an_invalid_environment_is_reported_by_its_variable(name, text, message):

@@ -255,10 +255,7 @@ ODD = {
         f"class Mine:{PARTS}\n    title = '\\u202eb'",
         r"title: found '\u202eb', expected text in one line that can be printed",
     ),
-    "a limit": (
-        f"class Mine:{PARTS}\n    nees_limit = 0",
-        "nees_limit: found 0, expected a",
-    ),
+    "a limit": (f"class Mine:{PARTS}\n    nees_limit = 0", "nees_limit: found 0, expected a"),
     "a start": (
         f"from dataclasses import dataclass\n@dataclass\nclass Mine:{PARTS}",
         r"init fails: NameError: name 'Reckoned' is not defined (NAME.py, line 4)",

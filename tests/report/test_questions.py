@@ -162,8 +162,7 @@ LONG = ("three variables", "radius and tone")
 
 
 @pytest.mark.parametrize(
-    "kind",
-    [pytest.param(kind, marks=pytest.mark.slow if kind in LONG else ()) for kind in KINDS],
+    "kind", [pytest.param(kind, marks=pytest.mark.slow if kind in LONG else ()) for kind in KINDS]
 )
 def test_every_kind_of_study_has_a_question_an_answer_and_figures(reported, kind):
     grid, ways, question = KINDS[kind]

@@ -187,10 +187,7 @@ REFUSED = {
         lambda s: s.hear(landmark=[9], bearing=[0.1], caller=["bat"]),
         "the vehicle itself",
     ),
-    "an unknown column": (
-        lambda s: s.hear(landmark=[9], bearings=[0.1]),
-        "did you mean 'bearing'",
-    ),
+    "an unknown column": (lambda s: s.hear(landmark=[9], bearings=[0.1]), "did you mean 'bearing'"),
 }
 
 

@@ -39,10 +39,7 @@ import pytest
         ("run --filter mine.py:Own", "; write mine:Own"),
         ("run --filter fastslam --particles 0", "--particles: found 0, expected greater than or"),
         ("run --filter fastslam --particles 9.5", "--particles: found '9.5', expected a whole"),
-        (
-            "run --particles 9",
-            "--particles: found 9, but --filter is smoother, which has no",
-        ),
+        ("run --particles 9", "--particles: found 9, but --filter is smoother, which has no"),
         (
             "run --filter both --particles 3 --fastslam.particles 3",
             "--particles and --fastslam.particles are one setting; give one of them",

@@ -278,11 +278,7 @@ def test_every_bearing_of_a_line_array_is_ambiguous(obey):
 
 
 def test_the_picture_is_written_where_it_is_asked_for_and_nothing_is_replaced(obey, refused):
-    assert obey("array", "square", "-o", "new/square.png", "--quiet") == (
-        0,
-        "new/square.png\n",
-        "",
-    )
+    assert obey("array", "square", "-o", "new/square.png", "--quiet") == (0, "new/square.png\n", "")
     picture = Path("new/square.png").read_bytes()
     assert picture.startswith(b"\x89PNG")
     assert "is there already" in refused("array", CIRCLE, "-o", "new/square.png")

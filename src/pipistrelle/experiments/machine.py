@@ -32,12 +32,7 @@ def cores() -> int:
 
 
 def check_memory(
-    filters: Sequence[str],
-    landmarks: int,
-    config: Config,
-    *,
-    passive: bool,
-    workers: int = 1,
+    filters: Sequence[str], landmarks: int, config: Config, *, passive: bool, workers: int = 1
 ) -> None:
     """Raise if an estimator's map may need more memory than this machine has.
 

@@ -346,11 +346,7 @@ class Closeup:
     """
 
     def __init__(
-        self,
-        panel: MapPanel,
-        box: tuple[float, float, float, float],
-        reach: float,
-        particles: int,
+        self, panel: MapPanel, box: tuple[float, float, float, float], reach: float, particles: int
     ) -> None:
         from matplotlib.collections import PolyCollection
         from matplotlib.lines import Line2D

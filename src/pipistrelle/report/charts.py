@@ -17,16 +17,7 @@ from pipistrelle.config import STRATEGIES
 from pipistrelle.evaluation.comparison import Finding
 from pipistrelle.evaluation.consistency import anees, anees_bounds_about
 from pipistrelle.evaluation.scores import Score, shown_in
-from pipistrelle.figures.chart import (
-    MARKS,
-    Axis,
-    Chart,
-    Panel,
-    Series,
-    ends,
-    linear_axis,
-    log_axis,
-)
+from pipistrelle.figures.chart import MARKS, Axis, Chart, Panel, Series, ends, linear_axis, log_axis
 from pipistrelle.report import effects as changes
 from pipistrelle.report import sentences as paper
 from pipistrelle.report.axes import (
@@ -61,14 +52,7 @@ from pipistrelle.report.study import (
     own_cases,
     samples,
 )
-from pipistrelle.report.variables import (
-    BEAM,
-    UNITS,
-    Variable,
-    listed,
-    places,
-    with_article,
-)
+from pipistrelle.report.variables import BEAM, UNITS, Variable, listed, places, with_article
 
 WORLDS = "Mean ± σ over worlds; dots: single worlds above that"
 PASSIVE = " (passive's at the right edge, where they do not depend on the beam)"
@@ -110,7 +94,7 @@ class Level:
 _OWN: dict[str, dict[str, Any]] = {
     POSITION_ALIGNED: {
         "more": ". Each path after the rigid motion that fits it best: without the one turn of "
-        "everything that is most of the raw error",
+        "everything that is most of the raw error"
     },
     MAP: {"score": COMMON, "title": "Map RMSE of the landmarks that every strategy has placed"},
     MAP_ALIGNED: {
@@ -553,11 +537,7 @@ def _drives_alike(study: Study) -> bool:
     """Return whether the drives of all combinations of variables have equal laps and times."""
     frames = next(iter(study.trials.values())).nees.shape[2]
     drives = {
-        (
-            lap_time(study, i),
-            *frame_time(study, frames, i)[-1:].tolist(),
-            config.scenario.steps,
-        )
+        (lap_time(study, i), *frame_time(study, frames, i)[-1:].tolist(), config.scenario.steps)
         for i, config in enumerate(study.configs)
     }
     return len(drives) == 1

@@ -16,13 +16,7 @@ import numpy as np
 from jaxtyping import Float
 
 from pipistrelle.config import STRATEGIES
-from pipistrelle.evaluation.comparison import (
-    Contrast,
-    Finding,
-    Statement,
-    contrasts,
-    judge,
-)
+from pipistrelle.evaluation.comparison import Contrast, Finding, Statement, contrasts, judge
 from pipistrelle.evaluation.scores import shown_in
 from pipistrelle.report.study import (
     MAP,
@@ -41,13 +35,7 @@ from pipistrelle.report.study import (
     samples,
     values,
 )
-from pipistrelle.report.variables import (
-    Variable,
-    amount,
-    interval,
-    listed,
-    with_article,
-)
+from pipistrelle.report.variables import Variable, amount, interval, listed, with_article
 
 if TYPE_CHECKING:
     import polars as pl

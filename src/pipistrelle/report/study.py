@@ -32,13 +32,7 @@ from pipistrelle.experiments.studies.world import (
     world_schemas,
 )
 from pipistrelle.files import read_file
-from pipistrelle.report.variables import (
-    BEAM,
-    Variable,
-    beam_variable,
-    setting_variable,
-    word_of,
-)
+from pipistrelle.report.variables import BEAM, Variable, beam_variable, setting_variable, word_of
 
 if TYPE_CHECKING:
     import polars as pl
@@ -62,11 +56,7 @@ POSITION_BOUND, HEADING_BOUND = "position_bound_m", "heading_bound_rad"
 LANDMARKS, NEES = "landmarks_full", "nees_mean"
 ONLINE_POSITION = "online_position_rmse_m"
 """Position RMSE of the path as estimated at each time, if the filter revises it later."""
-READ = (
-    *(name for name in SCORES if name not in NOT_MEANS),
-    ONLINE_POSITION,
-    "landmarks_full_mean",
-)
+READ = (*(name for name in SCORES if name not in NOT_MEANS), ONLINE_POSITION, "landmarks_full_mean")
 """Columns of a study's table of trials that are read."""
 LATER = (ONLINE_POSITION, "caller_rmse_m", "caller_rmse_aligned_m")
 """Columns that studies may lack: no path is revised, or the study is older than the score."""

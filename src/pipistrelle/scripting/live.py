@@ -12,14 +12,7 @@ from jaxtyping import Float, Int
 
 from pipistrelle.arithmetic.random_stream import stream_key
 from pipistrelle.config import Config, InputError
-from pipistrelle.detection.logs.recording import (
-    CALLER,
-    MAX_TIME,
-    STATED,
-    Log,
-    LogCaller,
-    scan_at,
-)
+from pipistrelle.detection.logs.recording import CALLER, MAX_TIME, STATED, Log, LogCaller, scan_at
 from pipistrelle.detection.logs.vehicle import NOISY, read_vehicle, vehicle_of
 from pipistrelle.detection.logs.vehicle import Vehicle as VehicleKeys
 from pipistrelle.detection.noise import noise_of

@@ -49,12 +49,7 @@ from pipistrelle.scripting.arguments import (
     replayed,
     with_log,
 )
-from pipistrelle.scripting.log_warnings import (
-    fit_warnings,
-    labels_of,
-    log_warnings,
-    nis_warning,
-)
+from pipistrelle.scripting.log_warnings import fit_warnings, labels_of, log_warnings, nis_warning
 from pipistrelle.settings import Layer, resolve
 
 if TYPE_CHECKING:

@@ -6,16 +6,7 @@ from inspect import Parameter as Argument
 from inspect import Signature, cleandoc, signature
 from pathlib import Path
 from types import MappingProxyType, NoneType
-from typing import (
-    Annotated,
-    Any,
-    Literal,
-    TypedDict,
-    Union,
-    get_args,
-    get_origin,
-    get_type_hints,
-)
+from typing import Annotated, Any, Literal, TypedDict, Union, get_args, get_origin, get_type_hints
 
 from cyclopts import Group, Parameter
 

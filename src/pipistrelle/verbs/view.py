@@ -43,9 +43,7 @@ def view(
     output: Annotated[
         Path | None,
         Parameter(
-            name=("--output", "-o"),
-            metavar="FILE.html",
-            help=f"The page. [default: FOLDER/{PAGE}]",
+            name=("--output", "-o"), metavar="FILE.html", help=f"The page. [default: FOLDER/{PAGE}]"
         ),
     ] = None,
     log: Annotated[
@@ -165,8 +163,7 @@ def array(
     ] = None,
     named: NamedSettings = None,
     output: Annotated[
-        Path | None,
-        Parameter(name=("--output", "-o"), metavar="FILE.png", help="The picture."),
+        Path | None, Parameter(name=("--output", "-o"), metavar="FILE.png", help="The picture.")
     ] = None,
     overwrite: Annotated[bool, Parameter(help="Replace an existing FILE.png.")] = False,
     quiet: Annotated[bool, Parameter(help="Print only the path of the picture.")] = False,

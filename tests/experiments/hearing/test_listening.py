@@ -6,11 +6,7 @@ from dataclasses import fields, replace
 import numpy as np
 import pytest
 
-from pipistrelle.acoustics.arrivals import (
-    arrivals_at,
-    arrivals_of_emission,
-    through_piston,
-)
+from pipistrelle.acoustics.arrivals import arrivals_at, arrivals_of_emission, through_piston
 from pipistrelle.acoustics.emitter import Bodies
 from pipistrelle.acoustics.paths import VEHICLE, Caller, callers_of
 from pipistrelle.arithmetic.random_stream import stream_key

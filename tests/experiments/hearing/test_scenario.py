@@ -5,11 +5,7 @@ import pytest
 from scipy.stats import kstest
 
 from pipistrelle.config import Config, InputError, MotionConfig, ScenarioConfig
-from pipistrelle.experiments.hearing.scenario import (
-    Scenario,
-    draw_scenario,
-    standing_landmarks,
-)
+from pipistrelle.experiments.hearing.scenario import Scenario, draw_scenario, standing_landmarks
 from pipistrelle.experiments.hearing.trajectories import true_motion
 
 SEEDS = range(12)

@@ -10,13 +10,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from pipistrelle.config import (
-    AssociationConfig,
-    Config,
-    EmitterConfig,
-    InputError,
-    ScenarioConfig,
-)
+from pipistrelle.config import AssociationConfig, Config, EmitterConfig, InputError, ScenarioConfig
 from pipistrelle.detection.logs.recording import LogCaller
 from pipistrelle.detection.scans import rows_of as rows_of_scan
 from pipistrelle.estimation.beliefs import Gaussian

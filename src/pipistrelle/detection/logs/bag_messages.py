@@ -161,10 +161,7 @@ def _sonar_ranges(message: Any, _: float | None) -> Echoes:
 
 
 def _beams(
-    message: Any,
-    ways: Float[np.ndarray, "n 3"],
-    distance: Float[np.ndarray, " n"],
-    delays: Any,
+    message: Any, ways: Float[np.ndarray, "n 3"], distance: Float[np.ndarray, " n"], delays: Any
 ) -> Echoes:
     """Return the echoes of beams with a valid range and no flag, with std by the beam's width."""
     size = distance.size

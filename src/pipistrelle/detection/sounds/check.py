@@ -25,12 +25,7 @@ from pipistrelle.detection.scans import OWN, Scan
 from pipistrelle.detection.snapshots import Detections
 from pipistrelle.detection.sounds.calls import Calls
 from pipistrelle.detection.sounds.hearing import GAPS, Frame, Hearing, copied_channels, prepared
-from pipistrelle.detection.sounds.sound_file import (
-    Description,
-    RecordedArray,
-    Sound,
-    open_sound,
-)
+from pipistrelle.detection.sounds.sound_file import Description, RecordedArray, Sound, open_sound
 from pipistrelle.geometry import wrap
 
 CALLS, SNAPSHOTS = 64, 60

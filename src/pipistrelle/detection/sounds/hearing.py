@@ -44,13 +44,7 @@ from pipistrelle.detection.front_end import (
 from pipistrelle.detection.matched import Workspace, filter_blocks
 from pipistrelle.detection.scans import Scan
 from pipistrelle.detection.snapshots import Detections, detections_at
-from pipistrelle.detection.sounds.calls import (
-    Blocks,
-    CallOutputs,
-    Calls,
-    ToneSums,
-    calls_of,
-)
+from pipistrelle.detection.sounds.calls import Blocks, CallOutputs, Calls, ToneSums, calls_of
 from pipistrelle.detection.sounds.sound_file import ARRAY_FILE as ARRAY
 from pipistrelle.detection.sounds.sound_file import (
     FILE,

@@ -186,10 +186,7 @@ def _placeless(
 
 
 def place_at(
-    distance: float,
-    setup: ScenarioConfig,
-    rng: np.random.Generator,
-    clear_of: Iterable[Points],
+    distance: float, setup: ScenarioConfig, rng: np.random.Generator, clear_of: Iterable[Points]
 ) -> Float[np.ndarray, "2"] | None:
     """Draw a random position at `distance` [m] from the centre, clear of points; else None."""
     clear_of = [*clear_of]

@@ -117,10 +117,7 @@ def frames_of(
 
 
 def _together(
-    sounds: Arrivals,
-    own_clock: Sequence[int],
-    calls: Sequence[tuple[float, Arrivals]],
-    span: float,
+    sounds: Arrivals, own_clock: Sequence[int], calls: Sequence[tuple[float, Arrivals]], span: float
 ) -> Arrivals:
     """Replace the arrivals of independent callers in a frame by arrivals of their timed `calls`."""
     parts = [arrivals_at(sounds, ~np.isin(sounds.caller, own_clock))]

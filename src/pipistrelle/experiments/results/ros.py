@@ -56,10 +56,7 @@ def _stamp(time: float) -> int:
 
 
 def pose_fields(
-    time: float,
-    frame: str,
-    pose: Float[np.ndarray, "3"],
-    covariance: Float[np.ndarray, "3 3"],
+    time: float, frame: str, pose: Float[np.ndarray, "3"], covariance: Float[np.ndarray, "3 3"]
 ) -> Fields:
     """Convert a pose in the plane [m, m, rad] and its covariance to a `POSE` message."""
     six = np.zeros((6, 6))
@@ -70,10 +67,7 @@ def pose_fields(
 
 
 def correction_fields(
-    time: float,
-    frames: tuple[str, str],
-    pose: Sequence[float],
-    odometry: Sequence[float],
+    time: float, frames: tuple[str, str], pose: Sequence[float], odometry: Sequence[float]
 ) -> Fields:
     """Return the transform from the map's to the odometry's coordinate frame, as a `TRANSFORM`.
 

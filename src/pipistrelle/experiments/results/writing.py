@@ -408,9 +408,7 @@ def _pose_columns(name: str, poses: Float[np.ndarray, "k 3"]) -> dict[str, np.nd
 
 
 def landmark_table(
-    landmarks: Landmarks,
-    true_landmarks: LabelledPoints | None,
-    mapped: Landmarks | None = None,
+    landmarks: Landmarks, true_landmarks: LabelledPoints | None, mapped: Landmarks | None = None
 ) -> "pl.DataFrame":
     """Return a map as a table, a row per hypothesis of each landmark, with true positions.
 

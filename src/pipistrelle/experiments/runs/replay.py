@@ -16,13 +16,7 @@ from typing import Any
 import numpy as np
 
 from pipistrelle.config import BagConfig, Config, InputError, Strategy
-from pipistrelle.detection.logs.readers import (
-    READERS,
-    Reader,
-    Robot,
-    reader_of,
-    recording_of,
-)
+from pipistrelle.detection.logs.readers import READERS, Reader, Robot, reader_of, recording_of
 from pipistrelle.detection.logs.recording import Log
 from pipistrelle.detection.noise import noise_of, without_hidden
 from pipistrelle.detection.scans import (

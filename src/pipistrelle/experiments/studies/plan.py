@@ -27,13 +27,7 @@ from pydantic_core import PydanticCustomError
 from pipistrelle.acoustics.call import with_calls
 from pipistrelle.arrays.layout import with_array
 from pipistrelle.config import STRATEGIES, Config, InputError, Section, Strategy
-from pipistrelle.estimation.catalogue import (
-    CATALOGUE,
-    PAPERS,
-    SECTIONS,
-    check_distinct,
-    check_name,
-)
+from pipistrelle.estimation.catalogue import CATALOGUE, PAPERS, SECTIONS, check_distinct, check_name
 from pipistrelle.experiments.hearing.caller_paths import with_routes
 from pipistrelle.experiments.hearing.scenario import ALL_DRAWN, World
 from pipistrelle.experiments.hearing.world_folder import (

@@ -29,12 +29,7 @@ from pipistrelle.config import Config, InputError
 from pipistrelle.estimation.beliefs import KNOWN, Track, revises_path
 from pipistrelle.estimation.catalogue import SECTIONS
 from pipistrelle.estimation.smoother.preintegration import numbers_of
-from pipistrelle.evaluation.accuracy import (
-    heaviest,
-    landmark_error,
-    pose_error,
-    position_error,
-)
+from pipistrelle.evaluation.accuracy import heaviest, landmark_error, pose_error, position_error
 from pipistrelle.evaluation.bound import nees_of_exact_start
 from pipistrelle.evaluation.consistency import track_nees
 from pipistrelle.experiments.hearing.listening import listen
