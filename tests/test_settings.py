@@ -103,89 +103,55 @@ def test_layers_keep_settings_that_they_do_not_name(tmp_path):
         ("rays.power.x = 3", "rays.power: found {'x': 3}, expected a valid number"),
         ("scenario.steps = 3.0", "scenario.steps: found 3.0, expected a valid integer"),
         ("target.shape = 'cube'", "target.shape: found 'cube', expected 'cylinder' or 'sphere'"),
-        (
-            "detection.leakage_db = 12345",
-            "detection.leakage_db: found 12345, expected less than or equal to 300",
-        ),
+        ("detection.leakage_db = 12345",
+         "detection.leakage_db: found 12345, expected less than or equal to 300"),
         ("rays.range_bounds = [1]", "rays.range_bounds: found [1], expected 2 values"),
         ("rays.range_bounds = [1, 2, 3]", "rays.range_bounds: found [1, 2, 3], expected 2 values"),
-        (
-            "rays.range_bounds = [1, -2]",
-            "rays.range_bounds: found [1, -2], expected greater than 0 as value 2",
-        ),
+        ("rays.range_bounds = [1, -2]",
+         "rays.range_bounds: found [1, -2], expected greater than 0 as value 2"),
         ("callers = 3", f"callers: found 3, {TABLES}"),
         ("[callers]\nfrequency = 3e4", f"callers: found {{'frequency': 30000.0}}, {TABLES}"),
         ("callers = [3]", "callers.1: found 3, expected a table that says who calls"),
-        (
-            "[[callers]]\nfreqency = 1",
-            "callers.1.freqency: no such key of a caller; did you mean frequency?",
-        ),
-        (
-            "[[callers]]\n[[callers]]\nfrequency = -1",
-            "callers.2.frequency: found -1, expected greater than 0",
-        ),
-        (
-            "[[callers]]\nlevel_db = 'loud'",
-            "callers.1.level_db: found 'loud', expected a valid number",
-        ),
-        (
-            "[[callers]]\nname = 'a b'",
-            "callers.1.name: found 'a b', expected up to 40 letters, digits, _ and -",
-        ),
-        (
-            "[[callers]]\nname = 'Vehicle'",
-            "callers: found the name 'Vehicle' again, expected another; choose one",
-        ),
-        (
-            "callers = [{}, {name = 'beacon'}]",
-            "callers: found the name 'beacon' again, expected another; choose one",
-        ),
+        ("[[callers]]\nfreqency = 1",
+         "callers.1.freqency: no such key of a caller; did you mean frequency?"),
+        ("[[callers]]\n[[callers]]\nfrequency = -1",
+         "callers.2.frequency: found -1, expected greater than 0"),
+        ("[[callers]]\nlevel_db = 'loud'",
+         "callers.1.level_db: found 'loud', expected a valid number"),
+        ("[[callers]]\nname = 'a b'",
+         "callers.1.name: found 'a b', expected up to 40 letters, digits, _ and -"),
+        ("[[callers]]\nname = 'Vehicle'",
+         "callers: found the name 'Vehicle' again, expected another; choose one"),
+        ("callers = [{}, {name = 'beacon'}]",
+         "callers: found the name 'beacon' again, expected another; choose one"),
         ("[[callers]]\nplace = [1]", "callers.1.place: found [1], expected x and y"),
         ("[[callers]]\nplace = [1, nan]", "callers.1.place: found [1, nan], expected x and y"),
-        (
-            "[[callers]]\nplace = [1, 2]\ndistance = 3",
-            "callers.1: found a place and a distance, expected one of them; leave one out",
-        ),
-        (
-            "[[callers]]\nwaypoints = [[1, 2]]",
-            "callers.1.waypoints: found [[1, 2]], expected a list of points [x, y], two at least",
-        ),
-        (
-            "[[callers]]\ncourse = 'line'",
-            "callers.1.course: found 'line', expected 'circle', 'walk' or 'mission'",
-        ),
+        ("[[callers]]\nplace = [1, 2]\ndistance = 3",
+         "callers.1: found a place and a distance, expected one of them; leave one out"),
+        ("[[callers]]\nwaypoints = [[1, 2]]",
+         "callers.1.waypoints: found [[1, 2]], expected a list of points [x, y], two at least"),
+        ("[[callers]]\ncourse = 'line'",
+         "callers.1.course: found 'line', expected 'circle', 'walk' or 'mission'"),
         (
             "[[callers]]\nspeed = 1.0",
             "callers.1: found speed, which a caller that stands has not; add way-points or "
             'course = "circle", or leave it out',
         ),
-        (
-            "[[callers]]\ncourse = 'circle'\ndistance = 3",
-            'callers.1: found distance, which course = "circle" has not; leave one of them out',
-        ),
-        (
-            "[[callers]]\ncourse = 'walk'\nroute = 'a.csv'",
-            "callers.1: found course, which a route has not; leave one of them out",
-        ),
-        (
-            "[[callers]]\ncourse = 'circle'\nspeed = 0",
-            "callers.1: found speed 0, expected another; give a place to one that stands",
-        ),
-        (
-            "[[callers]]\nroute = [[0, 1, 2], [0, 1, 2]]",
-            "callers.1: found time 0 after 0 in row 2 of the route, expected times that rise",
-        ),
-        (
-            "[[callers]]\nroute = [[0, 1, 2]]",
-            "callers.1.route: found [[0, 1, 2]], expected a CSV file of time,x,y, or two such rows",
-        ),
+        ("[[callers]]\ncourse = 'circle'\ndistance = 3",
+         'callers.1: found distance, which course = "circle" has not; leave one of them out'),
+        ("[[callers]]\ncourse = 'walk'\nroute = 'a.csv'",
+         "callers.1: found course, which a route has not; leave one of them out"),
+        ("[[callers]]\ncourse = 'circle'\nspeed = 0",
+         "callers.1: found speed 0, expected another; give a place to one that stands"),
+        ("[[callers]]\nroute = [[0, 1, 2], [0, 1, 2]]",
+         "callers.1: found time 0 after 0 in row 2 of the route, expected times that rise"),
+        ("[[callers]]\nroute = [[0, 1, 2]]",
+         "callers.1.route: found [[0, 1, 2]], expected a CSV file of time,x,y, or two such rows"),
         ("[[callers]]\n" * 8, "callers: found 8 callers, expected at most 7 besides the vehicle"),
-        (
-            "rays.power = 2\nrays.range_bounds = [3, 2]",
-            "rays.range_bounds: range_bounds must rise, found [3.0, 2.0]",
-        ),
+        ("rays.power = 2\nrays.range_bounds = [3, 2]",
+         "rays.range_bounds: range_bounds must rise, found [3.0, 2.0]"),
     ],
-)
+)  # fmt: skip
 def test_an_invalid_file_is_reported_by_key_value_and_expectation(tmp_path, text, message):
     assert refusal(tmp_path, text) == message
 

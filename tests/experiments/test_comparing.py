@@ -632,18 +632,6 @@ def test_a_comparison_is_written_with_sums_and_a_readme(kind, request, tmp_path)
         assert part in readme
 
 
-def test_changed_files_of_an_earlier_comparison_are_not_replaced(missions, tmp_path):
-    folder = tmp_path / "out"
-    given = {"command": "", "notes": ()}
-    write_comparison(OwnFiles(folder, COMPARISON), missions, **given)
-    write_comparison(OwnFiles(folder, COMPARISON), missions, **given)
-    (folder / "comparison.csv").write_text("mine")
-    with pytest.raises(InputError, match=r"comparison\.csv: was changed since"):
-        write_comparison(OwnFiles(folder, COMPARISON), missions, **given)
-    assert (folder / "comparison.csv").read_text() == "mine"
-    assert (folder / "README.md").exists()
-
-
 @pytest.mark.parametrize("name", ["<script>", "a`b``c", "`"])
 def test_the_readme_shows_folder_names_as_code_without_markup(missions, tmp_path, name):
     compared = replace(missions, folders={**missions.folders, "A": Path(name)})

@@ -141,16 +141,6 @@ def test_estimators_in_one_run_keep_their_separate_settings(capsys):
     assert "warning" not in capsys.readouterr().err, "done again, to the same tracks"
 
 
-def test_the_names_of_two_runs_are_compared(capsys):
-    ran("one", "--settings", "paper")
-    ran("two", "--settings", "best")
-    capsys.readouterr()
-    assert main(["compare", "one", "two"]) == 0
-    assert ["settings", "paper", "best"] in [
-        line.split() for line in capsys.readouterr().out.splitlines()
-    ]
-
-
 def test_a_file_may_contain_settings_of_one_estimator():
     Path("mine.toml").write_text("rays.power = 4.0\n[own.ekf]\nrays.power = 5.0\n")
     for name, power in (("ekf", 5.0), ("iekf", 4.0)):

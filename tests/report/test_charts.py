@@ -8,8 +8,11 @@ import pytest
 from pipistrelle.evaluation.consistency import anees_bounds
 from pipistrelle.figures.chart import csv_rows
 from pipistrelle.report.charts import (
+    MOST_PANELS,
     answers,
+    beside,
     effect_charts,
+    facets_of,
     gain_charts,
     level_charts,
     study_charts,
@@ -17,6 +20,7 @@ from pipistrelle.report.charts import (
 from pipistrelle.report.effects import effects_of, measures_of
 from pipistrelle.report.sentences import TABLE_II
 from pipistrelle.report.study import COMMON, RULES, lap_time, read_study, select
+from pipistrelle.report.variables import axis_of, axis_of_words
 from report.invented import BEAMWIDTH, diverging, invent, narrowed, only
 from report.planted import LEVELS as GRID
 from report.planted import by_level, write_planted
@@ -25,6 +29,7 @@ NAMES = [
     "gain", "anees_ekf", "anees_fastslam", "position_rmse", "heading_rmse",
     "map_rmse", "position_rmse_aligned", "map_rmse_aligned", "landmarks", "table_ii",
 ]  # fmt: skip
+PAIR = 'strategies = ["active", "passive"]\nfilters = ["ekf"]\n'
 
 
 @pytest.fixture(scope="module")
@@ -377,3 +382,63 @@ def test_effects_of_a_single_world_and_of_none_have_no_intervals(tmp_path):
         study.trials["ekf", "fused"].failed[:] = failed
         (chart,) = effect_charts(select(study, "none"))
         assert all(np.isnan(series.low).all() for p in chart.panels for series in p.series)
+
+
+def test_strategies_are_shifted_around_their_position():
+    axis = axis_of_words(["a", "b"])
+    at = np.array([0.0, 1.0])
+    three = [beside(axis, at, way) for way in ("active", "passive", "fused")]
+    assert three[0][0] < three[1][0] == 0.0 < three[2][0]
+    assert beside(axis, at, "fused", ["fused"]).tolist() == at.tolist()
+    pair = [beside(axis, at, way, ["fused", "passive"]) for way in ("passive", "fused")]
+    assert pair[0][0] == pytest.approx(-pair[1][0])
+
+
+def facets(tmp_path, grid, ways=PAIR):
+    write_planted(tmp_path / "s", grid, worlds=1, ways=ways)
+    study = read_study(tmp_path / "s")
+    return study, [facets_of(study, v, axis_of(v)) for v in study.variables]
+
+
+def test_few_combinations_of_the_rest_have_a_panel_each(tmp_path):
+    grid = '"rays.power" = [1, 3]\n"beacon.level_db" = [36.8, 42.8, 48.8]'
+    _, (power, level) = facets(tmp_path, grid)
+    assert [title for title, _ in power[0]] == [
+        f"beacon.level_db = {word}" for word in ("36.8", "42.8", "48.8")
+    ]
+    (_, first), (_, second) = level[0]
+    assert [line.name for line in first] == ["active", "passive"]
+    assert second[0].cells.tolist() == [3, 4, 5]
+    assert (power[1], level[1]) == (False, False)
+
+
+def test_many_become_lines_of_a_panel_per_filter_and_strategy_each_case_once(tmp_path):
+    levels = ", ".join(str(30.0 + k) for k in range(MOST_PANELS + 1))
+    grid = f'beamwidth = [180, 11]\n"beacon.level_db" = [{levels}]'
+    _, (beam, level) = facets(tmp_path, grid)
+    assert (beam[1], level[1]) == (True, False)
+    assert [title for title, _ in beam[0]] == ["EKF, active", "EKF, passive"]
+    assert [len(lines) for _, lines in beam[0]] == [MOST_PANELS + 1] * 2
+    _, lines = beam[0][0]
+    assert lines[0].name == "beacon.level_db = 30"
+    strengths = [line.strength for line in lines]
+    assert strengths[0] == 1.0
+    assert (np.diff(strengths) < 0.0).all()
+    assert [title for title, _ in level[0]] == ["11°", "180°"]
+
+
+def test_passive_sensing_is_one_line_where_the_rest_is_the_beam(tmp_path):
+    widths = ", ".join(str(20 * k) for k in range(1, MOST_PANELS + 2))
+    grid = f'beamwidth = [{widths}]\n"beacon.level_db" = [36.8, 48.8]'
+    _, (_, level) = facets(tmp_path, grid)
+    assert [(title, len(lines)) for title, lines in level[0]] == [
+        ("EKF, active", MOST_PANELS + 1), ("EKF, passive", 1),
+    ]  # fmt: skip
+
+
+def test_without_variables_the_filters_are_the_axis_with_shifted_strategies():
+    study = replace(invent(2), variables=(), beamwidth=BEAMWIDTH[:1])
+    ((_, lines),), _ = facets_of(study, None, axis_of_words(["EKF", "FastSLAM 2.0"]))
+    assert [(line.way, line.x.tolist()) for line in lines][:3] == [
+        (("ekf", "active"), [0.0]), (("fastslam", "active"), [1.0]), (("ekf", "fused"), [0.0]),
+    ]  # fmt: skip

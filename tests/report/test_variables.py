@@ -9,6 +9,8 @@ from hypothesis import strategies as st
 
 from pipistrelle.report.variables import (
     amount,
+    axis_of,
+    axis_of_words,
     beam_name,
     beam_variable,
     geometric,
@@ -23,6 +25,7 @@ from pipistrelle.report.variables import (
     word_of,
     written,
 )
+from report.invented import invent
 
 
 def test_numbers_rise_and_are_their_positions():
@@ -119,3 +122,39 @@ def test_a_variable_is_two_sided_around_an_inner_reference():
     sound = setting_variable("assumed.speed_of_sound", [337.0, 343.0, 349.0])
     sides = [two_sided(replace(sound, base=base)) for base in range(3)]
     assert sides == [False, True, False]
+
+
+def test_a_geometric_series_has_a_logarithmic_axis_and_other_numbers_do_not():
+    particles = axis_of(setting_variable("fastslam.particles", [100, 300, 1000]))
+    assert particles.log
+    assert [text for _, text in particles.ticks] == ["100", "300", "1000"]
+    level = axis_of(setting_variable("beacon.level_db", [36.8, 42.8, 48.8]))
+    assert not level.log
+    assert level.limits[0] < 36.8 < 48.8 < level.limits[1]
+    assert level.named[1] == (42.8, "beacon.level_db = 42.8")
+
+
+def test_beams_have_a_logarithmic_axis_in_degrees():
+    (beam,) = invent(2).variables
+    axis = axis_of(beam)
+    assert (axis.log, axis.label, axis.words) == (True, "half-power beamwidth [°]", False)
+    assert [text for _, text in axis.ticks][::11] == ["11", "180"]
+
+
+def test_words_are_upright_or_slanted_and_long_words_are_shortened_in_the_middle():
+    axis = axis_of(setting_variable("rays.weights", ["instantaneous", "aggregated"]))
+    assert (axis.words, axis.log, axis.slanted) == (True, False, False)
+    assert [text for _, text in axis.ticks] == ["instantaneous", "aggregated"]
+    few = axis_of_words([f"measurement number {k}" for k in range(6)])
+    assert (len(few.ticks[0][1]), few.slanted) == (8, False)
+    many = axis_of_words([f"measurement number {k}" for k in range(8)])
+    assert ({len(text) for _, text in many.ticks}, many.slanted) == ({12}, True)
+    assert len({text for _, text in many.ticks}) == 8, "their ends tell them apart"
+    assert many.named[3] == (3.0, "measurement number 3")
+
+
+def test_ticks_that_would_run_into_each_other_are_left_out_and_read_out_still():
+    axis = axis_of(setting_variable("rays.prune", [k * 1.25e-5 for k in range(1, 21)]))
+    assert 2 <= len(axis.ticks) < 20
+    assert axis.ticks[0][0] == 1.25e-5
+    assert len(axis.named) == 20

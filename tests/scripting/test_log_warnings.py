@@ -24,6 +24,11 @@ def log_of(**columns):
     return replace(LOG, scans=(scan_with(np.arange(10), np.zeros(10), **columns),))
 
 
+def warnings_of(log, *trials):
+    """The warnings about a log of 10 rows, unless another is given, and its estimates."""
+    return fit_warnings(log or log_of(distance=np.ones(10)), trials, Path("log"), Config())
+
+
 def trial_of(scan, gated, labels=(), **more):
     track = SimpleNamespace(
         pose=SimpleNamespace(mean=np.zeros((2, 3))),
@@ -41,9 +46,7 @@ def trial_of(scan, gated, labels=(), **more):
 @pytest.mark.parametrize(("gated", "asked"), [(1, False), (2, True)])
 def test_units_are_questioned_by_the_share_of_gated_measurements(gated, asked):
     heard = scan_with(np.arange(5), np.zeros(5), np.ones(5))
-    lines = fit_warnings(
-        log_of(distance=np.ones(10)), [trial_of(heard, gated)], Path("log"), Config()
-    )
+    lines = warnings_of(None, trial_of(heard, gated))
     assert any(f"{gated} of 5 measurements do not fit" in line for line in lines) == asked
     assert len(lines) == 1, "else it is said that the gate rejects more than its share"
 
@@ -56,7 +59,7 @@ def test_units_are_asked_about_where_few_rows_of_an_association_are_on_the_map(
     monkeypatch.setattr("pipistrelle.scripting.log_warnings.misreading", unexplained)
     labels = (np.where(np.arange(10) < mapped, 1, -1),)
     log = log_of(distance=np.ones(10))
-    lines = fit_warnings(log, [trial_of(log.scans[0], 0, labels)], Path("log"), Config())
+    lines = warnings_of(log, trial_of(log.scans[0], 0, labels))
     assert [line.split(" (")[0] for line in lines] == [
         "log: 4 of 10 rows are of landmarks of the map at the end"
     ] * asked
@@ -76,25 +79,22 @@ def test_warning_names_time_and_cause_of_an_alarm(call, repaired, words):
     log = replace(log_of(distance=np.ones(10)), callers=(mate,))
     trial = trial_of(log.scans[0], 0, (np.ones(10, int),))
     trial.track.report = {"alarms": [(4.5, call, repaired), (7.0, call, repaired)]}
-    (line,) = fit_warnings(log, [trial], Path("log"), Config())
+    (line,) = warnings_of(log, trial)
     assert "from 4.5, 7 s on" in line
     assert all(word in line for word in words)
 
 
 def test_few_rows_on_the_map_are_no_question_in_a_log_of_few_scans():
     log = log_of(distance=np.ones(10))
-    assert (
-        fit_warnings(log, [trial_of(log.scans[0], 0, (np.full(10, -1),))], Path("log"), Config())
-        == []
-    )
+    assert warnings_of(log, trial_of(log.scans[0], 0, (np.full(10, -1),))) == []
 
 
 def test_few_rows_on_the_map_are_no_question_where_the_columns_of_a_log_are_right():
     log = noisy_log(labels=False)
     trial = trial_of(log.scans[0], 0, tuple(np.full(scan.landmark.size, -1) for scan in log.scans))
-    assert fit_warnings(log, [trial], Path("log"), Config()) == []
+    assert warnings_of(log, trial) == []
     spoilt = noisy_log(labels=False, spoil="clockwise:")
-    (line,) = fit_warnings(spoilt, [trial], Path("log"), Config())
+    (line,) = warnings_of(spoilt, trial)
     assert "0 of " in line
     assert "bearings seem to be clockwise: negated" in line
 
@@ -110,12 +110,9 @@ def test_a_heading_beyond_a_turn_is_asked_about(name, heading, asked):
 @pytest.mark.parametrize(("short", "asked"), [(8, False), (9, True)])
 def test_short_excess_paths_are_asked_about_where_nearly_all_are(short, asked):
     excess_path = np.where(np.arange(10) < short, 0.19, 3.0)
-    lines = fit_warnings(
-        log_of(excess_path=excess_path, excess_path_std=0.1, caller=1), [], Path("log"), Config()
-    )
-    assert [f"{short} of 10 excess paths are below 0.2 m" in line for line in lines] == [
-        True
-    ] * asked
+    lines = warnings_of(log_of(excess_path=excess_path, excess_path_std=0.1, caller=1))
+    words = f"{short} of 10 excess paths are below 0.2 m"
+    assert [words in line for line in lines] == [True] * asked
 
 
 NOTHING = scan_with(np.arange(0), np.zeros(0), np.zeros(0))
@@ -125,7 +122,7 @@ NOTHING = scan_with(np.arange(0), np.zeros(0), np.zeros(0))
 def test_missing_measurements_are_reported_only_for_empty_scans(rows):
     heard = scan_with(np.arange(rows), np.zeros(rows), np.ones(rows))
     trial = trial_of(NOTHING, 0, heard=[heard])
-    (line,) = fit_warnings(log_of(distance=np.ones(10)), [trial], Path("log"), Config())
+    (line,) = warnings_of(None, trial)
     assert ("nothing in it is heard by active sensing" in line) == (not rows)
     assert ("none of the 5 rows of active sensing is of a landmark" in line) == (rows == 5)
 
@@ -142,8 +139,7 @@ def test_missing_measurements_are_reported_only_for_empty_scans(rows):
 )
 def test_discarded_rows_are_reported_with_a_sufficient_limit(left_out, parts):
     trial = trial_of(NOTHING, 0, left_out={k: np.array(v) for k, v in left_out.items()})
-    both = [trial, trial]
-    *_, line = fit_warnings(log_of(distance=np.ones(10)), both, Path("log"), Config())
+    *_, line = warnings_of(None, trial, trial)
     for part in parts:
         assert part in line
     ((_, stds),) = left_out.items()
@@ -153,10 +149,7 @@ def test_discarded_rows_are_reported_with_a_sufficient_limit(left_out, parts):
 def test_the_share_of_measurements_that_do_not_fit_is_of_bearings_and_excess_paths():
     rows = {"excess_path": np.full(5, 2.0), "excess_path_std": 0.1, "caller": 1}
     heard = scan_with(np.arange(5), np.zeros(5), **rows)
-    said = [
-        fit_warnings(log_of(distance=np.ones(10)), [trial_of(heard, gated)], Path("log"), Config())
-        for gated in (2, 8)
-    ]
+    said = [warnings_of(None, trial_of(heard, gated)) for gated in (2, 8)]
     assert "the gate rejects 20.0% of the measurements" in said[0][0]
     assert "8 of 10 measurements do not fit" in said[1][0]
 

@@ -235,12 +235,6 @@ def test_values_that_are_not_paths_are_rejected(tmp_path):
         pipistrelle.run(str(tmp_path))
 
 
-def test_folders_without_results_are_rejected(tmp_path):
-    for name in ("nowhere", "."):
-        with pytest.raises(InputError):
-            pipistrelle.load(name)
-
-
 @pytest.mark.usefixtures("undrawn")
 def test_a_table_that_is_cut_or_none_is_refused_by_name(done):
     table = done.save("one") / "steps.parquet"

@@ -6,7 +6,6 @@ import pytest
 import soundfile
 
 import pipistrelle
-from pipistrelle.files import SOUND, OwnFiles
 from reference.sounds import FEW, foreign, swept
 
 FEWEST = ("--receiver.elements", "2", "--duration", "1", "--strategy", "fused", "--quiet")
@@ -51,32 +50,6 @@ def test_the_size_of_the_sound_is_checked_before_the_mission(refused, monkeypatc
     monkeypatch.setattr("shutil.disk_usage", lambda _: type("Usage", (), {"free": 1000})())
     said = refused("run", *FEWEST, "-o", "run", "--save-sound", "tape")
     assert "--save-sound: found 0.0 GB free" in said
-    assert not Path("tape").exists()
-
-
-def test_only_recordings_of_pipistrelle_are_replaced(obey, refused, undrawn):
-    line = ("run", *FEWEST)
-    assert obey(*line, "-o", "a", "--save-sound", "tape")[0] == 0
-    first = OwnFiles(Path("tape"), SOUND).read("recording.wav")
-    assert "tape: is not empty" in refused(*line, "-o", "b", "--save-sound", "tape")
-    again = (*line, "-o", "c", "--overwrite", "--save-sound", "tape")
-    assert obey(*again)[0] == 0
-    assert OwnFiles(Path("tape"), SOUND).read("recording.wav") == first, "the same bits"
-    Path("tape", "recording.wav").write_bytes(first[:-4])
-    said = refused(*line, "-o", "d", "--overwrite", "--save-sound", "tape")
-    assert "recording.wav" in said
-    assert Path("tape", "recording.wav").read_bytes() == first[:-4]
-    assert not list(Path("tape").glob("*.partial"))
-
-
-def test_frames_without_sound_are_refused(refused):
-    for words, said_of in (
-        (("--frames", "0:2"), "--frames"),
-        (("--save-sound", "tape", "--frames", "8:9"), "--frames"),
-    ):
-        assert said_of in refused(
-            "run", *FEW, "--strategy", "fused", "-o", "run", "--quiet", *words
-        )
     assert not Path("tape").exists()
 
 

@@ -4,15 +4,13 @@ import json
 import re
 import tomllib
 from dataclasses import replace
-from math import degrees, inf, pi, radians, sin
+from math import degrees, inf
 from pathlib import Path
 
 import numba
 import numpy as np
-import polars
 import polars as pl
 import pytest
-from scipy.special import j1
 
 import pipistrelle
 from pipistrelle import files, kernel_clock
@@ -29,6 +27,8 @@ from pipistrelle.verbs.console import listening
 from reference.command_line import COMPILING, SHORT, contents, summary, table, track
 from reference.results import loop, mission_folder, study_folder
 from report.drawing import draw_only
+
+SAVED = {"--save-log": ("log.toml", "truth.csv"), "--save-sound": ("recording.wav",)}
 
 
 def test_a_run_prints_its_stages_scores_and_folder(obey):
@@ -185,13 +185,6 @@ def test_the_settings_of_a_run_are_a_file_that_repeats_it(obey, undrawn):
     np.testing.assert_array_equal(track("one", "fused_ekf"), track("two", "fused_ekf"))
 
 
-def test_results_are_replaced_only_when_asked(obey, refused, undrawn):
-    words = ("run", *SHORT, "--strategy", "active", "--quiet", "-o", "one")
-    obey(*words)
-    assert "one: is not empty" in refused(*words)
-    assert obey(*words, "--overwrite")[0] == 0
-
-
 @pytest.mark.parametrize("trouble", [KeyboardInterrupt, MemoryError])
 @pytest.mark.parametrize(
     "place", ["scripting.missions.run_mission", "figures.mission.draw_mission"]
@@ -312,13 +305,6 @@ def test_a_saved_log_is_the_files_that_the_readme_promises(short_log):
     assert "log.toml and four CSV files" in page.read_text(encoding="utf-8")
 
 
-def test_a_log_is_saved_to_a_separate_folder(obey, refused, undrawn):
-    Path("log").mkdir()
-    Path("log/notes.txt").write_text("mine")
-    assert "log: is not empty" in refused("run", *SHORT, "--save-log", "log")
-    assert "is that of --output" in refused("run", "--save-log", "new", "-o", "./new")
-
-
 def test_a_link_to_itself_is_refused_in_place_of_any_folder(refused, undrawn):
     Path("loop").symlink_to("loop")
     mission_folder(Path("one"), {("fused", "ekf"): loop()})
@@ -330,16 +316,22 @@ def test_a_link_to_itself_is_refused_in_place_of_any_folder(refused, undrawn):
     assert "loop: found no such folder" in refused("compare", "one", "loop")
 
 
-@pytest.mark.parametrize("name", ["log.toml", "truth.csv", "README.md"])
-def test_a_log_is_saved_over_a_log_of_ours_and_over_nothing_of_the_users(
-    obey, refused, undrawn, name
+@pytest.mark.parametrize(
+    ("flag", "name"),
+    [(flag, name) for flag, names in SAVED.items() for name in (*names, "README.md")],
+)
+def test_logs_and_recordings_are_saved_over_ours_and_over_nothing_of_the_users(
+    obey, refused, undrawn, flag, name
 ):
-    words = ("run", *SHORT, "--save-log", "log", "--overwrite", "--quiet", "-o")
+    line = ("run", *SHORT, "--receiver.elements", "2", flag, "log", "--quiet")
+    words = (*line, "--overwrite", "-o")
     Path("log").mkdir()
     Path("log", name).write_text("mine")
-    assert "holds no log of Pipistrelle" in refused(*words, "one")
+    assert "log: is not empty and holds no " in refused(*words, "one")
+    assert "is that of --output" in refused("run", flag, "new", "-o", "./new")
     Path("log", name).unlink()
     assert obey(*words, "two")[0] == 0
+    assert "log: is not empty; name a new folder" in refused(*line, "-o", "three")
     assert obey(*words, "three")[0] == 0
     Path("log", name).write_text("mine")
     assert f"{name}: was changed since Pipistrelle wrote it" in refused(*words, "four")
@@ -404,23 +396,6 @@ def test_short_options_set_their_settings(settings):
     assert config.scenario.landmarks == 3
     assert config.scenario.steps == 40
     assert config.fastslam.particles == 30
-
-
-def test_the_beamwidth_accounts_for_the_given_speed_of_sound(settings):
-    words = ("--emitter.frequency", "50000", "--air.speed-of-sound", "330")
-    radius = settings("--beamwidth", "60", *words).emitter.radius
-    ka = 2.0 * pi * 50e3 / 330.0 * radius
-    pressure = 2.0 * j1(ka * sin(radians(30.0))) / (ka * sin(radians(30.0)))
-    assert pressure**2 == pytest.approx(0.5, rel=1e-9)
-
-
-def test_flags_go_over_the_environment_over_the_file(settings, monkeypatch):
-    Path("mission.toml").write_text("seed = 2\n[rays]\npower = 2\nratio = 0.2\n")
-    monkeypatch.setenv("PIPISTRELLE_SEED", "3")
-    monkeypatch.setenv("PIPISTRELLE_RAYS__POWER", "3")
-    monkeypatch.setenv("PIPISTRELLE_DATA", "/nowhere")
-    config = settings("--config", "mission.toml", "--seed", "4")
-    assert (config.seed, config.rays.power, config.rays.ratio) == (4, 3.0, 0.2)
 
 
 def test_the_schema_describes_every_setting(obey):
@@ -499,19 +474,6 @@ def test_calibrated_parameters_are_in_the_table_and_the_summary(obey, undrawn):
     assert rows["sensor place x, 1 sigma"] == [f"{run['calibration']['sensor_place_x_std']:.2g}"]
 
 
-@pytest.mark.parametrize(
-    ("estimator", "parameter", "words"),
-    [
-        ("ekf", "speed_scale", ("found speed_scale with the filter ekf", "take smoother")),
-        ("smoother", "gravity", ("gravity", "speed_scale")),
-    ],
-)
-def test_a_parameter_that_cannot_be_calibrated_is_refused(refused, estimator, parameter, words):
-    said = refused("run", "--filter", estimator, "--filter.calibrate", parameter)
-    assert said.startswith("filter.calibrate: ") or parameter == "gravity"
-    assert all(word in said for word in words)
-
-
 def test_a_study_has_columns_of_calibrated_parameters(obey):
     Path("plan.toml").write_text(
         'format = 1\nname = "own"\niterations = 1\nfilters = ["smoother", "ekf"]\n'
@@ -520,6 +482,6 @@ def test_a_study_has_columns_of_calibrated_parameters(obey):
     )
     status, *_ = obey("study", "plan.toml", "--workers", "1", "-o", "out")
     assert status == 0
-    trials = polars.read_parquet("out/trials/*.parquet").sort("case")
+    trials = pl.read_parquet("out/trials/*.parquet").sort("case")
     assert trials["turn_bias_std"].is_null().to_list() == [False, True]
     assert 0.0 < trials["turn_bias_std"][0] <= 0.02

@@ -186,19 +186,6 @@ def test_a_full_disk_keeps_the_earlier_page(obey, folder, refused, monkeypatch):
     assert "one: could not be written" in refused("view", folder, "--quiet")
 
 
-@pytest.mark.parametrize(
-    ("make", "said"),
-    [
-        (lambda: None, "none: found no such folder, expected the result folder of"),
-        (lambda: Path("none").write_text(""), "none: found a file, expected the result folder of"),
-        (lambda: Path("none").mkdir(), "none: found no summary.json"),
-    ],
-)
-def test_view_rejects_folders_without_results(refused, make, said):
-    make()
-    assert said in refused("view", "none")
-
-
 def test_a_study_is_refused_with_what_to_do_instead(obey, refused, undrawn):
     Path("tiny.toml").write_text(TINY)
     assert obey("study", "tiny.toml", "--workers", "1", "--quiet", "-o", "study")[0] == 0

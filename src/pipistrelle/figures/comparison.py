@@ -135,19 +135,16 @@ def _draw_errors(
         axes.set_axisbelow(True)
         what = "error" if known else "from the first"
         axes.set_ylabel(f"{what},\n{name} [m]", multialignment="center")
-        axes.set_ylim(0.0, _highest([line.get_ydata() for line in axes.lines]))
+        errors = [np.asarray(line.get_ydata()) for line in axes.lines]
+        most = [np.max(e[np.isfinite(e)], initial=0.0) for e in errors]
+        # Errors of diverged paths are cut.
+        axes.set_ylim(0.0, float(1.08 * min(max(most), 20.0 * max(min(most), 0.5))) or 1.0)
         axes.set_xlim(0.0, max(view.time[-1] for view in estimate.views))
         if first is None:
             axes.tick_params(labelbottom=False)
         else:
             axes.set_xlabel("time [s]")
         first = first or axes
-
-
-def _highest(errors: Sequence[Any]) -> float:
-    """Return the upper limit of an error axis; it cuts the errors of diverged paths."""
-    most = [np.max(e[np.isfinite(e)], initial=0.0) for e in map(np.asarray, errors)]
-    return float(1.08 * min(max(most), 20.0 * max(min(most), 0.5))) or 1.0
 
 
 def _look(i: int) -> dict[str, Any]:

@@ -1,8 +1,13 @@
-"""The style of all figures: colours, sizes of type, and the saving of a figure."""
+"""The style of all figures and pages: colours, sizes of type; figures saved, pages filled in."""
 
+from collections.abc import Callable, Mapping
+from importlib.resources import files
 from io import BytesIO
 from pathlib import Path
-from typing import TYPE_CHECKING
+from types import MappingProxyType
+from typing import TYPE_CHECKING, Any
+
+from pipistrelle.files import upright
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -89,6 +94,36 @@ def page_colours() -> str:
     )
     dark = f"@media (prefers-color-scheme: dark) {{ :root {{ {dark} }} }}"
     return f":root {{ {light} }}\n{dark}"
+
+
+def page_of(
+    room: str,
+    scripts: tuple[str, ...],
+    functions: Mapping[str, Callable[..., Any]] = MappingProxyType({}),
+    /,
+    **values: Any,
+) -> str:
+    """Return a room's ``page.html`` with its ``page.css``, scripts and values; texts are escaped.
+
+    `room`: a package, as "pipistrelle.report". `functions`: filters of the template.
+    """
+    from jinja2 import Environment, StrictUndefined
+    from markupsafe import Markup
+
+    def read(name: str) -> str:
+        return (files(room) / name).read_text(encoding="utf-8")
+
+    environment = Environment(
+        autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True
+    )
+    environment.filters |= functions
+    text = environment.from_string(read("page.html")).render(
+        style=Markup(read("page.css")),
+        script=Markup("".join(map(read, scripts))),
+        colours=Markup(page_colours()),
+        **values,
+    )
+    return upright(text)
 
 
 def save_figure(figure: "Figure", folder: Path, name: str) -> tuple[Path, Path]:

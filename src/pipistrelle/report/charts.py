@@ -5,13 +5,14 @@ PDF and CSV follow. `evaluation.scores` lists the scores that are charted over a
 """
 
 import math
+import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
 from pipistrelle.config import STRATEGIES
 from pipistrelle.evaluation.comparison import Finding
@@ -20,15 +21,6 @@ from pipistrelle.evaluation.scores import Score, shown_in
 from pipistrelle.figures.chart import MARKS, Axis, Chart, Panel, Series, ends, linear_axis, log_axis
 from pipistrelle.report import effects as changes
 from pipistrelle.report import sentences as paper
-from pipistrelle.report.axes import (
-    Line,
-    axis_of,
-    axis_of_words,
-    beside,
-    each_combination,
-    facets_of,
-    slug,
-)
 from pipistrelle.report.study import (
     COMMON,
     LANDMARKS,
@@ -52,7 +44,16 @@ from pipistrelle.report.study import (
     own_cases,
     samples,
 )
-from pipistrelle.report.variables import BEAM, UNITS, Variable, listed, places, with_article
+from pipistrelle.report.variables import (
+    BEAM,
+    UNITS,
+    Variable,
+    axis_of,
+    axis_of_words,
+    listed,
+    places,
+    with_article,
+)
 
 WORLDS = "Mean ± σ over worlds; dots: single worlds above that"
 PASSIVE = " (passive's at the right edge, where they do not depend on the beam)"
@@ -63,6 +64,122 @@ BOUND = (
 """Parts of captions."""
 GAINS = (("position", POSITION), ("map", COMMON))
 DIFFERENCE = "active minus fused; open: not significant"
+MOST_PANELS = 6
+"""Most panels of combinations; more combinations become lines of a panel per strategy."""
+ASIDE = {"active": 0.985, "fused": 1.015, "passive": 1.0}
+"""Factors by which strategies are shifted along a logarithmic axis."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Line:
+    """A line in a chart: the cases of a filter and strategy along the horizontal axis."""
+
+    way: Way
+    name: str
+    """The strategy, or the combination if the panel has a single strategy."""
+    strength: float = 1.0
+    x: Float[np.ndarray, " k"]
+    aside: Float[np.ndarray, " k"]
+    """Positions along the axis, and positions shifted from the other strategies."""
+    cells: Int[np.ndarray, " k"]
+    """Numbers of the combinations."""
+
+
+Facet = tuple[str, list[Line]]
+"""Title and lines of one panel."""
+
+
+def facets_of(study: Study, variable: Variable | None, axis: Axis) -> tuple[list[Facet], bool]:
+    """Split a study's cases into chart panels with lines over a variable, or over the filters.
+
+    Returns: a panel per filter and combination of the other variables with the strategies as
+    lines; if these are more than `MOST_PANELS`, a panel per filter and strategy with a line per
+    distinct combination, the first strongest. And whether the lines are combinations.
+    """
+    titles, trials = filter_titles(study), study.trials
+    if variable is None:
+        at = np.arange(len(titles), dtype=np.float64)
+        among = [one for one in STRATEGIES if any(one == way for _, way in trials)]
+        lines = [
+            Line(
+                way=(name, strategy),
+                name=strategy,
+                x=at[[i]],
+                aside=beside(axis, at[[i]], strategy, among),
+                cells=np.zeros(1, dtype=int),
+            )
+            for strategy in STRATEGIES
+            for i, name in enumerate(titles)
+            if (name, strategy) in trials
+        ]
+        return [("", lines)], False
+    rows, x = along(study, variable), places(variable)
+    count = rows.shape[1]
+    many = count > 1 and len(titles) * count > MOST_PANELS
+    names = [combination_name(study, int(i), [variable]) for i in rows[0]]
+    facets: list[Facet] = []
+    for name, title in titles.items():
+        among = [strategy for strategy in STRATEGIES if (name, strategy) in trials]
+        for strategy in among if many else ():
+            at = trials[name, strategy].at[rows]
+            first = np.sort(np.unique(at, axis=1, return_index=True)[1]).tolist()
+            last = max(len(first) - 1, 1)
+            look = {"way": (name, strategy), "x": x, "aside": x}
+            lines = [
+                Line(name=names[j], strength=1.0 - 0.75 * i / last, cells=rows[:, j], **look)
+                for i, j in enumerate(first)
+            ]
+            facets.append((f"{title}, {strategy}", lines))
+        for j in () if many else range(count):
+            lines = [
+                Line(
+                    way=(name, strategy),
+                    name=strategy,
+                    x=x,
+                    aside=beside(axis, x, strategy, among),
+                    cells=rows[:, j],
+                )
+                for strategy in among
+            ]
+            parts = [title, names[j]] if len(titles) > 1 or count == 1 else [names[j]]
+            facets.append((", ".join(filter(None, parts)), lines))
+    return facets, many
+
+
+def beside(
+    axis: Axis,
+    x: Float[np.ndarray, " k"],
+    strategy: str,
+    among: Sequence[str] = STRATEGIES,
+    far: float = 1.0,
+) -> Float[np.ndarray, " k"]:
+    """Shift a strategy's points along the axis, so that the strategies do not overlap.
+
+    `among`: all strategies shown. `far`: multiple of the shift of single worlds.
+    """
+    middle = float(np.mean([ASIDE[one] for one in among if one in ASIDE] or [1.0]))
+    share = far * (ASIDE.get(strategy, middle) - middle)
+    if axis.log:
+        return x * (1.0 + share)
+    low, high = axis.limits
+    return x + share * (12.0 if axis.words else 0.5 * (high - low))
+
+
+def each_combination(study: Study, variable: Variable) -> str:
+    """Describe for a caption the lines of a chart that has a line per combination of variables."""
+    others = [other for other in study.variables if other is not variable]
+    first = combination_name(study, 0, [variable])
+    what = (
+        f"value of {with_article(others[0])}"
+        if len(others) == 1
+        else (f"combination of {listed([with_article(other) for other in others])}")
+    )
+    return f"a line for each {what}, that of {first} the strongest"
+
+
+def slug(name: str) -> str:
+    """Replace characters that are not letters or digits by underscores, for a file's name."""
+    return re.sub(r"\W+", "_", name)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -11,20 +11,17 @@ import platform
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from importlib.metadata import PackageNotFoundError, version
-from importlib.resources import files
 from math import inf
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
-
-from markupsafe import Markup
+from typing import Any
 
 from pipistrelle import __version__
 from pipistrelle.evaluation.bound import IN_ONE_WORLD
 from pipistrelle.evaluation.comparison import INTERVALS
 from pipistrelle.evaluation.scores import shown_in
-from pipistrelle.figures.chart import Chart, column_count, csv_rows, csv_text
-from pipistrelle.figures.style import page_colours
-from pipistrelle.files import REPORT, claim, drawn_files, upright
+from pipistrelle.figures.chart import Chart, column_count, csv_rows, csv_text, draw_chart
+from pipistrelle.figures.style import page_of, save_figure
+from pipistrelle.files import REPORT, claim, drawn_files
 from pipistrelle.report import effects as changes
 from pipistrelle.report import tables
 from pipistrelle.report.charts import Figure, answers, study_charts
@@ -53,9 +50,6 @@ from pipistrelle.report.study import (
 from pipistrelle.report.svg import legend, panel_svg, readings
 from pipistrelle.report.variables import UNITS, amount, number_word, three_digits
 from pipistrelle.settings import to_toml
-
-if TYPE_CHECKING:
-    from jinja2 import Template
 
 LIBRARIES = ("numpy", "scipy", "numba", "polars", "pydantic", "matplotlib", "jinja2")
 PAPERS_QUESTION = "Does listening to someone else’s calls as well as one’s own build a better map?"
@@ -202,10 +196,13 @@ def page(
 
     `figures`: under each rule that has them. `numbers`: the content of ``summary.json``.
     """
-    here, study = files("pipistrelle.report"), result.study
+    study = result.study
     rules = sorted(RULES, key=lambda rule: rule != result.rule)
     shown = [_figure(views, rules) for views in figures.values()]
-    text = _template().render(
+    return page_of(
+        "pipistrelle.report",
+        ("page.js",),
+        {"number": three_digits, "p": _p, "finding": _shown, "amount": amount},
         study=study,
         papers=result.papers,
         headline=result.rule,
@@ -225,9 +222,6 @@ def page(
         figures=_side_by_side([figure for figure in shown if answers(figure["name"])]),
         further=_side_by_side([figure for figure in shown if not answers(figure["name"])]),
         models=_side_by_side([_figure({"always": chart}, ["always"]) for chart in models]),
-        style=Markup((here / "page.css").read_text(encoding="utf-8")),
-        script=Markup((here / "page.js").read_text(encoding="utf-8")),
-        colours=Markup(page_colours()),
         filters=filter_titles(study),
         papers_filters=FILTERS,
         number_word=number_word,
@@ -238,19 +232,6 @@ def page(
         consistency=tables.by_strategy(numbers["consistency"]),
         config=to_toml(study.config),
     )
-    return upright(text)
-
-
-def _template() -> "Template":
-    """Return the Jinja template of a report's page, which escapes every text."""
-    from jinja2 import Environment, StrictUndefined
-
-    environment = Environment(
-        autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True
-    )
-    environment.filters |= {"number": three_digits, "p": _p, "finding": _shown, "amount": amount}
-    text = (files("pipistrelle.report") / "page.html").read_text(encoding="utf-8")
-    return environment.from_string(text)
 
 
 def _side_by_side(figures: list[dict[str, Any]]) -> list[dict[str, Any]]:
@@ -287,9 +268,6 @@ def _figure(views: Mapping[Any, Chart], rules: Sequence[str]) -> dict[str, Any]:
 
 def _write_figure(chart: Chart, folder: Path) -> None:
     """Write a chart as a PNG and a PDF file."""
-    from pipistrelle.figures.chart import draw_chart
-    from pipistrelle.figures.style import save_figure
-
     save_figure(draw_chart(chart), folder, chart.name)
 
 

@@ -484,7 +484,11 @@ def _trials(
     full = _array(landmarks, landmarks["full"], worlds, shape, at=label, empty=False)
     none = np.float32(0.0)
     error = _array(landmarks, landmarks["error_m"], worlds, shape, at=label, empty=none)
-    shared = _common(numbers, full, error)
+    common: dict[Way, Float[np.ndarray, "n c"]] = {}
+    for name in {name for name, _ in numbers}:
+        of_filter = {way: cases for way, cases in numbers.items() if way[0] == name}
+        shared = np.all([full[:, cases] for cases in of_filter.values()], axis=0)
+        common |= {way: rmse_of(error[:, cases], shared) for way, cases in of_filter.items()}
     by_way = {}
     for way, cases in numbers.items():
         first = np.sort(np.unique(cases, return_index=True)[1])
@@ -493,7 +497,7 @@ def _trials(
             at=np.argmax(cases[:, None] == c, axis=1),
             failed=failed[:, c],
             diverged=diverged[:, c],
-            scores={score: table[:, c] for score, table in scores.items()} | {COMMON: shared[way]},
+            scores={score: table[:, c] for score, table in scores.items()} | {COMMON: common[way]},
             placed=full[:, c],
             off=error[:, c],
             nees=nees[:, c],
@@ -529,17 +533,3 @@ def _means(*columns: Float[np.ndarray, "n b k"]) -> Float[np.ndarray, "i b k"]:
     counts = [np.sum(np.isfinite(column), axis=0) for column in columns]
     with np.errstate(invalid="ignore"):
         return np.array([np.nansum(c, axis=0) / n for c, n in zip(columns, counts, strict=True)])
-
-
-def _common(
-    numbers: Mapping[Way, Int[np.ndarray, " c"]],
-    full: Bool[np.ndarray, "n a l"],
-    error: Float[np.ndarray, "n a l"],
-) -> dict[Way, Float[np.ndarray, "n c"]]:
-    """Return each case's map RMSE over the landmarks that all strategies of its filter placed."""
-    rmse = {}
-    for name in {name for name, _ in numbers}:
-        of_filter = {way: c for way, c in numbers.items() if way[0] == name}
-        shared = np.all([full[:, c] for c in of_filter.values()], axis=0)
-        rmse |= {way: rmse_of(error[:, c], shared) for way, c in of_filter.items()}
-    return rmse

@@ -1,16 +1,17 @@
-"""Variables of a study, and how values and numbers are written for readers."""
+"""Variables of a study, their axes, and how values and numbers are written for readers."""
 
 import json
 import math
 import re
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 from jaxtyping import Float
 
 from pipistrelle.config import CallerConfig, caller_names
+from pipistrelle.figures.chart import Axis
 from pipistrelle.settings import known_settings
 
 BEAM = "beamwidth"
@@ -27,6 +28,13 @@ NUMBERS = (
     "none", "one", "two", "three", "four", "five", "six", "seven", "eight", "nine", "ten",
     "eleven", "twelve",
 )  # fmt: skip
+
+SHORTEST = 8
+"""Fewest letters of an upright word; words that would be shorter are slanted."""
+SLANTED_LETTERS = 12
+"""Most letters of a slanted word."""
+MAX_LETTERS = 52
+"""Letters that fit along an axis."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -154,6 +162,72 @@ def geometric(numbers: Sequence[float]) -> bool:
         return False
     ratios, steps = np.diff(np.log(numbers)), np.diff(numbers)
     return bool(np.std(ratios) / np.mean(ratios) < np.std(steps) / np.mean(steps))
+
+
+def axis_of(variable: Variable) -> Axis:
+    """Return the chart axis for a variable of a study, with a tick at each value.
+
+    Returns: logarithmic for beamwidths and for geometric series.
+    """
+    at = places(variable).tolist()
+    if variable.name == BEAM:
+        degrees = (word.removesuffix("°") for word in variable.words)
+        ticks = tuple(zip(at, degrees, strict=True))
+        return Axis(
+            label=variable.label, limits=(0.9 * at[0], 1.12 * at[-1]), log=True, ticks=ticks
+        )
+    named = tuple(zip(at, variable.words, strict=True))
+    if variable.numbers is None:
+        return replace(axis_of_words(variable.words), label=variable.label)
+    log = geometric(variable.numbers)
+    room = 0.06 * (at[-1] - at[0])
+    limits = (at[0] - room, at[-1] + room)
+    if log:
+        ratio = (at[-1] / at[0]) ** 0.06
+        limits = (at[0] / ratio, at[-1] * ratio)
+    return Axis(
+        label=variable.label, limits=limits, log=log, ticks=_thinned(named, limits, log=log),
+        named=tuple((x, f"{variable.name} = {word}") for x, word in named),
+    )  # fmt: skip
+
+
+def axis_of_words(words: Sequence[str]) -> Axis:
+    """Return a chart axis with words as ticks; long words are slanted or shortened."""
+    named = tuple((float(i), word) for i, word in enumerate(words))
+    longest = MAX_LETTERS // len(named)
+    slanted = longest < SHORTEST and max(map(len, words)) > longest
+    longest = SLANTED_LETTERS if slanted else max(longest, 3)
+    return Axis(
+        label="",
+        limits=(-0.6, len(named) - 0.4),
+        ticks=tuple((i, _shortened(word, longest)) for i, word in named),
+        named=named,
+        words=True,
+        slanted=slanted,
+    )
+
+
+def _thinned(
+    named: Sequence[tuple[float, str]], limits: tuple[float, float], *, log: bool
+) -> tuple[tuple[float, str], ...]:
+    """Remove axis ticks with a text that would overlap the text of the tick before."""
+    kept: list[tuple[float, str]] = []
+    for value, word in named:
+        if kept:
+            ends = np.array([kept[-1][0], value])
+            share = np.diff(np.log(ends) if log else ends)[0]
+            share /= np.diff(np.log(limits) if log else limits)[0]
+            if share * MAX_LETTERS < 0.5 * (len(word) + len(kept[-1][1])) + 1.0:
+                continue
+        kept.append((value, word))
+    return tuple(kept)
+
+
+def _shortened(word: str, most: int) -> str:
+    """Replace the middle of a word by an ellipsis if it has more than `most` letters."""
+    if len(word) <= most:
+        return word
+    return f"{word[: most - most // 2 - 1]}…{word[len(word) - most // 2 :]}"
 
 
 def _callers(value: Any) -> tuple[CallerConfig, ...] | None:

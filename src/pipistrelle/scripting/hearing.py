@@ -203,13 +203,6 @@ def _heard(
     return Heard(overview=overview, log=log, text=None, odd=tuple(odd))
 
 
-def faults_of(folder: Path, config: Config) -> list[str]:
-    """Check a sound recording and return its faults, a line each."""
-    from pipistrelle.detection.sounds.check import check_recording
-
-    return check_recording(folder, described(folder), config)
-
-
 def described(folder: Path) -> "Description":
     """Read the description of a sound recording; raise if the folder holds no recording."""
     from pipistrelle.detection.sounds.sound_file import FILE, read_description

@@ -125,7 +125,14 @@ def compare(
     }
     if comparing.kind_of(folders) == "studies":
         compared = comparing.compare_studies(folders, drop_diverged=drop_diverged)
-        answer, tables = _studies_answer(compared), _study_tables(compared)
+        from pipistrelle.report.effects import headline
+
+        cases = sum(r["score"] == comparing.POSITION and r["letter"] == "B" for r in compared.rows)
+        answer = [
+            headline(f"{comparing.LETTERS[one.b]} instead of A", "position RMSE", "m", one, cases)
+            for one in compared.overall
+        ]
+        tables = _study_tables(compared)
         for letter, (done, planned) in zip(names, compared.worlds, strict=True):
             names[letter] += f": {done} worlds" + f" of {planned}" * (done < planned)
     elif drop_diverged:
@@ -160,18 +167,6 @@ def compare(
         put("\n\n".join(block for block in blocks if block))
     if output is not None:
         put(output)
-
-
-def _studies_answer(compared: "ComparedStudies") -> list[str]:
-    """Return a sentence on each further study: its mean position RMSE against the first."""
-    from pipistrelle.experiments.comparing import LETTERS, POSITION
-    from pipistrelle.report.effects import headline
-
-    cases = sum(row["score"] == POSITION and row["letter"] == "B" for row in compared.rows)
-    return [
-        headline(f"{LETTERS[one.b]} instead of A", "position RMSE", "m", one, cases)
-        for one in compared.overall
-    ]
 
 
 def _missions_answer(compared: "ComparedMissions") -> list[str]:

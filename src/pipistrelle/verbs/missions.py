@@ -127,13 +127,15 @@ def _hear(asked: dict[str, Any]) -> int:
     """Detect the echoes of a recording for `pipistrelle hear`, or check the recording."""
     recording, door = asked["recording"], door_of(asked, working=partial(working, asked["quiet"]))
     config = hearing.heard_settings(door.flags)
+    about = hearing.described(recording)
     if asked["check"]:
-        faults = hearing.faults_of(recording, config)
+        from pipistrelle.detection.sounds.check import check_recording
+
+        faults = check_recording(recording, about, config)
         put("\n".join(faults) or "nothing odd was found")
         if faults:
             warn(f"{recording}: found {len(faults)} fault{'s' * (len(faults) > 1)}")
         return 1 if faults else 0
-    hearing.described(recording)
     if asked["output"] is None:
         raise InputError("hear: found no folder for the log; name one with -o LOG")
     heard = hearing.hear_by(door)

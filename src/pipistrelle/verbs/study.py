@@ -108,8 +108,10 @@ def _progress(quiet: bool) -> Iterator[Show]:
             left = pace(so_far)
             worlds, rest = f"{so_far.done}/{so_far.worlds}", f", {left}" if left else ""
             trials = {
-                name: f"{ended}/{so_far.trials[name]}{_failures(so_far.failed[name])}"
-                for name, ended in so_far.ended.items()
+                name: f"{ended}/{so_far.trials[name]}" + f" ({failed} failed)" * (failed > 0)
+                for (name, ended), failed in zip(
+                    so_far.ended.items(), so_far.failed.values(), strict=True
+                )
             }
             if draw is not None:
                 draw("worlds", so_far.done, so_far.worlds, worlds + rest)
@@ -121,11 +123,6 @@ def _progress(quiet: bool) -> Iterator[Show]:
                 say(f"{worlds} worlds{rest}; trials: {ended}")
 
         yield show
-
-
-def _failures(number: int) -> str:
-    """Format the number of failed trials in brackets; "" for none."""
-    return f" ({number} failed)" if number else ""
 
 
 def _pace() -> Callable[["StudyProgress"], str]:

@@ -543,25 +543,17 @@ def test_a_damaged_or_missing_bag_is_refused_by_name(tmp_path):
         ([], ("no odometry",)),
         ([*drive(), seen(0.2, math.nan)], ("topic /seen, message 1", "the range nan")),
         ([*drive(), seen(0.2, 2e6)], ("topic /seen, message 1", "range 2000000.0")),
-        (
-            [*drive(), ("/odom", ODOMETRY, 0.5, odometry(0.5, math.nan, 0.0, 0.0)), seen(0.2)],
-            ("topic /odom, message 6", "x nan"),
-        ),
-        (
-            [*drive(), ("/odom", ODOMETRY, 0.5, odometry(0.2, 0.0, 0.0, 0.0)), seen(0.2)],
-            ("topic /odom, message 6", "run backwards", "--bag.stamps received"),
-        ),
-        (
-            [*drive(), seen(0.2), ("/seen", LABELLED, 0.3, labelled(0.1, [(7, 0.0, 1.0)]))],
-            ("topic /seen, message 2", "run backwards"),
-        ),
-        (
-            [*drive(), ("/seen", LABELLED, 0.2, labelled(0.2, [(7, 0.0, 1.0), (7, 0.2, 1.0)]))],
-            ("topic /seen, message 1", "landmark 7"),
-        ),
+        ([*drive(), ("/odom", ODOMETRY, 0.5, odometry(0.5, math.nan, 0.0, 0.0)), seen(0.2)],
+         ("topic /odom, message 6", "x nan")),
+        ([*drive(), ("/odom", ODOMETRY, 0.5, odometry(0.2, 0.0, 0.0, 0.0)), seen(0.2)],
+         ("topic /odom, message 6", "run backwards", "--bag.stamps received")),
+        ([*drive(), seen(0.2), ("/seen", LABELLED, 0.3, labelled(0.1, [(7, 0.0, 1.0)]))],
+         ("topic /seen, message 2", "run backwards")),
+        ([*drive(), ("/seen", LABELLED, 0.2, labelled(0.2, [(7, 0.0, 1.0), (7, 0.2, 1.0)]))],
+         ("topic /seen, message 1", "landmark 7")),
         ([*drive(), seen(9.0)], ("topic /seen", "1 outside odometry")),
     ],
-)
+)  # fmt: skip
 def test_unusable_messages_are_refused_by_topic_and_number(tmp_path, told, parts):
     refused(written(tmp_path / "one.mcap", *told), *parts)
 

@@ -390,27 +390,21 @@ def test_one_row_of_odometry_is_no_log(tmp_path):
         ("[0.05, 0.06", "[-0.05, 0.06", ("'initial_pose_std[0]': found -0.05",)),
         ("[0.5, 20.0]", "[20.0, 0.5]", ("'range_bounds': found [20.0, 0.5]", "below a far one")),
         ("range_std = 0.2", "range_std = 0.2\nstep = 0", ("'step': found 0", "greater than 0")),
-        (
-            "range_std = 0.2",
-            "range_std = 0.2\ntime_offset = 4e7",
-            ("'time_offset': found 40000000.0", "3600"),
-        ),
+        ("range_std = 0.2",
+         "range_std = 0.2\ntime_offset = 4e7",
+         ("'time_offset': found 40000000.0", "3600")),
         ("range_std = 0.2", "range_std = 0.2\ngate = 1.5", ("'gate': found 1.5", "equal to 1")),
-        (
-            "[0.5, 20.0]",
-            "[0.5, 20.0]\n[association]\nrange = 7.0",
-            ("unknown key 'association.range'", "clutter"),
-        ),
+        ("[0.5, 20.0]",
+         "[0.5, 20.0]\n[association]\nrange = 7.0",
+         ("unknown key 'association.range'", "clutter")),
         ("range_std = 0.2", "range_std = ", ("TOML", "line 7")),
-        (
-            "range_std = 0.2",
-            "range_std = 1e-155",
-            ("'range_std': found 1e-155", "equal to 0.000001"),
-        ),
+        ("range_std = 0.2",
+         "range_std = 1e-155",
+         ("'range_std': found 1e-155", "equal to 0.000001")),
         ("range_std = 0.2", "range_std = " + "[" * 5000, ("more than 8 levels", "mend the file")),
         ("range_std = 0.2", "range_std = " + "2" * 5000, ("integer of many digits", "64 bits")),
     ],
-)
+)  # fmt: skip
 def test_a_bad_setting_is_refused_by_its_key(tmp_path, old, new, parts):
     assert old in UNICYCLE
     folder = recorded(tmp_path, UNICYCLE.replace(old, new, 1))

@@ -531,9 +531,3 @@ def test_a_study_of_beamwidths_goes_on_by_either_way_of_writing_it(tmp_path):
 def test_temperatures_may_vary_if_the_speed_of_sound_is_set(tmp_path):
     text = BEAMS + '"air.temperature_c" = [0.0, 20.0]\n[config]\nair.speed_of_sound = 343.0\n'
     assert len(plan_of(tmp_path, BARE + text).grid["emitter.radius"]) == 2
-
-
-def test_a_plan_without_beamwidths_is_read_as_ever(tmp_path):
-    plain = plan_of(tmp_path, BARE + '[grid]\n"emitter.radius" = [0.0025, 0.025]\n')
-    assert plain.grid == {"emitter.radius": (0.0025, 0.025)}
-    assert plain.config == Config()

@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float
@@ -154,7 +155,7 @@ def score(track: Track, truth: Truth, scans: Sequence[Scan], limit: float) -> Sc
 
     Bradley & Abaid, Eqs. (23), (26) and (27) and Sec. V-A.
     """
-    path = score_path(track.pose, truth.path)
+    path: dict[str, Any] = score_path(track.pose, truth.path)
     worst = path["nees_max"]
     estimate = heaviest(track.landmarks)
     labels, positions = truth.landmarks or (np.empty(0, int), np.empty((0, 2)))
@@ -164,13 +165,9 @@ def score(track: Track, truth: Truth, scans: Sequence[Scan], limit: float) -> Sc
     squared, degrees = track.innovations
     rows = np.count_nonzero(~np.isnan(np.concatenate([[], *(scan.bearing for scan in scans)])))
     return Scores(
-        position_rmse_m=path["position_rmse_m"],
-        heading_rmse_rad=path["heading_rmse_rad"],
+        **path,
         map_rmse_m=_rmse(position_error(mapped, true)),
-        position_rmse_aligned_m=path["position_rmse_aligned_m"],
         map_rmse_aligned_m=_aligned_rmse(mapped, true),
-        nees_mean=path["nees_mean"],
-        nees_max=worst,
         caller_rmse_m=_rmse(position_error(followed, walked)),
         caller_rmse_aligned_m=_aligned_rmse(followed, walked),
         diverged=(None if finite else True)

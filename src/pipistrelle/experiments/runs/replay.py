@@ -304,14 +304,18 @@ def rerun(
     for run in summary.runs:
         trust(f"{folder / SUMMARY}: runs.filter", run.filter, CATALOGUE, "filter", "filters")
     config = resolve(from_file(folder / "config.toml"))
-    trust(
-        f"{folder / 'config.toml'}: association.method", config.association.method,
-        (KNOWN, *METHODS), "association.method", "association",
-    )  # fmt: skip
+    place, method = f"{folder / 'config.toml'}: association.method", config.association.method
+    trust(place, method, (KNOWN, *METHODS), "association.method", "association")
     strategies = list(dict.fromkeys(run.strategy for run in summary.runs))
     filters = list(dict.fromkeys(run.filter for run in summary.runs))
     if summary.log is None:
-        _check_simulated(folder, log)
+        if "scenario" not in read_toml(folder / "config.toml"):
+            found = "which log was solved (it is the folder of an earlier version)"
+            fix = "solve it anew, `pipistrelle slam LOG -o DIR`, and name DIR"
+            raise refusal(f"{folder / SUMMARY}: log", "nothing", found, fix)
+        if log is not None:
+            expected = "none, for `pipistrelle run` simulated this mission"
+            raise refusal(f"{folder}, option --log", f"{log}", expected, "leave it out")
         world = ALL_DRAWN if (kept := config.scenario.world) is None else read_world(Path(kept))
         mission = run_mission(
             config, strategies, filters, world=world, progress=progress, watch=watch
@@ -345,48 +349,23 @@ def _sums(log: Path) -> dict[str, str]:
     return sums
 
 
-def _check_simulated(folder: Path, log: Path | None) -> None:
-    """Raise unless a mission without a log was simulated, or if the user names a log for it."""
-    if "scenario" not in read_toml(folder / "config.toml"):
-        raise refusal(
-            f"{folder / SUMMARY}: log",
-            "nothing",
-            "which log was solved (it is the folder of an earlier version)",
-            "solve it anew, `pipistrelle slam LOG -o DIR`, and name DIR",
-        )
-    if log is not None:
-        raise refusal(
-            f"{folder}, option --log",
-            f"{log}",
-            "none, for `pipistrelle run` simulated this mission",
-            "leave it out",
-        )
-
-
 def _log_of(folder: Path, summary: Summary, log: Path | None) -> Path:
     """Return the path of the log that a mission used; raise if it is missing or was changed."""
     assert summary.log
     path = summary.log.place if log is None else log
     where = f"{folder / SUMMARY}: log.path" if log is None else f"{folder}, option --log"
     if not path.exists():
-        raise refusal(
-            where,
-            f"{path}, which is not there",
-            "the log that was solved",
-            "put it back, or say with --log where it is",
-        )
+        found, fix = f"{path}, which is not there", "put it back, or say with --log where it is"
+        raise refusal(where, found, "the log that was solved", fix)
     then, now = summary.log.files, _sums(path)
     changed = [name for name in sorted({*then, *now}) if then.get(name) != now.get(name)]
     if changed:
         name = changed[0]
         how = "is new" if name not in then else "is gone" if name not in now else "was changed"
         others = f", and {len(changed) - 1} more" if len(changed) > 1 else ""
-        raise refusal(
-            path,
-            f"not the log that was solved ({name} {how}{others})",
-            f"it as {folder} was made of it",
-            "put that back, or solve it as it is, `pipistrelle slam`, and name that folder",
-        )
+        found = f"not the log that was solved ({name} {how}{others})"
+        fix = "put that back, or solve it as it is, `pipistrelle slam`, and name that folder"
+        raise refusal(path, found, f"it as {folder} was made of it", fix)
     return path
 
 

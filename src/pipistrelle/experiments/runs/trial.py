@@ -29,7 +29,6 @@ from pipistrelle.estimation.beliefs import (
     Estimator,
     Gaussian,
     Innovations,
-    Landmarks,
     Track,
     at_steps,
     completed,
@@ -46,7 +45,6 @@ from pipistrelle.experiments.hearing.scenario import ALL_DRAWN, World, standing_
 from pipistrelle.experiments.machine import check_memory
 from pipistrelle.experiments.named_settings import Case, each_its_own
 from pipistrelle.experiments.results.scores import (
-    Scores,
     TrialResult,
     map_motion,
     position_floor,
@@ -212,7 +210,18 @@ def run_trial(
     )
     wall_s = kernel_clock.wall_s() - began
     track = _named(at_vehicle(at_steps(whole, steps), drive.sensor), used, drive)
-    scores, mapped = _scored(track, drive, used, estimator.nees_limit, causes, association)
+    truth, limit, found, mapped = drive.truth, estimator.nees_limit, None, None
+    if association is not None and causes is not None:
+        found = associated(track.labels, causes, [*drive.moving])
+    elif association is not None and truth.landmarks is not None:
+        found = matched(track.landmarks, *truth.landmarks, map_motion(track, truth))
+    if found is None:
+        scores = score(track, truth, used, limit)
+    else:
+        mapped = renamed(track.landmarks, found)
+        scores = score(replace(track, landmarks=mapped), truth, used, limit)
+        motion = map_motion(track, truth)
+        scores = with_association(scores, track.landmarks, found, truth, motion)
     return TrialResult(
         strategy=strategy,
         filter=name,
@@ -223,7 +232,7 @@ def run_trial(
         mapped=mapped,
         causes=causes,
         wall_s=wall_s,
-        online=None if track.online is None else score_path(track.online, drive.truth.path),
+        online=None if track.online is None else score_path(track.online, truth.path),
     )
 
 
@@ -253,30 +262,6 @@ def _named(track: Track, used: Sequence[Scan], drive: Drive) -> Track:
     pairs = (zip(scan.callers.tolist(), drive.callers.tolist(), strict=False) for scan in used)
     own = {name: label for both in pairs for name, label in both}
     return replace(track, callers={own.get(name, name): of for name, of in track.callers.items()})
-
-
-def _scored(
-    track: Track,
-    drive: Drive,
-    used: Sequence[Scan],
-    limit: float,
-    causes: Causes | None,
-    association: Association | None,
-) -> tuple[Scores, Landmarks | None]:
-    """Score a track; after data association, also return the map with true labels."""
-    truth = drive.truth
-    if association is None:
-        return score(track, truth, used, limit), None
-    motion = map_motion(track, truth)
-    if causes is not None:
-        found = associated(track.labels, causes, [*drive.moving])
-    elif truth.landmarks is not None:
-        found = matched(track.landmarks, *truth.landmarks, motion)
-    else:
-        return score(track, truth, used, limit), None
-    mapped = renamed(track.landmarks, found)
-    scores = score(replace(track, landmarks=mapped), truth, used, limit)
-    return with_association(scores, track.landmarks, found, truth, motion), mapped
 
 
 def run_filter(

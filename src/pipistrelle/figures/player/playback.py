@@ -10,7 +10,6 @@ import base64
 import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields, is_dataclass, replace
-from importlib.resources import files
 from itertools import pairwise
 from typing import Any
 
@@ -39,7 +38,7 @@ from pipistrelle.figures.recorder import (
     pruned,
     resolved,
 )
-from pipistrelle.figures.style import STRATEGY_COLOURS, page_colours
+from pipistrelle.figures.style import STRATEGY_COLOURS, page_of
 from pipistrelle.files import spelt, upright
 
 MAX_FRAMES = 3000
@@ -313,26 +312,17 @@ def _revised(
 
 def page(playback: Playback) -> str:
     """Return an HTML page that plays a mission, with its scripts and numbers."""
-    from jinja2 import Environment, StrictUndefined
-
-    here = files("pipistrelle.figures.player")
-    environment = Environment(
-        autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True
-    )
-    template = environment.from_string((here / "page.html").read_text(encoding="utf-8"))
     numbers = json.dumps(_numbers(playback), allow_nan=False, separators=(",", ":"))
-    text = template.render(
+    return page_of(
+        "pipistrelle.figures.player",
+        SCRIPTS,
         title=playback.title,
         excess_paths=any(len(estimate.excess_paths.landmark) for estimate in playback.estimates),
         facts=playback.facts,
         version=__version__,
-        colours=Markup(page_colours()),
-        style=Markup((here / "page.css").read_text(encoding="utf-8")),
-        script=Markup("".join((here / name).read_text(encoding="utf-8") for name in SCRIPTS)),
         # No character may end the element of the page.
         numbers=Markup(numbers.replace("<", "\\u003c").replace("&", "\\u0026")),
     )
-    return upright(text)
 
 
 def _numbers(playback: Playback) -> dict[str, Any]:
