@@ -184,9 +184,8 @@ class PiecesFile:
 
 def not_written(path: Path, error: OSError) -> InputError:
     """Return the error for a file or folder that could not be written."""
-    return InputError(
-        f"{path}: could not be written ({error.strerror}); make room or name another folder"
-    )
+    fix = "make room or name another folder"
+    return InputError(f"{path}: could not be written ({error.strerror}); {fix}")
 
 
 def whole_name(partial: str) -> str | None:
@@ -332,10 +331,8 @@ def claim(
         finally:
             remove_empty(made)
     except OSError as error:
-        raise InputError(
-            f"{folder}: cannot be used as a folder for {kind.title} ({error.strerror}); name one "
-            f"that can be written with {another}"
-        ) from error
+        why = f"cannot be used as a folder for {kind.title} ({error.strerror})"
+        raise InputError(f"{folder}: {why}; name one that can be written with {another}") from error
     own = OwnFiles(folder, kind)
     if empty:
         return own
@@ -348,10 +345,8 @@ def claim(
             f"it is replaced; name a new folder with {another}"
         )
     if not overwrite:
-        raise InputError(
-            f"{folder}: is not empty; name a new folder with {another}, or add {allow} to replace "
-            f"the {word} there"
-        )
+        fix = f"name a new folder with {another}, or add {allow} to replace the {word} there"
+        raise InputError(f"{folder}: is not empty; {fix}")
     own.check()
     return own
 
@@ -382,10 +377,9 @@ def drawn_files(draw: Callable[[Path], object], under: str = "") -> dict[str, by
             drawn = sorted(Path(place).iterdir())
             return {f"{under}{path.name}": path.read_bytes() for path in drawn}
     except OSError as error:
-        raise InputError(
-            f"{gettempdir()}: pictures could not be drawn there ({error.strerror}); make room, or "
-            "set TMPDIR to a folder that has some"
-        ) from error
+        why = f"pictures could not be drawn there ({error.strerror})"
+        fix = "make room, or set TMPDIR to a folder that has some"
+        raise InputError(f"{gettempdir()}: {why}; {fix}") from error
 
 
 class OwnFiles:
@@ -426,18 +420,15 @@ class OwnFiles:
         if name not in self._sums:
             raise InputError(f"{path}: is not Pipistrelle's: {SUMS} does not name it")
         if sha256(data).hexdigest() not in self._sums[name]:
-            raise InputError(
-                f"{path}: was changed since Pipistrelle wrote it; run again what wrote it"
-            )
+            fix = "run again what wrote it"
+            raise InputError(f"{path}: was changed since Pipistrelle wrote it; {fix}")
         return data
 
     def check_kind(self) -> None:
         """Raise if the folder contains results of another kind."""
         if self.there not in (None, self.kind.title):
-            raise InputError(
-                f"{self.folder}: holds {self.there} of Pipistrelle, which {self.kind.title} does "
-                "not replace; name another folder"
-            )
+            why = f"holds {self.there} of Pipistrelle, which {self.kind.title} does not replace"
+            raise InputError(f"{self.folder}: {why}; name another folder")
 
     def check(self) -> None:
         """Raise if the folder contains changed or foreign files that output would replace."""
@@ -495,10 +486,8 @@ class OwnFiles:
                 elif _list_in(self._place) == self._list:
                     self.check()
                 else:
-                    raise InputError(
-                        f"{self.folder}: somebody else wrote into it meanwhile, so nothing there "
-                        "is replaced; name another folder"
-                    )
+                    why = "somebody else wrote into it meanwhile, so nothing there is replaced"
+                    raise InputError(f"{self.folder}: {why}; name another folder")
                 self._write_held(files, keep=keep)
         except OSError as error:
             raise not_written(self.folder, error) from error
@@ -574,9 +563,8 @@ class OwnFiles:
 
 def _in_the_way(path: Path, what: str) -> InputError:
     """Return the error that a file or folder may not be replaced by output."""
-    return InputError(
-        f"{path}: {what}, so it is not replaced; move it away, or name another folder"
-    )
+    fix = "move it away, or name another folder"
+    return InputError(f"{path}: {what}, so it is not replaced; {fix}")
 
 
 def _list_in(folder: Path) -> bytes | None:

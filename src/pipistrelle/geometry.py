@@ -49,9 +49,8 @@ def range_and_bearing(
     (array([2.]), array([0.]))
     """
     offset = points - pose[:2]
-    return np.hypot(offset[:, 0], offset[:, 1]), wrap(
-        np.arctan2(offset[:, 1], offset[:, 0]) - pose[2]
-    )
+    bearing = np.arctan2(offset[:, 1], offset[:, 0]) - pose[2]
+    return np.hypot(offset[:, 0], offset[:, 1]), wrap(bearing)
 
 
 def circular_mean(

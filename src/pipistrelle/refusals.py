@@ -90,12 +90,9 @@ def table_refusal(
         kinds = () if field is None else (field.annotation, *get_args(field.annotation))
         tables = [kind for kind in kinds if isinstance(kind, type) and issubclass(kind, BaseModel)]
     if fault["type"] == "missing" and isinstance(last, str):
-        names = [
-            f["loc"][-1] for f in faults if f["type"] == "missing" and f["loc"][:-1] == (*within,)
-        ]
-        named = ", ".join(
-            repr(key.removesuffix(last) + str(name)) for name in names if name in known
-        )
+        gone = [f["loc"] for f in faults if f["type"] == "missing"]
+        names = [name for *around, name in gone if around == within and name in known]
+        named = ", ".join(repr(key.removesuffix(last) + str(name)) for name in names)
         found, expected = f"no key{'s' * (', ' in named)} {named}", f"the keys {', '.join(known)}"
         return refusal(where, found, expected, f"add {named}")
     if fault["type"] == "extra_forbidden":

@@ -235,9 +235,8 @@ def test_ambiguous_bearings_are_reported_once_for_all_cases(obey):
     status, printed, said = obey("small.toml", *words)
     assert (status, printed) == (0, "one\n")
     lines = said.splitlines()
-    assert [line[:41] for line in lines] == ["pipistrelle: warning: receiver.spacing: 0.0"] * 2 or (
-        len(lines) == 2 and all("warning: receiver.spacing: 0.007 m is" in line for line in lines)
-    )
+    assert len(lines) == 2
+    assert all("warning: receiver.spacing: 0.007 m is" in line for line in lines)
 
 
 # Interrupts

@@ -174,9 +174,8 @@ def kind_of(folders: Sequence[Path]) -> Literal["missions", "studies"]:
     if any(studies):
         one, other = folders[studies.index(True)], folders[studies.index(False)]
         results_in(other)
-        raise InputError(
-            f"{one}: is a study's folder, and {other} is not; expected folders of one kind"
-        )
+        expected = "folders of one kind"
+        raise InputError(f"{one}: is a study's folder, and {other} is not; expected {expected}")
     return "missions"
 
 
@@ -218,9 +217,8 @@ def differing(settings: Sequence[Mapping[str, Any]]) -> dict[str, tuple[str | No
     for name in dict.fromkeys(name for one in settings for name in one):
         values = [one.get(name) for one in settings]
         if any(value != values[0] for value in values):
-            unlike[name] = tuple(
-                v if v is None or isinstance(v, str) else json.dumps(v) for v in values
-            )
+            texts = (v if isinstance(v, str | None) else json.dumps(v) for v in values)
+            unlike[name] = tuple(texts)
     return unlike
 
 
@@ -395,9 +393,8 @@ def compare_studies(folders: Sequence[Path], *, drop_diverged: bool = False) -> 
     notes.append(f"Worlds in which a case diverged {left}.")
     for who in dict.fromkeys(alone.values()):
         i = who[0]
-        labels = [
-            _label([keyed[i][key]], varied, widths[i]) for key, its in alone.items() if its == who
-        ]
+        cases = (keyed[i][key] for key, its in alone.items() if its == who)
+        labels = [_label([case], varied, widths[i]) for case in cases]
         some = "; ".join(labels[:4]) + f"; and {len(labels) - 4} more" * (len(labels) > 4)
         notes.append(f"Only in {_letters(who)}, not compared: {some}")
     return ComparedStudies(
@@ -421,9 +418,8 @@ def _read(folder: Path) -> tuple[Plan, "pl.DataFrame"]:
         trials = stored.trials.collect()
         trials.select("case", "iteration", "status", "diverged", "beamwidth_deg", POSITION)
     except (OSError, pl.exceptions.PolarsError) as error:
-        raise InputError(
-            f"{folder}: its trials have not the columns of this version; run the study anew"
-        ) from error
+        why = "its trials have not the columns of this version"
+        raise InputError(f"{folder}: {why}; run the study anew") from error
     return stored.plan, trials
 
 
@@ -602,9 +598,8 @@ def comparison_table(compared: ComparedMissions | ComparedStudies) -> "pl.DataFr
                 compared.folders.items(), estimate.estimates, values, strict=True
             )
         )
-    return pl.DataFrame(rows, infer_schema_length=None).with_columns(
-        pl.selectors.float().fill_nan(None)
-    )
+    known = pl.selectors.float().fill_nan(None)
+    return pl.DataFrame(rows, infer_schema_length=None).with_columns(known)
 
 
 def settings_table(compared: Compared) -> "pl.DataFrame":

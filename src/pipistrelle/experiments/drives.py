@@ -82,10 +82,8 @@ def split_at(drive: Drive, times: Sequence[float]) -> tuple[Drive, Int[np.ndarra
     share = (end - begin)[:, np.newaxis, np.newaxis]
     spread = share * turn @ covariance[step] @ turn.transpose(0, 2, 1)
     rows, columns = np.triu_indices(3)
-    path = drive.truth.path
-    callers = {
-        label: points_at(fine, time, places) for label, places in drive.truth.callers.items()
-    }
+    path, callers = drive.truth.path, drive.truth.callers
+    callers = {label: points_at(fine, time, places) for label, places in callers.items()}
     path = None if path is None else path_at(fine, time, path)
     truth = replace(drive.truth, time=fine, path=path, callers=callers)
     motion = Motion(model="poses", control_std=(0.0, 0.0, 0.0))

@@ -1,6 +1,6 @@
 """Figures of comparisons: paths of several runs in a map, differences of studies by case."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from textwrap import fill
 from typing import TYPE_CHECKING, Any
@@ -78,9 +78,8 @@ def _draw_missions(compared: ComparedMissions) -> "Figure":
         filters = dict.fromkeys(title_of(e.estimates[i][1]) for e in compared.estimates)
         name = f"{_named(letter, folder)} ({' and '.join(filters)})"
         entries.append((name, {"lw": 1.3} | _look(i)))
-    entries.append(
-        ("placed landmarks", {"lw": 0, "marker": "o", "ms": 3.2, "mfc": "none", "mec": INK})
-    )
+    circle = {"lw": 0, "marker": "o", "ms": 3.2, "mfc": "none", "mec": INK}
+    entries.append(("placed landmarks", circle))
     _draw_legend(figure, entries, 5)
     return figure
 
@@ -177,11 +176,8 @@ def _draw_studies(compared: ComparedStudies) -> "Figure":
     from matplotlib.ticker import MaxNLocator
 
     first, others = compared.rows[0], len(compared.folders) - 1
-    labels = [
-        row["case"]
-        for row in compared.rows
-        if (row["score"], row["letter"]) == (first["score"], first["letter"])
-    ]
+    same = ("score", "letter")
+    labels = [r["case"] for r in compared.rows if all(r[name] == first[name] for name in same)]
     there = {row["score"] for row in compared.rows}
     shown = {name: score for name, score in shown_in("studies").items() if name in there}
     rows = -(-len(shown) // ACROSS)
@@ -196,7 +192,12 @@ def _draw_studies(compared: ComparedStudies) -> "Figure":
         for k, row in enumerate(row for row in compared.rows if row["score"] == name):
             other = LETTERS.index(row["letter"])
             place = k // others + (other - 1 - 0.5 * (others - 1)) * 0.6 / others
-            _draw_difference(axes, row, place, RUNS[other % len(RUNS)])
+            colour = RUNS[other % len(RUNS)]
+            for low, high, width in (("low", "high", 0.9), ("alone_low", "alone_high", 2.6)):
+                if row[low] is not None and row[high] is not None:
+                    axes.hlines(place, row[low], row[high], color=colour, lw=width, zorder=2)
+            face = colour if row["p"] < SIGNIFICANCE else "white"
+            axes.plot(row["difference"], place, "o", ms=4.6, mfc=face, mec=colour, zorder=3)
         title = heading(score).replace(" [", "\u00a0[")  # no line begins with the unit
         axes.set_title(fill(title, TITLE), loc="left", weight="bold")
         axes.set_xlabel("other less A" if others > 1 else "B less A")
@@ -208,9 +209,9 @@ def _draw_studies(compared: ComparedStudies) -> "Figure":
     for text in (text for axes in grid[:, 0] for text in axes.get_yticklabels()):
         text.set_parse_math(False)
     names = [_named(*one) for one in compared.folders.items()]
-    entries: list[tuple[str, dict[str, Any]]] = [(names[0], {"lw": 0})]
-    entries += [
-        (name, {"color": RUNS[i % len(RUNS)], "lw": 2.6}) for i, name in enumerate(names) if i
+    entries: list[tuple[str, dict[str, Any]]] = [
+        (name, {"color": RUNS[i % len(RUNS)], "lw": 2.6} if i else {"lw": 0})
+        for i, name in enumerate(names)
     ]
     entries += [
         ("95 %, by itself", {"color": INK, "lw": 2.6}),
@@ -219,12 +220,3 @@ def _draw_studies(compared: ComparedStudies) -> "Figure":
     ]
     _draw_legend(figure, entries, 6)
     return figure
-
-
-def _draw_difference(axes: "Axes", row: Mapping[str, Any], place: float, colour: str) -> None:
-    """Draw a difference of a score as a point, with each of its two intervals if it is finite."""
-    for low, high, width in (("low", "high", 0.9), ("alone_low", "alone_high", 2.6)):
-        if row[low] is not None and row[high] is not None:
-            axes.hlines(place, row[low], row[high], color=colour, lw=width, zorder=2)
-    face = colour if row["p"] < SIGNIFICANCE else "white"
-    axes.plot(row["difference"], place, "o", ms=4.6, mfc=face, mec=colour, zorder=3)

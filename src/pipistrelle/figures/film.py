@@ -10,18 +10,19 @@ import shutil
 import subprocess
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from jaxtyping import Float, UInt8
 
 from pipistrelle.acoustics.paths import Caller, moves
 from pipistrelle.config import InputError
-from pipistrelle.estimation.beliefs import Landmarks, placed
+from pipistrelle.estimation.beliefs import placed
 from pipistrelle.experiments.drives import NO_TRUTH, Truth
 from pipistrelle.figures.maps import RAY, RIGHT, MapPanel, draw_maps, ellipses, shades
 from pipistrelle.figures.recorder import Snapshot, heard_from, pruned
 from pipistrelle.figures.style import INK, STRATEGY_COLOURS, STYLE
+from pipistrelle.refusals import refusal
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -84,18 +85,14 @@ def animate_mission(
     chosen = np.linspace(len(longest) - 1, 0, min(pictures, len(longest))).round().astype(int)
     times = np.array([longest[i].scan.time for i in chosen[::-1]])
     start = times[0] if truth.path is None else truth.time[0]
-    panels = [
-        FilmPanel(case, frames, beamwidth, truth, callers) for case, frames in snapshots.items()
-    ]
+    panels = [FilmPanel(*one, beamwidth, truth, callers) for one in snapshots.items()]
     with matplotlib.rc_context(STYLE):
         figure, _ = draw_maps(panels, truth, callers)
         try:
             write(_play(figure, panels, times, start), path)
         except OSError as error:
-            reason = error.strerror or error
-            raise InputError(
-                f"{path}: cannot be written ({reason}); choose another place"
-            ) from None
+            why = f"cannot be written ({error.strerror or error}); choose another place"
+            raise InputError(f"{path}: {why}") from None
 
 
 def _play(
@@ -166,9 +163,8 @@ class FilmPanel(MapPanel):
         self.pruned = self.add(PolyCollection([], fc="none", ec=INK, lw=0.8, ls=":", zorder=1.9))
         self.bearings = self.add(LineCollection([], colors=self.colour, **dashed))
         self.ranges = self.add(LineCollection([], colors=self.colour, lw=1.4, zorder=3.6))
-        self.crossing = self.add(
-            Line2D([], [], ls="", marker="o", ms=4.0, mfc=INK, mec="none", zorder=5.2)
-        )
+        dot: dict[str, Any] = {"marker": "o", "ms": 4.0, "mfc": INK, "mec": "none"}
+        self.crossing = self.add(Line2D([], [], ls="", zorder=5.2, **dot))
         self.rings = self.add(PolyCollection([], fc="none", lw=1.6, zorder=5.3))
         self.movers = self.add(Line2D([], [], ls="", zorder=5.4, **star))
 
@@ -190,10 +186,7 @@ class FilmPanel(MapPanel):
         tip = origin + reach[:, None] * np.column_stack([np.cos(angle), np.sin(angle)])
         self.ranges.set_segments([np.stack([origin, end]) for end in tip[ranged]])
         self.bearings.set_segments([np.stack([origin, end]) for end in tip[~ranged]])
-        self._show_changes(frame.landmarks, picture)
-
-    def _show_changes(self, rows: Landmarks, picture: int) -> None:
-        """Show hypotheses pruned since the last picture, and rings around new landmarks."""
+        rows = frame.landmarks
         full, gone = placed(rows), pruned(self.rows, rows)
         self.pruned.set(verts=ellipses(self.rows.mean[gone], self.rows.covariance[gone], RAY))
         labels = rows.landmark[full].tolist()
@@ -215,19 +208,14 @@ def film_writer(path: Path) -> Callable[[Pictures, Path], None]:
 
     Raises InputError for another ending, or for an MP4 without ffmpeg.
     """
-    ending = path.suffix.lower()
+    ending, gif = path.suffix.lower(), path.with_suffix(".gif").name
     if ending == ".gif":
         return write_gif
     if ending != ".mp4":
-        raise InputError(
-            f"{path}: found the ending {ending!r}, expected .gif or .mp4; "
-            f"choose {path.with_suffix('.gif').name}"
-        )
+        raise refusal(path, f"the ending {ending!r}", ".gif or .mp4", f"choose {gif}")
     if shutil.which("ffmpeg") is None:
-        raise InputError(
-            f"{path}: found no ffmpeg on the PATH, which .mp4 needs; "
-            f"install ffmpeg or choose {path.with_suffix('.gif').name}"
-        )
+        missing = "found no ffmpeg on the PATH, which .mp4 needs"
+        raise InputError(f"{path}: {missing}; install ffmpeg or choose {gif}")
     return write_mp4
 
 
@@ -261,11 +249,9 @@ def write_mp4(pictures: Pictures, path: Path) -> None:
                 ffmpeg.stdin.write(picture.tobytes())
         reason = ffmpeg.communicate()[1].decode(errors="replace").strip().splitlines()[:1]
     if ffmpeg.returncode:
-        raise InputError(
-            f"{path}: ffmpeg ended with status {ffmpeg.returncode} "
-            f"({reason[0] if reason else 'no reason given'}); "
-            f"mend that or choose {path.with_suffix('.gif').name}"
-        )
+        ended = f"status {ffmpeg.returncode} ({[*reason, 'no reason given'][0]})"
+        fix = f"mend that or choose {path.with_suffix('.gif').name}"
+        raise InputError(f"{path}: ffmpeg ended with {ended}; {fix}")
 
 
 def _palette() -> "Image":

@@ -295,9 +295,8 @@ class MapPanel:
         self.excess_paths = add(PolyCollection([], fc="none", ec=INK, **thin))
         self.ways = add(LineCollection([], colors=INK, **thin))
         self.full = add(PolyCollection([], zorder=4.0, **filled))
-        self.dots = add(
-            Line2D([], [], ls="", marker="o", ms=2.6, mfc=colour, mec="none", zorder=5.0)
-        )
+        dot: dict[str, Any] = {"marker": "o", "ms": 2.6, "mfc": colour, "mec": "none"}
+        self.dots = add(Line2D([], [], ls="", zorder=5.0, **dot))
         self.trails = add(Line2D([], [], color=colour, lw=1.2, ls=":", zorder=5.5))
         self.callers = add(Line2D([], [], ls="", zorder=5.5, **star))
         self.estimated = add(Line2D([], [], color=colour, lw=1.2, zorder=6.0))

@@ -144,13 +144,8 @@ def _ties(trial: TrialResult, true_landmarks: LabelledPoints | None) -> list[np.
         return []
     true = dict(zip(true_landmarks[0].tolist(), true_landmarks[1], strict=True))
     estimate = heaviest(trial.mapped or trial.track.landmarks)
-    return [
-        np.stack([mean, true[label]])
-        for label, mean, full in zip(
-            estimate.landmark.tolist(), estimate.mean, estimate.full, strict=True
-        )
-        if full and label in true
-    ]
+    full = zip(estimate.landmark[estimate.full].tolist(), estimate.mean[estimate.full], strict=True)
+    return [np.stack([mean, true[label]]) for label, mean in full if label in true]
 
 
 def outcome(trial: TrialResult, truth: Truth) -> str:

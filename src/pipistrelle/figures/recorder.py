@@ -168,10 +168,8 @@ def _squarest(
     spot = likeliest(frame, label)
     normal = unit(unit(spot - callers[frame.scan.caller[rows]]) + unit(spot - frame.pose[:2]))
     pairs = combinations(zip(rows, *normal.T.tolist(), strict=True), 2)
-    (one, *_), (other, *_) = max(
-        pairs, key=lambda pair: abs(pair[0][1] * pair[1][2] - pair[0][2] * pair[1][1])
-    )
-    return [one, other]
+    square = max(pairs, key=lambda pair: abs(pair[0][1] * pair[1][2] - pair[0][2] * pair[1][1]))
+    return [row for row, *_ in square]
 
 
 def likeliest(frame: Snapshot, label: int) -> Float[np.ndarray, "2"]:

@@ -113,9 +113,8 @@ def page_of(
     def read(name: str) -> str:
         return (files(room) / name).read_text(encoding="utf-8")
 
-    environment = Environment(
-        autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True
-    )
+    trimmed = {"trim_blocks": True, "lstrip_blocks": True}
+    environment = Environment(autoescape=True, undefined=StrictUndefined, **trimmed)
     environment.filters |= functions
     text = environment.from_string(read("page.html")).render(
         style=Markup(read("page.css")),

@@ -97,17 +97,16 @@ def facets_of(study: Study, variable: Variable | None, axis: Axis) -> tuple[list
     distinct combination, the first strongest. And whether the lines are combinations.
     """
     titles, trials = filter_titles(study), study.trials
+
+    def plain(way: Way, x: np.ndarray, cells: np.ndarray, among: Sequence[str]) -> Line:
+        aside = beside(axis, x, way[1], among)
+        return Line(way=way, name=way[1], x=x, aside=aside, cells=cells)
+
     if variable is None:
-        at = np.arange(len(titles), dtype=np.float64)
+        at, first = np.arange(len(titles), dtype=np.float64), np.zeros(1, dtype=int)
         among = [one for one in STRATEGIES if any(one == way for _, way in trials)]
         lines = [
-            Line(
-                way=(name, strategy),
-                name=strategy,
-                x=at[[i]],
-                aside=beside(axis, at[[i]], strategy, among),
-                cells=np.zeros(1, dtype=int),
-            )
+            plain((name, strategy), at[[i]], first, among)
             for strategy in STRATEGIES
             for i, name in enumerate(titles)
             if (name, strategy) in trials
@@ -131,16 +130,7 @@ def facets_of(study: Study, variable: Variable | None, axis: Axis) -> tuple[list
             ]
             facets.append((f"{title}, {strategy}", lines))
         for j in () if many else range(count):
-            lines = [
-                Line(
-                    way=(name, strategy),
-                    name=strategy,
-                    x=x,
-                    aside=beside(axis, x, strategy, among),
-                    cells=rows[:, j],
-                )
-                for strategy in among
-            ]
+            lines = [plain((name, strategy), x, rows[:, j], among) for strategy in among]
             parts = [title, names[j]] if len(titles) > 1 or count == 1 else [names[j]]
             facets.append((", ".join(filter(None, parts)), lines))
     return facets, many
@@ -426,8 +416,8 @@ def effect_charts(selection: Selection) -> list[Chart]:
     for (factor, whose), family in families.items():
         variable = next((v for v in study.variables if v.name == factor), None)
         first = family[0].pairing.before
-        words = (first, *dict.fromkeys(effect.pairing.after for effect in family))
-        words = variable.words if variable else words
+        afters = dict.fromkeys(effect.pairing.after for effect in family)
+        words = variable.words if variable else (first, *afters)
         axis = axis_of(variable) if variable else axis_of_words(words)
         at = dict(zip(words, places(variable) if variable else range(len(words)), strict=True))
         title = titles.get(whose, f"{whose} sensing")

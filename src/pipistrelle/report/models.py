@@ -63,9 +63,8 @@ def example_map(study: Study, world: Scenario) -> Chart:
     places = np.array([[part(s.x), part(s.y)] for s in series for part in (np.min, np.max)])
     low, high = places.min(axis=0), places.max(axis=0)
     middle, reach = (low + high) / 2.0, 0.52 * np.max(high - low)  # axes of equal length
-    x, y = (
-        Axis(label="", limits=(float(at - reach), float(at + reach)), ticks=()) for at in middle
-    )
+    limits = [(float(at - reach), float(at + reach)) for at in middle]
+    x, y = (Axis(label="", limits=ends, ticks=()) for ends in limits)
     count, others = len(world.landmarks), [caller.name for caller in world.callers[VEHICLE + 1 :]]
     shown = listed([f"{count} landmarks", *(f"the {name}" for name in others)])
     where = f" where {combination_name(study, 0)}" if study.drawing.any() else ""

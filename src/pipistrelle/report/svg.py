@@ -38,9 +38,8 @@ def panel_svg(panel: Panel) -> Markup:
     _, _, top, bottom = _box(panel)
     svg = Element("svg", {"class": "panel", "role": "img", "tabindex": "0"})
     svg.set("viewBox", f"0 0 {WIDTH:g} {bottom if panel.equal else HEIGHT:g}")
-    svg.set(
-        "aria-label", f"{panel.title or panel.y.label or 'chart'}. Arrow keys read the numbers."
-    )
+    title = panel.title or panel.y.label or "chart"
+    svg.set("aria-label", f"{title}. Arrow keys read the numbers.")
     if not panel.equal:
         _draw_grid(svg, panel)
     for series in panel.series:  # every band under every line
@@ -192,9 +191,8 @@ def _draw_series(svg: Element, series: Series, panel: Panel) -> None:
         _draw_spread(svg, series, panel)
     if mark.joined:
         gaps = np.diff(known, prepend=-2) > 1  # where a number is not finite
-        line = (
-            f"{'LM'[int(gap)]}{x[i]:.1f} {y[i]:.1f}" for gap, i in zip(gaps, known, strict=True)
-        )
+        points = zip(gaps, known, strict=True)
+        line = (f"{'LM'[int(gap)]}{x[i]:.1f} {y[i]:.1f}" for gap, i in points)
         _stroke(svg, "line" + " dashed" * series.dashed, series, "".join(line))
     for i in known if mark.symbol else ():
         filled = series.filled is None or bool(series.filled[i])
@@ -259,9 +257,8 @@ def _number(series: Series, i: int) -> str:
     below, above = value - series.low[i], series.high[i] - value
     if abs(below - above) <= 1e-9 * max(abs(below), abs(above), 1e-300):
         return f"{three_digits(value)} ± {three_digits(above)}"
-    return (
-        f"{three_digits(value)} ({three_digits(series.low[i])} to {three_digits(series.high[i])})"
-    )
+    ends = f"{three_digits(series.low[i])} to {three_digits(series.high[i])}"
+    return f"{three_digits(value)} ({ends})"
 
 
 def legend(panels: Sequence[Panel]) -> list[tuple[str, str, str, float]]:

@@ -173,9 +173,8 @@ def axis_of(variable: Variable) -> Axis:
     if variable.name == BEAM:
         degrees = (word.removesuffix("°") for word in variable.words)
         ticks = tuple(zip(at, degrees, strict=True))
-        return Axis(
-            label=variable.label, limits=(0.9 * at[0], 1.12 * at[-1]), log=True, ticks=ticks
-        )
+        limits = (0.9 * at[0], 1.12 * at[-1])
+        return Axis(label=variable.label, limits=limits, log=True, ticks=ticks)
     named = tuple(zip(at, variable.words, strict=True))
     if variable.numbers is None:
         return replace(axis_of_words(variable.words), label=variable.label)

@@ -206,10 +206,8 @@ class Door:
         if particles is not None and not any("fastslam" in entry(n).sections for n in names):
             able = [known.name for known in CATALOGUE.values() if "fastslam" in known.sections]
             others = " or ".join(self.option("filters", name) for name in (*able, *GROUPS))
-            raise InputError(
-                f"{self.option('particles')}: found {particles}, but {self.option('filters')} is "
-                f"{','.join(names)}, which has none; add {others}"
-            )
+            but = f"but {self.option('filters')} is {','.join(names)}, which has none"
+            raise InputError(f"{self.option('particles')}: found {particles}, {but}; add {others}")
         return names
 
 
@@ -284,10 +282,8 @@ def frames_named(given: Given, count: int) -> range:
         begin, end = (int(p[:18]) if p else None for p in parts)
         if frames := range(count)[begin:end]:
             return frames
-    raise InputError(
-        f"{given.where}: found {shown(given.value)}, expected A:B, from A to before B of {count} "
-        "frames that are counted from 0"
-    )
+    expected = f"A:B, from A to before B of {count} frames that are counted from 0"
+    raise InputError(f"{given.where}: found {shown(given.value)}, expected {expected}")
 
 
 def named_strategies(chosen: str | Sequence[str]) -> tuple[Strategy, ...]:
@@ -346,10 +342,9 @@ def _name_of(kind: str | type, where: str) -> str:
         raise InputError(f"{where}: found {shown(kind)}, {_EXPECTED}")
     module, name = kind.__module__, kind.__qualname__
     if getattr(sys.modules.get(module), name, None) is not kind:
-        raise InputError(
-            f"{where}: found the class {name}, which its module, {module}, does not have by this "
-            "name; expected one that others find, as module:Class: define it outside of functions"
-        )
+        found = f"the class {name}, which its module, {module}, does not have by this name"
+        expected = "one that others find, as module:Class: define it outside of functions"
+        raise InputError(f"{where}: found {found}; expected {expected}")
     return f"{module}:{name}"
 
 
@@ -388,9 +383,8 @@ def with_log(layer: Layer, recorded: "Log", log: Path) -> tuple[Config, list[str
     moves = any(caller.moves for caller in recorded.callers)
     own[TIMING] = Given(moves or has_excess_paths(recorded), str(log))
     if recorded.excess_path_std is not None:
-        own["filter", "excess_path_std"] = Given(
-            recorded.excess_path_std, f"{log}: excess_path_std"
-        )
+        where = f"{log}: excess_path_std"
+        own["filter", "excess_path_std"] = Given(recorded.excess_path_std, where)
     if ("rays", "likelihood") in layer:  # it is a reading of the paper's rays
         del own["rays", "spacing"]
     wished, settled, notes = resolve(layer), resolve(laid(own, layer, decided)), []

@@ -213,9 +213,8 @@ class Slam:
     @staticmethod
     def _map_table(landmarks: Landmarks) -> "pl.DataFrame":
         """Convert landmarks to the table of a map without true positions."""
-        return landmark_table(landmarks, None).drop(
-            "true_x_m", "true_y_m", "error_m", "true_landmark"
-        )
+        of_truth = ("true_x_m", "true_y_m", "error_m", "true_landmark")
+        return landmark_table(landmarks, None).drop(of_truth)
 
     @property
     def path(self) -> "pl.DataFrame":

@@ -194,9 +194,8 @@ def _rejected(trial: "TrialResult", recorded: "Log", config: Config) -> list[Que
             f"{expected:.1%}: they are less sure than they say, or something was placed wrong "
             "before"
         )
-        return [
-            (found, 'larger standard deviations help, or a gate of 1 with filter.robust = "huber"')
-        ]
+        fix = 'larger standard deviations help, or a gate of 1 with filter.robust = "huber"'
+        return [(found, fix)]
     found, _, advice = nis_warning(trial).partition("; ")
     return [(found, advice)] if found else []
 

@@ -117,9 +117,8 @@ def prepare_slam(
     check_own(layer)
     bag, width = resolve(layer).bag, door.given("beamwidth")
     if width.value is not None and not 0 < number(width) <= 360:
-        raise InputError(
-            f"{width.where}: found {width.value:g}, expected above 0 and up to 360 [deg]"
-        )
+        expected = "above 0 and up to 360 [deg]"
+        raise InputError(f"{width.where}: found {width.value:g}, expected {expected}")
     of_bags, reader = [it for key, it in given.items() if key[0] == "bag"], reader_of(place)
     if of_bags and reader.recognises(place) and not reader.configured:
         raise InputError(f"{of_bags[0].where}: means nothing to {reader.title}; leave it out")
@@ -256,9 +255,8 @@ class Recordings:
         if own is None:
             if frames.value is not None:
                 sound = door.option("save_sound")
-                raise InputError(
-                    f"{frames.where}: found {frames.value}, which is of {sound}; add it"
-                )
+                why = f"found {frames.value}, which is of {sound}"
+                raise InputError(f"{frames.where}: {why}; add it")
             return
         count = config.scenario.steps // config.scenario.steps_per_frame
         chosen = frames_named(frames, count)

@@ -198,9 +198,8 @@ class Results:
             import pyarrow  # noqa: F401
             import xarray  # noqa: F401
         except ImportError as missing:
-            raise InputError(
-                f"to_xarray: found no {missing.name}; python -m pip install pandas pyarrow xarray"
-            ) from None
+            fix = "python -m pip install pandas pyarrow xarray"
+            raise InputError(f"to_xarray: found no {missing.name}; {fix}") from None
         return self.tracks.to_pandas().set_index(["strategy", "filter", "time_s"]).to_xarray()
 
     def _scores_shown(self) -> "pl.DataFrame":

@@ -34,9 +34,8 @@ def report(
 
     target = folder / "report" if output is None else output
     study = read_study(folder)
-    summary = write_report(
-        study, target, progress=lambda name: None if quiet else say(f"Drawing {name} ...")
-    )
+    progress = (lambda _: None) if quiet else lambda name: say(f"Drawing {name} ...")
+    summary = write_report(study, target, progress=progress)
     if not quiet:
         if summary["partial"]:
             put(f"partial: {summary['worlds_done']} of {summary['worlds_planned']} worlds")
@@ -120,9 +119,7 @@ def compare(
         flag = "--overwrite" if overwrite else "--quiet"
         raise InputError(f"{flag}: nothing is kept without -o DIR; add it, or leave the flag out")
     compared: ComparedMissions | ComparedStudies
-    names = {
-        letter: spelt(folder) for letter, folder in zip(comparing.LETTERS, folders, strict=False)
-    }
+    names = dict(zip(comparing.LETTERS, map(spelt, folders), strict=False))
     if comparing.kind_of(folders) == "studies":
         compared = comparing.compare_studies(folders, drop_diverged=drop_diverged)
         from pipistrelle.report.effects import headline

@@ -102,9 +102,8 @@ class _File:
         data = self._file.read(size)
         self._left -= len(data)
         if self._left < 0.0:
-            raise ValueError(
-                f"a compressed file that takes more than {ROOM:.0%} of the room in {gettempdir()}"
-            )
+            room = f"{ROOM:.0%} of the room in {gettempdir()}"
+            raise ValueError(f"a compressed file that takes more than {room}")
         return data
 
 
@@ -273,9 +272,8 @@ def need_rosbags(where: str) -> None:
         import rosbags.rosbag1
         import rosbags.rosbag2  # noqa: F401
     except ImportError:
-        raise InputError(
-            f"{where}: needs rosbags, which is not installed; python -m pip install rosbags"
-        ) from None
+        fix = "python -m pip install rosbags"
+        raise InputError(f"{where}: needs rosbags, which is not installed; {fix}") from None
 
 
 def _storage(path: Path) -> Path:

@@ -95,9 +95,8 @@ def jumps(motions: Float[np.ndarray, "k _"], dt: Float[np.ndarray, " k"]) -> Int
     angular rate, exceeds ten times the 90th percentile of the moving steps.
     """
     found = np.zeros(len(dt), dtype=bool)
-    for size, least in zip(
-        (np.hypot(*motions.T[:2]), np.abs(motions[:, 2])), _MIN_JUMP, strict=True
-    ):
+    sizes = np.hypot(*motions.T[:2]), np.abs(motions[:, 2])
+    for size, least in zip(sizes, _MIN_JUMP, strict=True):
         speed = size / dt
         usual = np.percentile(speed[size > 0.0], 90.0) if np.any(size > 0.0) else 0.0
         found |= (size >= least) & (speed > _JUMP_RATIO * usual)

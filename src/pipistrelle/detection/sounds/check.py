@@ -13,7 +13,6 @@ from collections.abc import Iterator
 from dataclasses import dataclass, field
 from itertools import combinations, permutations
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Complex, Float, Int
@@ -45,13 +44,9 @@ DISAGREE = 0.15
 """Least median difference between the bearings of two faces that is reported [rad]."""
 
 
-class _Echo(NamedTuple):
-    """Matched-filter outputs of a loud echo at a group of microphones, at the echo's middle."""
-
-    frequency: Float[np.ndarray, " k"]
-    """Frequency of a tone, or frequencies of the parts of a band [Hz]."""
-    output: Complex[np.ndarray, "k e"]
-    """The matched filters' outputs, by frequency."""
+_Echo = tuple[Float[np.ndarray, " k"], Complex[np.ndarray, "k e"]]
+"""A loud echo at a group of microphones: the frequency of its tone, or those of the parts of its
+band [Hz], and the matched filters' outputs at each, at the echo's middle."""
 
 
 def array_faults(hearing: Hearing) -> Iterator[str]:
@@ -97,7 +92,7 @@ def _echo(frame: Frame, hearing: Hearing, d: int) -> _Echo | None:
     if wide is None:
         if not 0 <= round(at) < len(outputs):
             return None
-        return _Echo(hearing.sums.blocks.tones[[caller]], outputs[[round(at)]])
+        return hearing.sums.blocks.tones[[caller]], outputs[[round(at)]]
     c, far = wide.beams.speed_of_sound, np.linalg.norm(wide.beams.position, axis=1).max()
     toward = np.array([np.cos(found.bearing[d]), np.sin(found.bearing[d])])
     at -= wide.middle @ toward / c / frame.interval
@@ -110,7 +105,7 @@ def _echo(frame: Frame, hearing: Hearing, d: int) -> _Echo | None:
     bins = np.arange(math.ceil(limits[0]), math.floor(limits[1]) + 1)
     spectrum = np.fft.fft(outputs[first : first + 2 * reach], axis=0)[bins]
     turn = np.exp(2j * np.pi * bins / length * (at - first) * frame.interval)
-    return _Echo(carrier + bins / length, spectrum * turn[:, np.newaxis])
+    return carrier + bins / length, spectrum * turn[:, np.newaxis]
 
 
 def _pairs(frame: Frame, hearing: Hearing) -> list[tuple[int, float, int, float]]:
@@ -130,7 +125,7 @@ def _order(hearing: Hearing, g: int, echoes: list[_Echo]) -> Iterator[str]:
     """Yield a report if swapping two channels of a group, or inverting a channel, fits better."""
     lead, gain = _directions(hearing, g)
     if np.ptp(lead, axis=1).max() > WIDEST * hearing.about.call.duration:  # keep wideband only
-        echoes = [echo for echo in echoes if echo.frequency.size > 1]
+        echoes = [echo for echo in echoes if echo[0].size > 1]
     if not echoes:
         return
     row, members = hearing.array.layout.members(g)
@@ -154,10 +149,10 @@ def _shares(
     echo: _Echo, lead: Float[np.ndarray, "b e"], gain: Float[np.ndarray, " e"]
 ) -> tuple[float, Float[np.ndarray, "e e"]]:
     """Return an echo's energy share in the best beam, now and after channel swaps or inversions."""
-    now, changed = 0.0, np.zeros((gain.size, gain.size))
+    (frequency, output), now, changed = echo, 0.0, np.zeros((gain.size, gain.size))
     for some in np.array_split(lead, math.ceil(lead.size * gain.size / AT_ONCE)):
         # for each direction, position and channel: the term that would be added to a beam
-        heard = np.exp(-2j * np.pi * some[..., np.newaxis] * echo.frequency) @ echo.output
+        heard = np.exp(-2j * np.pi * some[..., np.newaxis] * frequency) @ output
         energy, added = np.abs(heard) ** 2, gain[:, np.newaxis] * heard
         own, own_energy = (np.einsum("bii->bi", each) for each in (added, energy))
         total, whole = own.sum(axis=1), own_energy.sum(axis=1)
@@ -252,9 +247,8 @@ class Overview:
         if len(self.time) == SHOWN_CALLS:
             return
         lags, faces, tones, elements = frame.matched.shape
-        energy = (
-            energy_of(frame.matched.reshape(-1).view(frame.matched.real.dtype), elements) / elements
-        )
+        parts = frame.matched.reshape(-1).view(frame.matched.real.dtype)
+        energy = energy_of(parts, elements) / elements
         loudest = energy.reshape(lags, faces, tones).max(axis=1, initial=0.0)
         edges = np.unique(np.linspace(0, lags, BINS + 1).astype(np.int64))[:-1]
         if edges.size:
@@ -366,11 +360,8 @@ def _call_rate(
         for k in gaps:
             some = sound.read(int(calls.sample[k]), min(own.size, int(calls.length[k])))
             some = some - some.mean(axis=0)
-            answers = np.fft.ifft(
-                np.fft.fft(some, 2 * own.size, axis=0)
-                * np.fft.fft(own, 2 * own.size).conj()[:, np.newaxis],
-                axis=0,
-            )
+            against = np.fft.fft(own, 2 * own.size).conj()[:, np.newaxis]
+            answers = np.fft.ifft(np.fft.fft(some, 2 * own.size, axis=0) * against, axis=0)
             answer += float((np.abs(answers) ** 2).max(axis=0).sum())
             energy += 0.5 * float((some**2).sum() * np.sum(np.abs(own) ** 2))
         share[rate] = answer / energy if energy > 0.0 else 0.0  # silence

@@ -170,10 +170,8 @@ def _placeless(
         call |= {"call": TONE, "frequency": None}
     call |= one.model_dump(exclude_none=True, include=fields)
     if call["call"] != SWEEP and call["frequency"] is None:
-        raise InputError(
-            f"{key}.frequency: found none, expected a tone of its own; give one, for only the "
-            "first may have the beacon's"
-        )
+        fix = "give one, for only the first may have the beacon's"
+        raise refusal(f"{key}.frequency", "none", "a tone of its own", fix)
     sent = CallConfig.model_validate({key: v for key, v in call.items() if v is not None})
     usual = config.emitter if one.way == "mission" else config.beacon
     return Caller(
@@ -318,10 +316,8 @@ def _times(
     period = setup.steps_per_frame * setup.step if one.period is None else one.period
     jitter = 0.0 if one.jitter is None else one.jitter
     if jitter > 0.1 * period:
-        raise InputError(
-            f"{key}.jitter: found {jitter:g} s, expected at most a tenth of the period of "
-            f"{period:g} s; make it smaller"
-        )
+        most = f"at most a tenth of the period of {period:g} s"
+        raise refusal(f"{key}.jitter", f"{jitter:g} s", most, "make it smaller")
     times = np.arange(0.0 if one.offset is None else one.offset, around.time[-1], period)
     return np.unique((times + jitter * rng.standard_normal(len(times))).clip(0.0))
 
@@ -329,17 +325,13 @@ def _times(
 def _check_apart(callers: Sequence[Caller], around: Surroundings, where: str) -> None:
     """Raise if the last caller is exactly at the vehicle or another caller at a vehicle's call."""
     *others, last = callers
-    calls = slice(
-        around.config.scenario.steps_per_frame, None, around.config.scenario.steps_per_frame
-    )
+    step, shape = around.config.scenario.steps_per_frame, around.path.shape
+    here = np.broadcast_to(np.asarray(last.place), shape)
     for name, place in [("vehicle", around.path), *((one.name, one.place) for one in others)]:
-        offset = np.broadcast_to(np.asarray(last.place) - np.asarray(place), around.path.shape)[
-            calls
-        ]
-        met = np.flatnonzero(~offset.any(axis=1))
+        met = np.flatnonzero(~(here - np.asarray(place))[step::step].any(axis=1))
         if met.size:
-            k = calls.start * (1 + int(met[0]))
-            x, y = np.broadcast_to(np.asarray(last.place), around.path.shape)[k].tolist()
+            k = step * (1 + int(met[0]))
+            x, y = here[k].tolist()
             raise InputError(
                 f"{where}: at {around.time[k]:.15g} s {last.name} is where {name} is, x {x:g} m, "
                 f"y {y:g} m; expected callers apart from each other and from the vehicle; move one"
@@ -352,10 +344,8 @@ def _check_speed(key: str, one: CallerConfig, config: Config) -> None:
     for name, most in (("speed", c), ("speed_std", c / 5.0)):
         speed = getattr(one, name)
         if speed is not None and not abs(speed) < most:
-            raise InputError(
-                f"{key}.{name}: found {speed:g} m/s, expected less than {most:.3g} m/s, for sound "
-                "is to be faster; slow it down"
-            )
+            expected = f"less than {most:.3g} m/s, for sound is to be faster"
+            raise refusal(f"{key}.{name}", f"{speed:g} m/s", expected, "slow it down")
 
 
 def _away_from_vehicle(

@@ -81,9 +81,8 @@ def _scattered(
 def _rows(setup: ScenarioConfig, rng: np.random.Generator) -> Iterator[tuple[float, float]]:
     """Yield tree positions in rows along x, halfway between the lanes of a lawn-mower course."""
     if setup.spacing == 0.0:
-        raise InputError(
-            "scenario.spacing: found 0, expected the distance of two trees of a row [m]"
-        )
+        expected = "the distance of two trees of a row [m]"
+        raise InputError(f"scenario.spacing: found 0, expected {expected}")
     first = math.ceil((setup.radius - setup.extent) / setup.lane)
     across = np.arange(-setup.extent - (first - 0.5) * setup.lane, setup.radius, setup.lane)
     along = np.arange(-setup.radius, setup.radius, setup.spacing) + rng.uniform() * setup.spacing
@@ -117,10 +116,8 @@ def _is_clear(
 def _refuse_crowd(setup: ScenarioConfig) -> None:
     """Raise if the disc of the settings has no room for the requested number of landmarks."""
     if setup.field == "disc" and setup.inner_radius >= setup.radius:
-        raise InputError(
-            f"scenario.inner_radius: found {setup.inner_radius:g} m, expected less than "
-            f"scenario.radius, {setup.radius:g} m"
-        )
+        found, most = f"{setup.inner_radius:g} m", f"scenario.radius, {setup.radius:g} m"
+        raise InputError(f"scenario.inner_radius: found {found}, expected less than {most}")
     half = 0.5 * setup.spacing
     most = math.pi / math.sqrt(12.0)  # the largest share of the plane that equal discs can cover
     most *= ((setup.radius + half) / max(half, 1e-100)) ** 2

@@ -165,15 +165,10 @@ def _emissions(
         poses, took = scenario.path[now], scenario.time[now] - scenario.time[now - 1]
         velocities = (poses[:, :2] - scenario.path[now - 1, :2]) / took[:, np.newaxis]
         callers = callers_at(scenario.callers, scenario.time, now)
-        emission, count = arrivals_of_emissions(
-            poses, velocities, scenario.landmarks, callers, config, scenario.bodies, medium
-        )
-        aimed = [
-            through_pistons(
-                emission, callers, beam, radius=radius, speed_of_sound=medium.speed_of_sound
-            )
-            for radius in radii
-        ]
+        there = scenario.landmarks, callers, config, scenario.bodies, medium
+        emission, count = arrivals_of_emissions(poses, velocities, *there)
+        through = partial(through_pistons, emission, callers, beam)
+        aimed = [through(radius=r, speed_of_sound=medium.speed_of_sound) for r in radii]
         end = np.cumsum(count)
         for rows in map(slice, end - count, end):
             yield [arrivals_at(arrivals, rows) for arrivals in aimed]
@@ -323,9 +318,8 @@ class _Rig:
         self.faintest_db = _faintest_db(self.front_end, layout, settled, config)
         self.callers = caller_labels(scenario)
         self.own_clock = np.array([caller.calls is not None for caller in scenario.callers])
-        self.missable: Bool[np.ndarray, " c"] = self.own_clock | [
-            caller.heading is not None for caller in scenario.callers
-        ]
+        aimed = [caller.heading is not None for caller in scenario.callers]
+        self.missable: Bool[np.ndarray, " c"] = self.own_clock | aimed
         self.workspace = Workspace()
         if settled.banded:
             self.filters = BandFilters(settled.calls, settled.rate)
@@ -428,9 +422,8 @@ class _Rig:
             outputs = filters.outputs(envelopes, lags, settled.noise_std, noise)
             shape = len(outputs), *self.layout.shape, lags
             matched = outputs.reshape(shape).transpose(3, 1, 0, 2)
-            yield _Record(
-                matched, start, interval, filters.pulse, sums=(lags, cut, envelopes, noise), cut=cut
-            )
+            sums = lags, cut, envelopes, noise
+            yield _Record(matched, start, interval, filters.pulse, sums=sums, cut=cut)
 
 
 def _faintest_db(

@@ -109,9 +109,8 @@ def draw_scenario(config: Config, rng: np.random.Generator, world: World = ALL_D
         landmarks = landmarks_in(setup, path[:, :2], clear, rng)
     vehicle, *others = callers_of(config, beacon)
     if settings is not None:
-        around = Surroundings(
-            config=config, time=time, path=path[:, :2], landmarks=landmarks, course=course
-        )
+        there = {"path": path[:, :2], "landmarks": landmarks, "course": course}
+        around = Surroundings(config=config, time=time, **there)
         others = callers_among(around, settings, rng, None if given else first)
     drawn = Scenario(
         time=time,
@@ -191,13 +190,11 @@ def _place_beacon(
 ) -> Float[np.ndarray, "2"]:
     """Draw a random position of the beacon, clear of the path and of bodies with a radius."""
     beacon = place_at(setup.beacon_distance, setup, rng, clear_of)
-    if beacon is not None:
-        return beacon
-    raise InputError(
-        f"scenario.beacon_distance: found {setup.beacon_distance:g} m, but no bearing there is "
-        f"{setup.clearance:g} m clear of the path and of bodies; expected another distance, or a "
-        "smaller scenario.clearance"
-    )
+    if beacon is None:
+        found = f"found {setup.beacon_distance:g} m, but no bearing there is {setup.clearance:g} m "
+        fix = "expected another distance, or a smaller scenario.clearance"
+        raise InputError(f"scenario.beacon_distance: {found}clear of the path and of bodies; {fix}")
+    return beacon
 
 
 def calls_heard(
@@ -229,24 +226,16 @@ def with_times(scenario: Scenario, times: Sequence[float]) -> Scenario:
     """Return a world with its paths interpolated at additional times; controls are unchanged."""
     time = np.union1d(scenario.time, np.array(times))
     path = path_at(time, scenario.time, scenario.path)
-    callers = tuple(
-        _with_times(caller, time, scenario.time) if moves(caller) else caller
-        for caller in scenario.callers[VEHICLE + 1 :]
-    )
-    return replace(scenario, time=time, path=path, callers=(scenario.callers[VEHICLE], *callers))
-
-
-def _with_times(
-    caller: Caller, time: Float[np.ndarray, " t"], clock: Float[np.ndarray, " n"]
-) -> Caller:
-    """Return a caller with path, velocity and heading interpolated at other times."""
-    heading, velocity = caller.heading, caller.velocity
-    return replace(
-        caller,
-        place=_places_at(time, clock, np.asarray(caller.place)),
-        velocity=None if velocity is None else _places_at(time, clock, np.asarray(velocity)),
-        heading=None if heading is None else wrap(np.interp(time, clock, np.unwrap(heading))),
-    )
+    clock, callers = scenario.time, [*scenario.callers]
+    for j, caller in enumerate(callers[VEHICLE + 1 :], start=VEHICLE + 1):
+        if moves(caller):
+            there: dict[str, Any] = {"place": _places_at(time, clock, np.asarray(caller.place))}
+            if caller.velocity is not None:
+                there["velocity"] = _places_at(time, clock, np.asarray(caller.velocity))
+            if caller.heading is not None:
+                there["heading"] = wrap(np.interp(time, clock, np.unwrap(caller.heading)))
+            callers[j] = replace(caller, **there)
+    return replace(scenario, time=time, path=path, callers=tuple(callers))
 
 
 def _places_at(

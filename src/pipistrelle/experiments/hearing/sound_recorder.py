@@ -83,20 +83,17 @@ class SoundRecorder:
         there = next(place for place in places if place.exists())
         free = shutil.disk_usage(there).free
         if self.size > free:
-            raise InputError(
-                f"--save-sound: found {free / 1e9:.1f} GB free at {there}, expected "
-                f"{self.size / 1e9:.1f} GB; keep fewer frames (--frames A:B) or 16 bits"
-            )
+            why = f"found {free / 1e9:.1f} GB free at {there}, expected {self.size / 1e9:.1f} GB"
+            raise InputError(f"--save-sound: {why}; keep fewer frames (--frames A:B) or 16 bits")
 
     def begin(self, scenario: Scenario) -> None:
         """Create the sound file with its header; raise if the settings give no real samples."""
         settled = sampling(self.config, scenario.callers)
         for caller, tone in zip(scenario.callers, settled.tones, strict=True):
             if tone >= settled.rate / 2.0:
-                raise InputError(
-                    f"{caller.key or caller.name}.frequency: found {tone:g} Hz, which real samples "
-                    f"at {settled.rate:g} Hz do not hold; expected less than half of that"
-                )
+                why = f"found {tone:g} Hz, which real samples at {settled.rate:g} Hz do not hold"
+                where = f"{caller.key or caller.name}.frequency"
+                raise InputError(f"{where}: {why}; expected less than half of that")
         self.sampling = settled
         loudest = max(10.0 ** (max(one.level_db for one in scenario.callers) / 20.0), 1.0)
         self.scale = HEADROOM * max(loudest, settled.noise_std)

@@ -16,6 +16,7 @@ from jaxtyping import Float
 from pipistrelle.config import InputError, MotionConfig, ScenarioConfig
 from pipistrelle.estimation.motion import Motion, controls_between, motion_step
 from pipistrelle.geometry import path_at, wrap_angle
+from pipistrelle.refusals import refusal
 
 LOOK_AHEAD = 1.0
 """Distance of the driver's aim from the vehicle [m]."""
@@ -213,16 +214,13 @@ def _towards(
 def _check_speed(setup: ScenarioConfig) -> None:
     """Raise if the speed in the settings is not positive, as way-points need."""
     if setup.speed <= 0.0:
-        raise InputError(
-            f"scenario.speed: found {setup.speed:g} m/s, expected more than 0 to drive between "
-            "way-points; correct it"
-        )
+        found, expected = f"{setup.speed:g} m/s", "more than 0 to drive between way-points"
+        raise refusal("scenario.speed", found, expected, "correct it")
 
 
 def _check_length(course: Commands | Poses, setup: ScenarioConfig) -> None:
     """Raise if a course of commands or poses ends before the drive does."""
     if course.time[-1] < setup.steps * setup.step - TIME_TOLERANCE:
-        raise InputError(
-            f"scenario.steps: found {setup.steps}, but the path of {setup.world} ends after "
-            f"{steps_of(course, setup)} steps of {setup.step:g} s; expected as many, or fewer"
-        )
+        most = f"{steps_of(course, setup)} steps of {setup.step:g} s; expected as many, or fewer"
+        but = f"but the path of {setup.world} ends after {most}"
+        raise InputError(f"scenario.steps: found {setup.steps}, {but}")

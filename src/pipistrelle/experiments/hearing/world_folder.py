@@ -125,10 +125,8 @@ def _decided(world: World, layer: Layer) -> Layer:
         return {}
     count, given = len(world.landmarks), layer.get(_COUNT)
     if given is not None and given.value != count:
-        raise InputError(
-            f"{given.where}: found {shown(given.value)}, but the world's landmarks.csv has "
-            f"{count}; leave it out"
-        )
+        but = f"but the world's landmarks.csv has {count}; leave it out"
+        raise InputError(f"{given.where}: found {shown(given.value)}, {but}")
     return {_COUNT: Given(count, f"{world.name}: landmarks.csv")}
 
 
@@ -164,9 +162,8 @@ def read_world(folder: Path) -> World:
     if WORLD_KEY in settings:
         raise InputError(f"{settings[WORLD_KEY].where}: a world has no other world; take it out")
     if CALLERS in settings:
-        raise InputError(
-            f"{settings[CALLERS].where}: a world's callers are [[callers]]; take out config."
-        )
+        fix = "take out config."
+        raise InputError(f"{settings[CALLERS].where}: a world's callers are [[callers]]; {fix}")
     landmarks = bodies = course = None
     config = resolve(settings)
     if "landmarks.csv" in there:

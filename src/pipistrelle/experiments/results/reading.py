@@ -147,9 +147,8 @@ class StoredMission:
 def read_mission(folder: Path) -> StoredMission:
     """Read a mission's results from a folder; raise if a file was changed since."""
     own, summary = results_in(folder), read_summary(folder)
-    scores: dict[Estimate, dict[str, Any]] = {
-        (run.strategy, run.filter): run.model_dump() for run in summary.runs
-    }
+    runs: dict[Estimate, Any] = {(run.strategy, run.filter): run for run in summary.runs}
+    scores = {estimate: run.model_dump() for estimate, run in runs.items()}
     names = {estimate: f"{estimate[0]}_{short_name(estimate[1])}" for estimate in scores}
     log = {} if summary.log is None else summary.log.model_dump(exclude={"path_bytes"})
     if log:

@@ -245,9 +245,8 @@ def map_motion(track: Track, truth: Truth) -> Float[np.ndarray, "3"]:
     if not known.any():
         return STAY
     motions = (STAY, alignment(points[known], true[known]))
-    return nearest_motion(
-        track.landmarks.mean[placed(track.landmarks)], truth.landmarks[1], motions
-    )
+    mapped = track.landmarks.mean[placed(track.landmarks)]
+    return nearest_motion(mapped, truth.landmarks[1], motions)
 
 
 def position_floor(drive: Drive, scans: Sequence[Scan]) -> float | None:

@@ -88,18 +88,16 @@ def _new_folder(name: str) -> list[Path]:
                 break
         return [folder, *made]
     except OSError as error:
-        raise InputError(
-            f"{runs}: cannot be used as a folder for results ({error.strerror}); name one that "
-            f"can be written with {COMMAND_LINE[0]}"
-        ) from error
+        why = f"cannot be used as a folder for results ({error.strerror})"
+        fix = f"name one that can be written with {COMMAND_LINE[0]}"
+        raise InputError(f"{runs}: {why}; {fix}") from error
 
 
 def _point_latest_at(folder: Path) -> None:
     """Link ``runs/latest`` to a folder, unless another program's file has that name."""
     latest = folder.parent / "latest"
-    if os.path.lexists(latest) and not (
-        latest.is_symlink() and _OURS.fullmatch(str(latest.readlink()))
-    ):
+    ours = latest.is_symlink() and _OURS.fullmatch(str(latest.readlink()))
+    if os.path.lexists(latest) and not ours:
         return
     link = partial_of(latest)
     with contextlib.suppress(OSError):
@@ -342,9 +340,8 @@ def tum_text(time: Float[np.ndarray, " k"], path: Float[np.ndarray, "k 3"]) -> s
     """
     half = path[:, 2] / 2.0
     rows = np.column_stack([time, path[:, :2], np.sin(half), np.cos(half)])
-    return "".join(
-        f"{t:.6f} {x:.12f} {y:.12f} 0 0 0 {qz:.12f} {qw:.12f}\n" for t, x, y, qz, qw in rows
-    )
+    line = "{:.6f} {:.12f} {:.12f} 0 0 0 {:.12f} {:.12f}\n"
+    return "".join(line.format(*row) for row in rows)
 
 
 def place_text(time: Float[np.ndarray, " k"], place: Float[np.ndarray, "k 2"]) -> str:
@@ -360,9 +357,8 @@ def map_text(landmarks: Landmarks) -> str:
     """
     estimate = heaviest(landmarks)
     lines = ["landmark,x,y,xx,xy,yy,status"]
-    for label, mean, P, full in zip(
-        estimate.landmark, estimate.mean, estimate.covariance, estimate.full, strict=True
-    ):
+    columns = estimate.landmark, estimate.mean, estimate.covariance, estimate.full
+    for label, mean, P, full in zip(*columns, strict=True):
         numbers = ",".join(f"{value:.15g}" for value in (*mean, P[0, 0], P[0, 1], P[1, 1]))
         lines.append(f"{label},{numbers},{'full' if full else 'partial'}")
     return "\n".join(lines) + "\n"
@@ -436,13 +432,9 @@ def landmark_table(
         schema_overrides={"status": pl.String},
     )
     labels, positions = true_landmarks or (np.empty(0, np.int64), np.empty((0, 2)))
-    truth = pl.DataFrame(
-        {
-            "true_landmark": labels.astype(np.int64),
-            "true_x_m": positions[:, 0],
-            "true_y_m": positions[:, 1],
-        }
-    )
+    x, y = positions.T
+    columns = {"true_landmark": labels.astype(np.int64), "true_x_m": x, "true_y_m": y}
+    truth = pl.DataFrame(columns)
     table = found.join(
         truth, on="true_landmark", how="full", coalesce=True, maintain_order="left_right"
     )

@@ -101,10 +101,8 @@ def scans_of(
 def _unlabelled(frame: FrameMeasurements) -> Scan:
     """Return a frame's measurements without labels; raise if the frame has only labelled ones."""
     if frame.unlabelled is None:
-        raise InputError(
-            "association.method: found frames that were heard with labels alone; expected some of "
-            "listen(..., labels=False)"
-        )
+        why = "found frames that were heard with labels alone"
+        raise InputError(f"association.method: {why}; expected some of listen(..., labels=False)")
     return frame.unlabelled
 
 

@@ -339,10 +339,8 @@ def _steps_of(scans: Sequence[Scan], time: Float[np.ndarray, " t"]) -> list[int]
         raise InputError(f"scan at {stray.time} s: expected the time of the end of a step")
     if np.any(np.diff(steps) < 0):
         late = int(np.argmax(np.diff(steps) < 0))
-        raise InputError(
-            f"scan at {scans[late + 1].time} s: follows one at {scans[late].time} s; expected "
-            "scans in the order of time"
-        )
+        late = f"scan at {scans[late + 1].time} s: follows one at {scans[late].time} s"
+        raise InputError(f"{late}; expected scans in the order of time")
     return steps.tolist()
 
 
@@ -350,9 +348,8 @@ def _check_known(drive: Drive, scans: Sequence[Scan]) -> None:
     """Raise if a landmark with a position known beforehand is a moving caller."""
     moving = {*drive.moving, *(label for scan in scans for label in scan.moving.tolist())}
     if roving := sorted(moving.intersection(drive.known.landmark.tolist())):
-        raise InputError(
-            f"landmarks known beforehand: found {roving}, which move; expected some that stand"
-        )
+        found = f"found {roving}, which move; expected some that stand"
+        raise InputError(f"landmarks known beforehand: {found}")
 
 
 def _move(session: Session[B], drive: Drive, first: int, last: int, path: Gaussian) -> None:

@@ -35,16 +35,14 @@ def check_filters(
     for name in filters:
         if roving and not entry(name).follows:
             able = ", ".join(one.name for one in CATALOGUE.values() if one.follows)
-            raise InputError(
-                f"association.method: found callers that move ({roving}) with the filter {name}, "
-                f"which follows none; take {able}, or add --listening.timing false"
-            )
+            why = f"found callers that move ({roving}) with the filter {name}, which follows none"
+            fix = f"take {able}, or add --listening.timing false"
+            raise InputError(f"association.method: {why}; {fix}")
         if name in CATALOGUE and asked and not CATALOGUE[name].calibrates:
             able = ", ".join(one.name for one in CATALOGUE.values() if one.calibrates)
-            raise InputError(
-                f"filter.calibrate: found {asked} with the filter {name}, which calibrates "
-                f"nothing; take {able}, or leave it out (in a plan, name it under [own.{able}])"
-            )
+            why = f"found {asked} with the filter {name}, which calibrates nothing"
+            fix = f"take {able}, or leave it out (in a plan, name it under [own.{able}])"
+            raise InputError(f"filter.calibrate: {why}; {fix}")
         if name in CATALOGUE:
             continue
         try:
@@ -55,18 +53,14 @@ def check_filters(
             raise InputError(f"filter {name}: init fails: {located(error)}") from error
         parts = ("pose", "landmarks", "gated")
         if lacking := [part for part in parts if not hasattr(belief, part)]:
-            raise InputError(
-                f"filter {name}: init returns a belief that lacks {', '.join(lacking)}; a belief "
-                f"has {', '.join(parts)}"
-            )
+            why = f"init returns a belief that lacks {', '.join(lacking)}"
+            raise InputError(f"filter {name}: {why}; a belief has {', '.join(parts)}")
         methods = ("pose", "landmarks", "path", "cloud")
-        if fixed := [
-            part for part in methods if not callable(getattr(completed(belief, Belief), part))
-        ]:
-            raise InputError(
-                f"filter {name}: init returns a belief whose {', '.join(fixed)} cannot be called; "
-                f"of a belief {', '.join(methods)} are methods, the last two where it has them"
-            )
+        whole = completed(belief, Belief)
+        if fixed := [part for part in methods if not callable(getattr(whole, part))]:
+            why = f"init returns a belief whose {', '.join(fixed)} cannot be called"
+            fix = f"of a belief {', '.join(methods)} are methods, the last two where it has them"
+            raise InputError(f"filter {name}: {why}; {fix}")
 
 
 @judging()
@@ -238,15 +232,10 @@ def _refuse_supersonic(scenario: Scenario, config: Config) -> None:
         return np.hypot(*np.diff(path, axis=0).T).max(initial=0.0) / config.scenario.step
 
     speed, c = fastest(scenario.path[:, :2]), config.medium.sound_speed
+    slower = f"expected less than the speed of sound ({c:.3g} m/s); slow it down"
     for caller in scenario.callers[VEHICLE + 1 :]:
         if moves(caller) and not (his := fastest(np.asarray(caller.place))) < c:
-            raise InputError(
-                f"{caller.key or caller.name}: it reaches {his:.3g} m/s, expected less than the "
-                f"speed of sound ({c:.3g} m/s); slow it down"
-            )
+            raise InputError(f"{caller.key or caller.name}: it reaches {his:.3g} m/s, {slower}")
     if not speed < c:
         key = "motion.speed_std" if abs(config.scenario.speed) < c else "scenario.speed"
-        raise InputError(
-            f"{key}: the vehicle reaches {speed:.3g} m/s, expected less than the speed of sound "
-            f"({c:.3g} m/s); slow it down"
-        )
+        raise InputError(f"{key}: the vehicle reaches {speed:.3g} m/s, {slower}")

@@ -289,9 +289,8 @@ def find_plan(word: str) -> Path:
     if word in PLANS:
         return Path(str(files("pipistrelle.experiments.studies") / f"{word}.toml"))
     if not path.exists():
-        raise InputError(
-            f"{word}: found no such file; expected {', '.join(PLANS)} or the path of a plan"
-        )
+        expected = f"{', '.join(PLANS)} or the path of a plan"
+        raise InputError(f"{word}: found no such file; expected {expected}")
     check_ordinary(path)
     return path
 
@@ -412,9 +411,8 @@ def _worlds(path: Path, folders: Any, worlds: dict[str, World]) -> Any:
     for folder in folders:
         world = read_world(path.parent / folder)
         if world.files != worlds.setdefault(world.name, world).files:
-            raise InputError(
-                f"{path}: grid.{WORLD}: found two worlds called {world.name}; rename a folder"
-            )
+            fix = "rename a folder"
+            raise InputError(f"{path}: grid.{WORLD}: found two worlds called {world.name}; {fix}")
         names.append(world.name)
     return names
 

@@ -120,9 +120,8 @@ def open_store(folder: Path, plan: Plan) -> None:
         _refuse_strange(folder, there, strange)
         if there is not None and (changes := changed_settings(there, plan)):
             differences = "".join(f"\n  {line}" for line in changes)
-            raise InputError(
-                f"{kept}: is the plan of another study; name a new folder with -o DIR{differences}"
-            )
+            fix = f"name a new folder with -o DIR{differences}"
+            raise InputError(f"{kept}: is the plan of another study; {fix}")
         if there is None or there.iterations < plan.iterations or there.planned < plan.planned:
             _keep_plan(folder, there, plan)
         readme = README.format(name=plan.name, version=find_version())
@@ -148,10 +147,8 @@ def _keep_plan(folder: Path, there: Plan | None, plan: Plan) -> None:
         if not _is_ours(kept, there):
             if plan.iterations <= there.iterations:
                 return
-            raise InputError(
-                f"{kept}: was changed since Pipistrelle wrote it, so it is not replaced; "
-                f"set iterations = {plan.iterations} in it"
-            )
+            changed = "was changed since Pipistrelle wrote it, so it is not replaced"
+            raise InputError(f"{kept}: {changed}; set iterations = {plan.iterations} in it")
         most = max(there.iterations, plan.iterations)
         plan = replace(plan, iterations=most, planned=max(there.planned, plan.planned))
     for world in plan.worlds.values():
@@ -159,9 +156,8 @@ def _keep_plan(folder: Path, there: Plan | None, plan: Plan) -> None:
         for name, content in files.items():
             path = folder / name
             if path.exists() and read_file(path) != content:
-                raise InputError(
-                    f"{path}: is not the world that is asked for; name a new folder with -o DIR"
-                )
+                fix = "name a new folder with -o DIR"
+                raise InputError(f"{path}: is not the world that is asked for; {fix}")
             path.parent.mkdir(parents=True, exist_ok=True)
             write_whole(path, content)
     write_whole(kept, plan_text(plan).encode())
@@ -169,16 +165,12 @@ def _keep_plan(folder: Path, there: Plan | None, plan: Plan) -> None:
 
 def _refuse_strange(folder: Path, there: Plan | None, strange: Sequence[str]) -> None:
     """Raise if a folder is neither empty nor a study's, so that nothing in it is overwritten."""
-    if there is None and strange:
-        raise InputError(
-            f"{folder}: holds {min(strange)} and no plan.toml, so it is no study's folder; "
-            "name another with -o DIR"
-        )
+    holds = f"{min(strange)} and no plan.toml" if there is None and strange else ""
     if there and not (_is_ours(folder / "plan.toml", there) or (folder / "trials").is_dir()):
-        raise InputError(
-            f"{folder}: holds a plan.toml that is not Pipistrelle's and no trials, so it is no "
-            "study's folder; name another with -o DIR"
-        )
+        holds = "a plan.toml that is not Pipistrelle's and no trials"
+    if holds:
+        fix = "name another with -o DIR"
+        raise InputError(f"{folder}: holds {holds}, so it is no study's folder; {fix}")
 
 
 def _is_ours(kept: Path, plan: Plan) -> bool:
@@ -217,9 +209,8 @@ def load_finished(folder: Path) -> StoredStudy:
     """Open a study's folder; raise if no world is finished, or a file of one was changed."""
     worlds = sorted(done_worlds(folder))
     if not worlds and (folder / "plan.toml").is_file():
-        raise InputError(
-            f"{folder}: no world is done yet; `pipistrelle study` with -o {folder} goes on"
-        )
+        fix = f"`pipistrelle study` with -o {folder} goes on"
+        raise InputError(f"{folder}: no world is done yet; {fix}")
     stored = load_study(folder)
     for world in worlds:
         check_world(folder, stored.plan, world)
@@ -297,9 +288,8 @@ def run_study(
             so_far = _advanced(so_far, trials)
             show(so_far)
     if len(done_worlds(folder).intersection(worlds)) < so_far.done:
-        raise InputError(
-            f"{folder}: lacks worlds that are done; expected one folder for all workers"
-        )
+        expected = "one folder for all workers"
+        raise InputError(f"{folder}: lacks worlds that are done; expected {expected}")
     return so_far
 
 
@@ -335,9 +325,8 @@ def _named(case: PlannedCase) -> Iterator[None]:
         yield
     except InputError as error:
         values = ", ".join(f"{name} = {value}" for name, value in case.values.items())
-        raise InputError(
-            f"{error} (where the grid has {values})" if values else f"{error}"
-        ) from None
+        where = f" (where the grid has {values})" if values else ""
+        raise InputError(f"{error}{where}") from None
 
 
 def _nothing_done(plan: Plan, worlds: int) -> StudyProgress:
@@ -541,10 +530,9 @@ def check_cluster(address: str) -> None:
         import dask  # noqa: F401
         import distributed  # noqa: F401
     except ImportError as error:
-        raise InputError(
-            f"--scheduler {address}: needs Dask, which is not installed; "
-            "python -m pip install dask distributed cryptography"
-        ) from error
+        why = "needs Dask, which is not installed"
+        fix = "python -m pip install dask distributed cryptography"
+        raise InputError(f"--scheduler {address}: {why}; {fix}") from error
 
 
 @contextmanager
@@ -557,10 +545,9 @@ def _client(address: str, workers: int) -> Iterator[Any]:
         try:
             client = Client(address, timeout="10s")
         except (OSError, ValueError) as error:
-            raise InputError(
-                f"--scheduler: found {address!r}, but no scheduler answers there ({error}); "
-                "expected local, or an address such as tcp://127.0.0.1:8786"
-            ) from error
+            why = f"found {address!r}, but no scheduler answers there ({error})"
+            expected = "local, or an address such as tcp://127.0.0.1:8786"
+            raise InputError(f"--scheduler: {why}; expected {expected}") from error
         with client:
             yield client
         return

@@ -304,9 +304,8 @@ def world_file(folder: Path, table: str, iteration: int) -> Path:
 
 def done_worlds(folder: Path) -> set[int]:
     """Return the set of finished worlds' numbers in a study's folder."""
-    names = (
-        path.stem.partition("_")[2] for path in (folder / "trials").glob("iteration_*.parquet")
-    )
+    files = (folder / "trials").glob("iteration_*.parquet")
+    names = (path.stem.partition("_")[2] for path in files)
     return {int(name) for name in names if name.isdecimal()}
 
 
@@ -352,10 +351,8 @@ def refuse_strange(folder: Path, plan: Plan, iterations: Iterable[int]) -> None:
     for iteration, name in product(iterations, TABLES[:-1]):
         path = world_file(folder, name, iteration)
         if os.path.lexists(path) and not _is_table(path, schemas[name]):
-            raise InputError(
-                f"{path}: is no table of this study as Pipistrelle wrote it, so it is not "
-                "replaced; move it away, or name another folder with -o DIR"
-            )
+            why = "is no table of this study as Pipistrelle wrote it, so it is not replaced"
+            raise InputError(f"{path}: {why}; move it away, or name another folder with -o DIR")
 
 
 def _is_table(path: Path, schema: "Mapping[str, pl.DataType]") -> bool:
@@ -363,9 +360,8 @@ def _is_table(path: Path, schema: "Mapping[str, pl.DataType]") -> bool:
     import polars as pl
 
     with contextlib.suppress(OSError, pl.exceptions.PolarsError):
-        return not path.is_symlink() and schema == pl.read_parquet_schema(
-            io.BytesIO(read_file(path))
-        )
+        if not path.is_symlink():
+            return schema == pl.read_parquet_schema(io.BytesIO(read_file(path)))
     return False
 
 

@@ -270,9 +270,8 @@ def _named(labels: Int[np.ndarray, " n"], trial: TrialResult) -> Int[np.ndarray,
     """Replace map labels by labels of true landmarks; false landmarks get numbers below -1."""
     if trial.mapped is None:
         return labels
-    pairs = zip(
-        trial.track.landmarks.landmark.tolist(), trial.mapped.landmark.tolist(), strict=True
-    )
+    own, true = trial.track.landmarks.landmark, trial.mapped.landmark
+    pairs = zip(own.tolist(), true.tolist(), strict=True)
     names = {UNLABELLED: UNLABELLED, **dict(pairs)}
     return np.array([names.get(label, -2 - label) for label in labels.tolist()], dtype=int)
 
