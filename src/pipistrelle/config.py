@@ -545,6 +545,8 @@ Parameter = Literal[
     "sensor_heading",
     "sensor_place",
     "time_offset",
+    "range_scale",
+    "range_bias",
 ]
 """Calibration parameters that the smoother can estimate."""
 PARAMETERS: tuple[Parameter, ...] = get_args(Parameter)
@@ -576,9 +578,9 @@ class FilterConfig(Section):
     gate: Gate = 1.0
     """Share of the predicted distribution outside of which measurements are discarded; 1: none;
     "auto": the share that suits the estimator."""
-    robust: Literal["none", "huber"] = "none"
-    """Robust loss of EKFs and smoother: `huber` reduces the weight of innovations beyond 2
-    sigma."""
+    robust: Literal["none", "huber", "cauchy"] = "none"
+    """Robust loss of EKFs and smoother: `huber` reduces the weight of innovations beyond 2 sigma,
+    `cauchy` of all, and of large ones further."""
     calibrate: tuple[Parameter, ...] = ()
     """Calibration parameters that the smoother estimates, from the standard deviations in
     `prior`."""
@@ -606,6 +608,10 @@ class PriorConfig(Section):
     """Standard deviation of the sensor's position on the vehicle, forward and to the left [m]."""
     time_offset_std: Annotated[Positive, Field(le=10)] = 0.1
     """Standard deviation of the delay of the sensor's clock behind the odometry's [s]."""
+    range_scale_std: Positive = 0.1
+    """Standard deviation of the ratio of measured to true ranges."""
+    range_bias_std: DistanceStd = 1.0
+    """Standard deviation of the constant error of measured ranges [m]."""
 
 
 def _check_rising(near: float, far: float) -> None:

@@ -12,11 +12,7 @@ from pipistrelle.acoustics.paths import VEHICLE, Caller, callers_of
 from pipistrelle.arrays.layout import square_of_four
 from pipistrelle.arrays.receiver import add_echo_blocks, noise_blocks, real_samples
 from pipistrelle.arrays.sampling import blocks_to_hear, sampling
-from pipistrelle.config import (
-    Config,
-    InputError,
-    ReceiverConfig,
-)
+from pipistrelle.config import Config, InputError, ReceiverConfig
 from reference.echoes import BEACON, CALLERS, CONFIG, SAMPLES, SETTLED, SQUARE, sounds
 from reference.samples import record_samples
 

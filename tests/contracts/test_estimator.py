@@ -294,7 +294,7 @@ class TestInvariantEkfSlam(EstimatorContract):
 class TestSmoother(EstimatorContract):
     @pytest.fixture(params=["none", "huber"])
     def slam(self, request):
-        return Smoother(motion=BICYCLE, rays=ray_config(), robust=request.param == "huber")
+        return Smoother(motion=BICYCLE, rays=ray_config(), robust=request.param)
 
 
 class TestFastSlam(EstimatorContract):

@@ -19,11 +19,7 @@ from pipistrelle.detection.front_end import average_faces
 from pipistrelle.detection.matched import filter_blocks
 from pipistrelle.detection.noise import EXCESS_PATH_FLOOR
 from pipistrelle.detection.scans import with_columns
-from pipistrelle.detection.snapshots import (
-    Columns,
-    Detections,
-    direct_of_faces,
-)
+from pipistrelle.detection.snapshots import Columns, Detections, direct_of_faces
 from pipistrelle.experiments.hearing.listening import listen
 from pipistrelle.experiments.hearing.oracle import label_detections
 from pipistrelle.experiments.hearing.scenario import caller_labels, world_of

@@ -252,9 +252,7 @@ def test_runs_of_lags_are_not_resolved():
 def world_rows(overlaps):
     """Return rows and right rows of a world without labels, and what direct calls say."""
     config = Config(
-        seed=31337,
-        scenario=ScenarioConfig(steps=80),
-        detection=DetectionConfig(overlaps=overlaps),
+        seed=31337, scenario=ScenarioConfig(steps=80), detection=DetectionConfig(overlaps=overlaps)
     )
     (frames,) = listen(world_of(config, 0), config, (0.0025,), labels=False)
     causes = np.concatenate([frame.causes for frame in frames])

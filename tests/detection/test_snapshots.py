@@ -238,9 +238,7 @@ def test_pure_noise_is_detected_in_hardly_any_frame():
 
 
 @given(
-    late=st.floats(0.0, 30.0),
-    angle=st.floats(-70.0, 70.0),
-    source=st.sampled_from([OWN, BEACON]),
+    late=st.floats(0.0, 30.0), angle=st.floats(-70.0, 70.0), source=st.sampled_from([OWN, BEACON])
 )
 @law
 def test_without_noise_an_echo_is_placed_where_it_starts(late, angle, source):

@@ -121,7 +121,7 @@ def raw(**columns):
             partial(raw, landmark=np.array([8, 8])),
             r"two bearings by one call for the landmarks \[8\]",
         ),
-        (with_columns(SCAN, bearing=np.array([np.nan, 1.0])), r"can use, for the landmarks \[3\]"),
+        (with_columns(SCAN, bearing=np.nan, range=np.nan), r"can use, for the landmarks \[3, 8\]"),
         (with_columns(SCAN, bearing=np.array([np.inf, 1.0])), "numbers that no filter can use"),
         (with_columns(SCAN, range=0.0), r"can use, for the landmarks \[3, 8\]"),
         (with_columns(SCAN, range=2e6), "numbers that no filter can use"),

@@ -69,15 +69,18 @@ def hear(history, x, k, m, into):
         at, heading, scale, leaning = sensor(history, k, pose, parameters)
         dx, dy = point - at
         turned = np.arctan2(dy, dx) - heading - lean * leaning
-        off = [wrap(turned - bearing) / across, (np.hypot(dx, dy) / scale - distance) / along]
-        return np.array(off)[[np.isfinite(bearing), np.isfinite(bearing) and np.isfinite(distance)]]
+        longer, bias = history.calibration.sensor[4:] - 1
+        far = (1.0 + (parameters[longer] if longer >= 0 else 0.0)) * np.hypot(dx, dy) / scale
+        far += parameters[bias] if bias >= 0 else 0.0
+        off = [wrap(turned - bearing) / across, (far - distance) / along]
+        return np.array(off)[[np.isfinite(bearing), np.isfinite(distance)]]
 
     def further(pose, point, parameters, call):
         at, _, scale, _ = sensor(history, k, pose, parameters)
         way = np.hypot(*(call - point)) + np.hypot(*(point - at)) - np.hypot(*(call - at))
         return np.array([(way / scale - excess_path) / sure])
 
-    if np.isfinite(bearing):
+    if np.isfinite(bearing) or np.isfinite(distance):
         by_all(seen, x, ends, into)
     if caller >= 0 and history.index[caller] != 0:
         by_all(further, x, [*ends, place_of(history, caller)], into)
@@ -85,7 +88,7 @@ def hear(history, x, k, m, into):
 
 def sensor(history, k, pose, parameters):
     """Return position and heading of the sensor, the scale of ranges, and the skew of bearings."""
-    sound, turned, place, clock = history.calibration.sensor - 1
+    sound, turned, place, clock = history.calibration.sensor[:4] - 1
     off, heading, scale, lean = np.zeros(2), pose[2], 1.0, 0.0
     seconds = history.legs.entries(2)[k]
     if clock >= 0 and seconds:

@@ -6,6 +6,7 @@ import gtsam
 import numpy as np
 
 from pipistrelle.estimation.measurement import excess_path_of
+from reference.everything import turned
 from reference.timing import excess_path_jacobians
 
 CALLER = 4
@@ -18,7 +19,7 @@ def pose_key(node):
 
 def graph_of(belief):
     """Return the factors of all measurements of a belief, and its linearisation point."""
-    history, (believed, place_std, speed_std, walk_std, _) = belief.history, belief.noise
+    history, (loss, place_std, speed_std, walk_std, _) = belief.history, belief.noise
     at, spots = belief.solution.points.at.entries(0), belief.solution.points.spots
     mean, noise, seconds, rows = map(history.legs.entries, range(4))
     graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
@@ -49,11 +50,11 @@ def graph_of(belief):
             point = key_of(history, labels, ends[0], k)
             if point is None:
                 continue
-            if not math.isnan(numbers[0]):
-                graph.add(direction(k, point, numbers, believed))
+            if not (math.isnan(numbers[0]) and math.isnan(numbers[1])):
+                graph.add(direction(k, point, numbers, loss))
             caller = None if ends[1] < 0 else key_of(history, labels, ends[1], k)
             if caller is not None:
-                graph.add(excess_path(k, point, caller, numbers, believed))
+                graph.add(excess_path(k, point, caller, numbers, loss))
     return graph, values
 
 
@@ -74,25 +75,29 @@ def velocity_key(v, node):
     return gtsam.symbol("v", (v << 32) + node)
 
 
-def robust(noise, believed):
-    """Add Huber's loss to a noise model, if the threshold is finite."""
-    if math.isinf(believed):
+def robust(noise, loss):
+    """Add a robust loss to a noise model, by its place among the losses."""
+    if loss == 0:
         return noise
-    huber = gtsam.noiseModel.mEstimator.Huber.Create(believed)
-    return gtsam.noiseModel.Robust.Create(huber, noise)
+    kinds = gtsam.noiseModel.mEstimator
+    kind = kinds.Huber.Create(2.0) if loss == 1 else kinds.Cauchy.Create(2.385)
+    return gtsam.noiseModel.Robust.Create(kind, noise)
 
 
-def direction(node, point, numbers, believed):
+def direction(node, point, numbers, loss):
     """Return the factor of a bearing, with its range if measured."""
     bearing, distance, _, across, along = numbers[:5]
+    if math.isnan(bearing):
+        noise = robust(gtsam.noiseModel.Isotropic.Sigma(1, along), loss)
+        return gtsam.RangeFactor2D(pose_key(node), point, distance, noise)
     if math.isnan(distance):
-        noise = robust(gtsam.noiseModel.Isotropic.Sigma(1, across), believed)
+        noise = robust(gtsam.noiseModel.Isotropic.Sigma(1, across), loss)
         return gtsam.BearingFactor2D(pose_key(node), point, gtsam.Rot2(bearing), noise)
-    noise = robust(gtsam.noiseModel.Diagonal.Sigmas(np.array([across, along])), believed)
+    noise = robust(gtsam.noiseModel.Diagonal.Sigmas(np.array([across, along])), loss)
     return gtsam.BearingRangeFactor2D(pose_key(node), point, gtsam.Rot2(bearing), distance, noise)
 
 
-def excess_path(node, point, caller, numbers, believed):
+def excess_path(node, point, caller, numbers, loss):
     """Return the factor of an excess path."""
 
     def misfit(_, values, slopes):
@@ -106,7 +111,7 @@ def excess_path(node, point, caller, numbers, believed):
                 slopes[k] = by[None]
         return np.array([excess_path_of(here, *places) - numbers[2]])
 
-    noise = robust(gtsam.noiseModel.Isotropic.Sigma(1, numbers[5]), believed)
+    noise = robust(gtsam.noiseModel.Isotropic.Sigma(1, numbers[5]), loss)
     return gtsam.CustomFactor(noise, [pose_key(node), point, caller], misfit)
 
 
@@ -150,9 +155,3 @@ def optimum(graph, values, passes=40):
     for _ in range(passes):
         values = values.retract(graph.linearize(values).optimize())
     return values
-
-
-def turned(heading):
-    """Return the rotation of x and y of a pose by a heading."""
-    c, s = np.cos(heading), np.sin(heading)
-    return np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])

@@ -166,7 +166,7 @@ REFUSED = {
     "a scan that is late": (lambda s: s.hear(time=0.9, **ONE), "the vehicle has moved on"),
     "a scan to come": (lambda s: s.hear(time=1.1, **ONE), "move to it first"),
     "a bearing that is no number": (
-        lambda s: s.hear(landmark=[9], bearing=[np.nan], range=[1.0]),
+        lambda s: s.hear(landmark=[9], bearing=[np.nan]),
         "hear, row 1: found bearing ''",
     ),
     "an endless range": (

@@ -15,7 +15,7 @@ import pytest
 import pipistrelle
 from pipistrelle.__main__ import main
 from pipistrelle.acoustics.emitter import beamwidth
-from pipistrelle.config import BagConfig, Config, FastSlamConfig
+from pipistrelle.config import PARAMETERS, BagConfig, Config, FastSlamConfig
 from pipistrelle.settings import known_settings
 
 HEAVY = {"numpy", "pydantic", "numba", "matplotlib"}
@@ -104,9 +104,7 @@ def test_help_all_of_slam_omits_settings_that_a_log_decides(printed):
         "--association.way-std",
         *(f"--filter.{name}" for name in ("noise", "excess-path-std", "robust")),
         *(f"--filter.{name}" for name in ("calibrate", "window")),
-        *(f"--prior.{name}-std" for name in ("speed-scale", "turn-bias", "wheelbase")),
-        *(f"--prior.{name}-std" for name in ("speed-of-sound", "sensor-heading", "sensor-place")),
-        "--prior.time-offset-std",
+        *(f"--prior.{name.replace('_', '-')}-std" for name in PARAMETERS),
         *(f"--filter.caller-{name}-std" for name in ("speed", "walk")),
         *(f"--rays.{name}" for name in rays),
         *(f"--fastslam.{name}" for name in swarm),

@@ -7,8 +7,5 @@ complex normal noise, each sample computed from its number.
 from lazy_loader import attach
 
 __getattr__, __dir__, __all__ = attach(
-    __name__,
-    submod_attrs={
-        "random_stream": ["complex_noise", "stream_key"],
-    },
+    __name__, submod_attrs={"random_stream": ["complex_noise", "stream_key"]}
 )

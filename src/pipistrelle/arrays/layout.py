@@ -314,10 +314,7 @@ class Layout:
         return np.outer(self.position, left), np.ones(self.position.size)
 
     def phases(
-        self,
-        angle: Float[np.ndarray, "*n"] | float,
-        frequency: float,
-        speed_of_sound: float,
+        self, angle: Float[np.ndarray, "*n"] | float, frequency: float, speed_of_sound: float
     ) -> Float[np.ndarray, "*n e"]:
         r"""Return a plane wave's phases [rad] at a face's elements, by angle off the face's normal.
 

@@ -53,15 +53,7 @@ import numpy as np
 from jaxtyping import Complex, Float
 
 from pipistrelle.acoustics.arrivals import Arrivals
-from pipistrelle.acoustics.call import (
-    FINER,
-    Band,
-    Call,
-    bands_of,
-    bins_of,
-    carrier_of,
-    lag_step,
-)
+from pipistrelle.acoustics.call import FINER, Band, Call, bands_of, bins_of, carrier_of, lag_step
 from pipistrelle.arithmetic.random_stream import complex_noise, stream_from
 from pipistrelle.arrays.layout import Layout, Scattered
 from pipistrelle.arrays.sampling import Sampling, block_shape

@@ -25,13 +25,7 @@ from jaxtyping import Bool, Complex, Float, Int
 from pipistrelle.acoustics.call import Call, ToneBurst, blocks_of, cross_talk, lag_step, on_raster
 from pipistrelle.arrays.layout import Layout, Scattered, along_line
 from pipistrelle.config import Config, InputError
-from pipistrelle.detection.beams import (
-    MARGIN,
-    Wide,
-    edge_around,
-    find_wide,
-    wide_of,
-)
+from pipistrelle.detection.beams import MARGIN, Wide, edge_around, find_wide, wide_of
 from pipistrelle.detection.direct import (
     MIN_EDGE_ENERGY,
     DirectCalls,
@@ -515,11 +509,7 @@ def _ahead(finder: Finder, bearing: Float[np.ndarray, "*m"]) -> Float[np.ndarray
 
 
 def _found(
-    matched: Complex[np.ndarray, "l f c e"],
-    end: Finders,
-    finder: Finder,
-    lags: Lags,
-    cut: int,
+    matched: Complex[np.ndarray, "l f c e"], end: Finders, finder: Finder, lags: Lags, cut: int
 ) -> tuple[Detections, Bool[np.ndarray, " m"]]:
     """Detect calls at a group of microphones; also return a mask of calls recorded in full."""
     if isinstance(finder.detector, Wide):

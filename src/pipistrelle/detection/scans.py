@@ -73,7 +73,7 @@ class Scan:
 
     @property
     def bearing(self) -> Float[np.ndarray, " m"]:
-        """Bearing from the heading, counter-clockwise [rad]; NaN for an excess path only."""
+        """Bearing from the heading, counter-clockwise [rad]; NaN if not measured."""
         return self.numbers[BEARING]
 
     @property
@@ -249,7 +249,8 @@ def without_excess_paths(scan: Scan, *numbers: int) -> Scan:
     >>> without_excess_paths(scan).landmark, without_excess_paths(scan).excess_path
     (array([8]), array([nan]))
     """
-    untimed, bare = without(scan, EXCESS_PATH, EXCESS_PATH_STD, *numbers), np.isnan(scan.bearing)
+    untimed = without(scan, EXCESS_PATH, EXCESS_PATH_STD, *numbers)
+    bare = np.isnan(scan.bearing) & np.isnan(scan.range)
     kept = rows_of(untimed, ~bare) if bare.any() else untimed
     known = scan.callers.size or scan.direct.size
     return replace(kept, callers=NO_CALLERS, direct=NO_CALLERS) if known else kept
@@ -301,9 +302,9 @@ def labelled(scan: Scan, label: Int[np.ndarray, " m"]) -> Scan:
               \bar\sigma^{-2} = \sum_i \sigma_i^{-2} ,
 
     else the plain mean without a standard deviation. Range and excess path are the first of a
-    landmark's rows; further excess paths become rows without a bearing, at the end. The label of a
-    caller's direct call (`Scan.direct`) becomes the caller's. A scan that is already labelled and
-    merged is returned unchanged.
+    landmark's rows; further excess paths, and range-only rows, become rows without a bearing, at
+    the end. The label of a caller's direct call (`Scan.direct`) becomes the caller's. A scan that
+    is already labelled and merged is returned unchanged.
 
     >>> from pipistrelle.detection.scans import make_scan
     >>> scan = make_scan(0.5, np.full(3, UNLABELLED), np.array([0.2, 0.4, 1.0]), bearing_std=0.1)
@@ -364,8 +365,8 @@ def _fuse(
 ) -> tuple[Int[np.ndarray, " k"], Int[np.ndarray, " k"], Float[np.ndarray, "8 k"]]:
     """Return label, caller and numbers of some callers' measurements, merged by landmark.
 
-    Rows without a label are kept unmerged, or left out. Further excess paths of a landmark become
-    rows at the end.
+    Rows without a label are kept unmerged, or left out. Further excess paths of a landmark and rows
+    without a bearing become rows at the end.
     """
     most = label.size
     landmark, caller = np.empty(most, np.int64), np.empty(most, np.int64)
@@ -402,15 +403,15 @@ def _fuse(
         landmark[count], caller[count] = label[m], whose[m]
         for number in (EXCESS_PATH, EXCESS_PATH_STD, LEVEL):
             numbers[number, count] = given[number, m]
+        for number in (RANGE, RANGE_STD):
+            numbers[number, count] = given[number, m] if math.isnan(bearing[m]) else np.nan
         count += 1
     return landmark[:count], caller[:count], numbers[:, :count].copy()
 
 
 @kernel
 def _average(
-    numbers: Float[np.ndarray, "8 k"],
-    merged: Int[np.ndarray, " m"],
-    sums: Float[np.ndarray, "5 m"],
+    numbers: Float[np.ndarray, "8 k"], merged: Int[np.ndarray, " m"], sums: Float[np.ndarray, "5 m"]
 ) -> None:
     """Average the bearings that were merged into each row; `sums` are relative to the first."""
     turn, weighted, slope, weighted_slope, weight = sums

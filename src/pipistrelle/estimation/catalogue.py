@@ -159,7 +159,7 @@ class Entry:
     """Gate that ``filter.gate = "auto"`` selects for a log: accepted share of a measurement's
     predicted distribution; 1 keeps all."""
     robust_gate: float = GATE
-    """Gate that ``filter.gate = "auto"`` selects with ``filter.robust = "huber"``."""
+    """Gate that ``filter.gate = "auto"`` selects with a robust loss."""
 
 
 def gate_of(name: str, config: Config) -> float:
@@ -175,7 +175,7 @@ def gate_of(name: str, config: Config) -> float:
     known = CATALOGUE.get(name)
     if known is None:
         return GATE
-    return known.robust_gate if settings.robust == "huber" else known.gate
+    return known.gate if settings.robust == "none" else known.robust_gate
 
 
 def entry(name: str) -> Entry:
@@ -302,7 +302,7 @@ def _ekf_options(config: Config, _: "Motion") -> dict[str, Any]:
     """Return the keyword arguments common to EKFs and smoother, from the settings."""
     settings = config.filter
     return {
-        "robust": settings.robust == "huber",
+        "robust": settings.robust,
         "speed_std": settings.caller_speed_std,
         "walk_std": settings.caller_walk_std,
     }

@@ -35,6 +35,7 @@ from pipistrelle.detection.scans import (
     labelled,
 )
 from pipistrelle.estimation.beliefs import Gaussian, Landmarks
+from pipistrelle.estimation.measurement import LOSSES
 from pipistrelle.estimation.motion import MOVED, Controls, Durations, Motion
 from pipistrelle.jit import Flag, Whole, kernel
 from pipistrelle.refusals import shown
@@ -74,7 +75,7 @@ WORDS = {
     TWICE: "two bearings by one call for the landmarks {}; expected one",
     NO_NUMBER: "numbers that no filter can use, for the landmarks {}; expected finite bearings "
     f"[rad] and ranges above 0 [m], NaN where passive, up to {FARTHEST:g}; a row without a bearing "
-    "has an excess path [m] alone",
+    "has a range or an excess path [m]",
     UNSTATED: "no standard deviations above 0 for the landmarks {}; expected "
     f"bearing_std up to {WIDEST:g} rad, and range_std and excess_path_std up to {FARTHEST:g} m "
     "where "
@@ -83,12 +84,14 @@ WORDS = {
 """Error messages by fault of a scan's measurements; {} is replaced by labels."""
 
 
-def check_gate(gate: Any) -> None:
-    """Raise InputError unless a gate is in (0, 1]."""
+def check_gate(gate: Any, robust: Any = "none") -> None:
+    """Raise InputError unless a gate is in (0, 1], and a robust loss is known by its name."""
     if isinstance(gate, bool) or not isinstance(gate, (int, float)) or not 0.0 < gate <= 1.0:
         raise InputError(
             f"gate: found {shown(gate)}, expected above 0 and up to 1; 1 drops nothing"
         )
+    if robust not in LOSSES:
+        raise InputError(f"robust: found {shown(robust)}, expected one of {', '.join(LOSSES)}")
 
 
 def check_belief(belief: Any, kind: type) -> None:
@@ -311,7 +314,7 @@ def _fault_of_row(
         return NO_CALLER
     bearing, distance, excess_path = numbers[BEARING, m], numbers[RANGE, m], numbers[EXCESS_PATH, m]
     silent = math.isnan(bearing)
-    if silent and (math.isnan(excess_path) or not math.isnan(distance)):
+    if silent and math.isnan(excess_path) and math.isnan(distance):
         return NO_NUMBER
     if (
         abs(bearing) > LARGEST

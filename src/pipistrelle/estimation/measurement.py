@@ -4,11 +4,12 @@
 """
 
 import math
-from typing import NamedTuple
+from typing import NamedTuple, get_args
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from pipistrelle.config import FilterConfig
 from pipistrelle.detection.scans import (
     BEARING,
     BEARING_STD,
@@ -30,15 +31,40 @@ caller it is 0, and an error would falsely place a point near one of them with h
 MAX_RELATIVE_RANGE_STD = 0.2
 """Largest standard deviation of the range of a crossing, or in the smoother by an excess path, that
 initialises a landmark, relative to the range."""
+LOSSES = get_args(FilterConfig.model_fields["robust"].annotation)
+"""Names of the robust losses; their codes in kernels are their places."""
+SQUARED, HUBER, CAUCHY = range(len(LOSSES))
 HUBER_K = 2.0
-"""Standard deviations above which Huber's rule down-weights a measurement."""
+"""Standard deviations above which Huber's loss down-weights a measurement."""
+CAUCHY_K = 2.385
+"""Scale of Cauchy's loss [standard deviations]: normal errors keep 95 % of their information."""
+
+
+@no_alloc
+def robust_loss(squared: float, loss: Whole) -> tuple[float, float]:
+    r"""Return the factor on the variance of a measurement, and twice its loss.
+
+    With the squared residual :math:`e^2` in units of its variance, the loss is e²/2 (SQUARED),
+
+    .. math:: k e - \tfrac12 k^2 \; (e > k), \qquad \tfrac12 c^2 \ln(1 + e^2 / c^2)
+
+    (HUBER, CAUCHY), and the factor the inverse of its weight: e / k and 1 + e² / c². Sources:
+    Huber, Robust Statistics (1981); Holland & Welsch, Communications in Statistics 6 (1977).
+    """
+    if loss == CAUCHY:
+        factor = 1.0 + squared / (CAUCHY_K * CAUCHY_K)
+        return factor, CAUCHY_K * CAUCHY_K * math.log(factor)
+    if loss == HUBER and squared > HUBER_K * HUBER_K:
+        size = math.sqrt(squared)
+        return size / HUBER_K, HUBER_K * (2.0 * size - HUBER_K)
+    return 1.0, squared
 
 
 class Row(NamedTuple):
     """A measured bearing and range with their variances, as scalars."""
 
     landmark: Whole
-    bearing: float  # [rad]
+    bearing: float  # [rad], NaN for a range-only measurement
     range: float  # [m], NaN if passive
     bearing_variance: float  # [rad^2]
     range_variance: float  # [m^2]
@@ -78,7 +104,7 @@ def timings_of(scan: Scan) -> Timings | None:
 
 @no_alloc
 def rows_with_bearing(columns: Columns) -> Whole:
-    """Count a scan's measurements with a bearing; others, with only an excess path, come last."""
+    """Count a scan's measurements with a bearing; others, a range or an excess path, come last."""
     rows, bearing = columns[0].size, columns[1][BEARING]
     while rows > 0 and math.isnan(bearing[rows - 1]):
         rows -= 1
@@ -136,14 +162,29 @@ def observe(
     """Return range, bearing, direction cosines and inverse range of a point from a pose.
 
     Returns range [m], bearing [rad], cos c and sin s of the direction in the world, and k, the
-    inverse of the range, bounded by `NEAREST`. The Jacobians follow: d range = (-c, -s, 0; c, s)
-    and d bearing = (s k, -c k, -1; -s k, c k) by pose and point.
+    inverse of the range, bounded by `NEAREST` (`bearing_slopes`, `range_slopes`).
     """
     dx, dy = px - x, py - y
     distance = math.sqrt(dx * dx + dy * dy)
     inverse = 1.0 / max(distance, NEAREST)
     bearing = wrap_angle(math.atan2(dy, dx) - heading)
     return distance, bearing, dx * inverse, dy * inverse, inverse
+
+
+Slopes = tuple[float, float, float]
+"""Derivatives by x, y and heading of the pose; by a point they are minus the first two."""
+
+
+@kernel
+def bearing_slopes(c: float, s: float, k: float) -> Slopes:
+    """Return the derivatives of a bearing by the pose, from the numbers of `observe`."""
+    return s * k, -c * k, -1.0
+
+
+@kernel
+def range_slopes(c: float, s: float) -> Slopes:
+    """Return the derivatives of a range by the pose, from the numbers of `observe`."""
+    return -c, -s, 0.0
 
 
 def measurement_jacobians(
@@ -168,7 +209,8 @@ def measurement_jacobians(
            [-0. ,  0.5]])
     """
     _, _, c, s, k = observe(pose[0], pose[1], pose[2], point[0], point[1])
-    return (np.array([[-c, -s, 0.0], [s * k, -c * k, -1.0]]), np.array([[c, s], [-s * k, c * k]]))
+    by_pose = np.array([range_slopes(c, s), bearing_slopes(c, s, k)])
+    return by_pose, -by_pose[:, :2]
 
 
 @kernel

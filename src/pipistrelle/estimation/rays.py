@@ -130,7 +130,7 @@ class UpdateParams(NamedTuple):
     sharing: int
     """Update of hypotheses by a bearing: FEDERATED, AS_PRINTED (federated, other reading of the
     likelihood), EXACT (Gaussian mixture) or FITTED (federated, with ``spacing = "auto"``)."""
-    robust: bool  # whether Huber's rule is used (`estimation.ekf.gaussian`)
+    loss: int  # code of the robust loss (`measurement.robust_loss`)
     rays_weigh: bool  # whether bearing-only landmarks weigh particles (`estimation.fastslam`)
 
 
@@ -148,7 +148,7 @@ def gate_bounds(gate: float) -> tuple[float, float]:
 
 @lru_cache(maxsize=16)
 def update_params(
-    rays: RayConfig, gate: float, *, robust: bool = False, swarm: FastSlamConfig | None = None
+    rays: RayConfig, gate: float, *, loss: int = 0, swarm: FastSlamConfig | None = None
 ) -> UpdateParams:
     """Return parameters of gates and bearing-only landmarks; ``swarm``: FastSLAM's settings."""
     passive_bound, active_bound = gate_bounds(gate)
@@ -167,7 +167,7 @@ def update_params(
         aggregated=rays.weights == "aggregated",
         ranged=RANGED[rays.ranged],
         sharing=EXACT if exact else _SHARING[rays.spacing, rays.likelihood],
-        robust=robust,
+        loss=loss,
         rays_weigh=swarm is not None and swarm.weighed_by == "all",
     )
 

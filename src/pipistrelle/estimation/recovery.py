@@ -49,7 +49,12 @@ from pipistrelle.detection.scans import (
     with_columns,
 )
 from pipistrelle.estimation.beliefs import Belief, JointGaussian
-from pipistrelle.estimation.measurement import excess_path_slopes, observe
+from pipistrelle.estimation.measurement import (
+    bearing_slopes,
+    excess_path_slopes,
+    observe,
+    range_slopes,
+)
 from pipistrelle.estimation.motion import Pose, PoseCovariance
 from pipistrelle.geometry import wrap_angle
 from pipistrelle.jit import Whole, kernel, no_alloc
@@ -202,7 +207,9 @@ def _cost(problem: Problem, pose: Pose, reach: float) -> tuple[float, Float[np.n
     for m in range(ratios.shape[1]):
         squared, det, size = _direction(problem, pose, m, 0.0, A, g)
         late, variance = _lateness(problem, pose, m, 0.0, A, g)
-        most = _outlier(2.0 * math.pi * (1.0 if size == 1 else reach), det, size)
+        spread = 1.0 if math.isnan(problem[0][BEARING, m]) else 2.0 * math.pi
+        spread *= 1.0 if math.isnan(problem[0][RANGE, m]) else reach
+        most = _outlier(spread, det, size)
         latest = _outlier(2.0 * reach, variance, 1)
         ratios[0, m], ratios[1, m] = squared / most, late / latest
         cost += min(squared, most) + min(late, latest)
@@ -248,30 +255,33 @@ def _step(
 def _direction(
     problem: Problem, pose: Pose, m: Whole, weight: float, A: PoseCovariance, g: Pose
 ) -> tuple[float, float, Whole]:
-    """Return the squared residual of a bearing (and range), its determinant and dimension.
+    """Return the squared residual of a bearing and range, its determinant and dimension.
 
-    Adds them, weighted, to the normal equations. Without bearing or mapped landmark, the residual
-    is 0.
+    Adds them, weighted, to the normal equations. Without either or mapped landmark, the residual is
+    0.
     """
     numbers, ends, mean, C = problem
     i = ends[0, m]
-    if i < 0 or math.isnan(numbers[BEARING, m]):
+    no_bearing, no_range = math.isnan(numbers[BEARING, m]), math.isnan(numbers[RANGE, m])
+    if i < 0 or (no_bearing and no_range):
         return 0.0, 1.0, 1
     distance, bearing, c, s, k = observe(pose[0], pose[1], pose[2], mean[i], mean[i + 1])
     xx, xy, yy = C[i, i], C[i, i + 1], C[i + 1, i + 1]
-    nu = wrap_angle(numbers[BEARING, m] - bearing)
+    nu, off = wrap_angle(numbers[BEARING, m] - bearing), numbers[RANGE, m] - distance
     bb = (s * s * xx - 2.0 * s * c * xy + c * c * yy) * k * k + numbers[BEARING_STD, m] ** 2
-    h0, h1 = s * k, -c * k
-    if math.isnan(numbers[RANGE, m]):
+    rr = c * c * xx + 2.0 * c * s * xy + s * s * yy + numbers[RANGE_STD, m] ** 2
+    h0, h1, _ = bearing_slopes(c, s, k)
+    if no_range:
         _add(A, g, (h0, h1, -1.0), weight / bb, nu)
         return nu * nu / bb, bb, 1
-    off = numbers[RANGE, m] - distance
-    rr = c * c * xx + 2.0 * c * s * xy + s * s * yy + numbers[RANGE_STD, m] ** 2
+    if no_bearing:
+        _add(A, g, range_slopes(c, s), weight / rr, off)
+        return off * off / rr, rr, 1
     br = (-s * c * xx + (c * c - s * s) * xy + c * s * yy) * k
     # The range, then the bearing given the range: two independent numbers.
     share = br / rr
     rest, left = nu - share * off, bb - share * br
-    _add(A, g, (-c, -s, 0.0), weight / rr, off)
+    _add(A, g, range_slopes(c, s), weight / rr, off)
     _add(A, g, (h0 + share * c, h1 + share * s, -1.0), weight / left, rest)
     return off * off / rr + rest * rest / left, rr * left, 2
 

@@ -19,7 +19,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from pipistrelle.detection.scans import NUMBERS, UNLABELLED, Scan
-from pipistrelle.estimation.measurement import caller_labels
+from pipistrelle.estimation.measurement import SQUARED, caller_labels
 from pipistrelle.estimation.motion import (
     Motion,
     MotionNumbers,
@@ -206,7 +206,7 @@ def _bound(
     (steps, d), n = at.shape, border.size
     places, rows, work = Places(*places), Rows(*rows), work_of(d, n, 0)
     front = Front(np.zeros((d, n)), np.zeros((d, d)), np.zeros((n, n)))
-    noise = NoiseModel(math.inf, PRIOR_STD, wander[0], wander[1], 0.0)
+    noise = NoiseModel(SQUARED, PRIOR_STD, wander[0], wander[1], 0.0)
     R, Z = np.zeros((n, n)), np.zeros((d, n))
     for j in range(1, n):
         front.information[j, j] = 1.0 / PRIOR_STD**2

@@ -265,6 +265,7 @@ def _residuals(
     off, turned = distance - r, wrap(bearing - np.arctan2(dy, dx) + pose[:, 2])
     rest = turned - S[:, 0, 1] / S[:, 0, 0] * off
     both = off**2 / S[:, 0, 0] + rest**2 / (S[:, 1, 1] - S[:, 0, 1] ** 2 / S[:, 0, 0])
-    size = np.where(np.isnan(bearing), 0, np.where(np.isnan(distance), 1, 2))
-    size[known.landmark[n] != label] = 0
-    return np.select([size == 2, size == 1], [both, turned**2 / S[:, 1, 1]], 0.0), size
+    aimed, ranged = ~np.isnan(bearing), ~np.isnan(distance)
+    size = np.where(known.landmark[n] == label, aimed * 1 + ranged, 0)
+    alone = np.where(aimed, turned**2 / S[:, 1, 1], off**2 / S[:, 0, 0])
+    return np.select([size == 2, size == 1], [both, alone], 0.0), size

@@ -318,7 +318,7 @@ ROWS = {
     "no range": ("range 0.0", "above 0 m", "0.1,7,0.5,0"),
     "swapped": ("range -2.0", "exchange bearing and range", "0.1,7,4.0,-2"),
     "nan range": ("range 'NaN'", "leave it empty", "0.1,7,0.5,NaN"),
-    "empty": ("bearing ''", "a finite number", "0.1,7,,1"),
+    "empty": ("bearing ''", "a finite number", "0.1,7,,"),
     "twice": ("time 0.06, landmark 1 again", "line 2", "0.06,1,0.5,1"),
     "outside but wrong": ("range -2.0", "above 0 m", "99,7,0.5,-2"),
     "beside no range": ("range_std -1.0", "from 1e-06 m", "0.1,7,0.5,,0.1,-1"),
@@ -619,8 +619,7 @@ TIMED_WRONG = {
     "unknown": ("0.1,7,0.5,4.0,3.5,,bat", "line 2", "caller 'bat'", "expected boat or mate"),
     "the vehicle": ("0.1,7,0.5,4.0,3.5,,vehicle", "caller 'vehicle'"),
     "a number": ("0.1,7,0.5,4.0,3.5,,1", "caller '1'"),
-    "no bearing": ("0.1,7,,4.0,3,,boat", "bearing ''", "without a range"),
-    "nothing": ("0.1,7,,,,,boat", "bearing ''", "a further excess path alone"),
+    "nothing": ("0.1,7,,,,,boat", "bearing ''", "a further excess path"),
     "over itself": (
         "0.1,52,0.5,,3,,mate",
         "line 2",

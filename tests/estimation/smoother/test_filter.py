@@ -204,7 +204,7 @@ def test_excess_paths_that_are_off_by_far_count_by_hubers_loss(callers):
     mission, motion, start = scaled_mission("passive", 1.0, callers=callers)
     for scan in mission.scans[4::10]:
         scan.numbers[EXCESS_PATH] += 3.0
-    *_, (belief, _) = followed(smoother(motion, robust=True), mission, start)
+    *_, (belief, _) = followed(smoother(motion, robust="huber"), mission, start)
     best = at_once(belief, mission, motion, start, robust=True)
     nodes, _, places = differences(belief, *best)
     assert max(nodes) < 3 * STOPS
@@ -219,7 +219,7 @@ def test_excess_paths_that_are_off_by_far_count_by_hubers_loss(callers):
 @pytest.mark.parametrize("strategy", SENSING)
 def test_outliers_count_by_hubers_loss(strategy):
     mission, motion, start = scaled_mission(strategy, 1.0, outliers=0.05)
-    *_, (belief, _) = followed(smoother(motion, robust=True), mission, start)
+    *_, (belief, _) = followed(smoother(motion, robust="huber"), mission, start)
     best = at_once(belief, mission, motion, start, robust=True)
     nodes, _, places = differences(belief, *best)
     assert max(nodes) < 3 * STOPS

@@ -9,11 +9,7 @@ from pipistrelle.detection.scans import with_columns
 from pipistrelle.estimation.beliefs import Gaussian, placed
 from pipistrelle.estimation.measurement import excess_path_of
 from pipistrelle.estimation.motion import Motion
-from pipistrelle.estimation.smoother.filter import (
-    MAX_RELATIVE_RANGE_STD,
-    Smoother,
-    unscented_range,
-)
+from pipistrelle.estimation.smoother.filter import MAX_RELATIVE_RANGE_STD, Smoother, unscented_range
 from reference.missions import ray_config, scan_with
 
 UNICYCLE = Motion(model="unicycle", control_std=(0.05, 0.02), noise_at_rest=False)

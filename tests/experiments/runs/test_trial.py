@@ -190,7 +190,6 @@ def test_a_row_may_contain_only_an_excess_path():
     [
         ({"excess_path": np.array([3.0, np.nan])}, "numbers that no filter can use"),
         ({"excess_path": np.array([3.0, np.inf])}, "numbers that no filter can use"),
-        ({"distance": [np.nan, 4.0]}, "numbers that no filter can use"),
         ({"excess_path_std": np.array([0.1, np.nan])}, "no standard deviations above 0"),
         ({"excess_path_std": np.array([0.0, 0.1])}, "no standard deviations above 0"),
     ],
@@ -340,7 +339,7 @@ def test_a_filter_predicts_after_its_only_scan_at_the_start(name):
     [
         (scan_with(time=0.7), "scan at 0.7 s: expected the time"),
         (scan_with(time=9.0), "scan at 9.0 s: expected the time"),
-        (scan_with([3], [np.nan], [2.0], time=0.5), r"landmarks \[3\]"),
+        (scan_with([3], [np.nan], time=0.5), r"landmarks \[3\]"),
         (scan_with([3, 4], [0.1, 0.1], [2.0, -1.0], time=0.5), r"landmarks \[4\]"),
         (scan_with([3], [0.1], [np.inf], time=0.5), r"landmarks \[3\]"),
         (scan_with([3], [0.1], time=0.5, bearing_std=np.nan), r"no standard deviations .* \[3\]"),

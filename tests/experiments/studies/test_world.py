@@ -10,7 +10,7 @@ import polars as pl
 import pytest
 
 from pipistrelle.acoustics.emitter import beamwidth
-from pipistrelle.config import Config, InputError, WaterConfig
+from pipistrelle.config import PARAMETERS, Config, InputError, WaterConfig
 from pipistrelle.detection.scans import with_columns
 from pipistrelle.evaluation.bound import nees_of_exact_start, pose_bound
 from pipistrelle.evaluation.consistency import nees
@@ -212,6 +212,7 @@ OTHERS = {
     "prior.speed_scale_std": 0.01, "prior.turn_bias_std": 0.001, "prior.wheelbase_std": 0.3,
     "prior.speed_of_sound_std": 1.0, "prior.sensor_heading_std": 0.01,
     "prior.sensor_place_std": 0.5, "prior.time_offset_std": 0.01,
+    "prior.range_scale_std": 0.01, "prior.range_bias_std": 0.01,
     "rays.ratio": 0.2, "rays.density": 2.0, "rays.range_bounds": [1.0, 15.0], "rays.prune": 0.3,
     "rays.power": 4.0, "rays.weights": "aggregated", "rays.likelihood": "printed",
     "rays.spacing": "auto", "rays.ranged": "moved", "rays.merge": 2.0,
@@ -258,13 +259,7 @@ NEEDS = {
     "filter.caller_walk_std": ROAMING,
     "filter.robust": {"filter": {"noise": "measured"}},
     "filter.window": {"scenario": {"steps": 640}},
-    "prior.speed_scale_std": {"filter": {"calibrate": ["speed_scale"]}},
-    "prior.turn_bias_std": {"filter": {"calibrate": ["turn_bias"]}},
-    "prior.wheelbase_std": {"filter": {"calibrate": ["wheelbase"]}},
-    "prior.speed_of_sound_std": {"filter": {"calibrate": ["speed_of_sound"]}},
-    "prior.sensor_heading_std": {"filter": {"calibrate": ["sensor_heading"]}},
-    "prior.sensor_place_std": {"filter": {"calibrate": ["sensor_place"]}},
-    "prior.time_offset_std": {"filter": {"calibrate": ["time_offset"]}},
+    **{f"prior.{name}_std": {"filter": {"calibrate": [name]}} for name in PARAMETERS},
     "rays.spacing": {"filter": {"bearing_std": 0.003}},
     "rays.merge": {"scenario": {"steps": 80}},
     "assumed.angular_rate_std": {"motion": {"model": "unicycle"}},

@@ -19,13 +19,7 @@ import numpy as np
 
 from pipistrelle.config import STEEPEST
 from pipistrelle.detection.logs.poses import MOTION_COVARIANCE, POSE, poses_along
-from pipistrelle.detection.logs.recording import (
-    CALLER,
-    MEASUREMENTS,
-    STATED,
-    Log,
-    assemble,
-)
+from pipistrelle.detection.logs.recording import CALLER, MEASUREMENTS, STATED, Log, assemble
 from pipistrelle.detection.logs.vehicle import (
     KINDS,
     NOISY,
@@ -37,14 +31,7 @@ from pipistrelle.detection.logs.vehicle import (
 from pipistrelle.detection.scans import UNLABELLED, Scan
 from pipistrelle.files import LOG, OwnFiles, read_text
 from pipistrelle.refusals import refusal
-from pipistrelle.text_tables import (
-    Table,
-    check_unique,
-    place_of,
-    read_table,
-    rows_kept,
-    table_text,
-)
+from pipistrelle.text_tables import Table, check_unique, place_of, read_table, rows_kept, table_text
 
 ROBOTS = range(1, 6)
 LANDMARKS = range(6, 21)

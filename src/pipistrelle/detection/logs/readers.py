@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 _OTHERS = {
     frozenset({".wav", ".flac", ".aif", ".aiff", ".ogg", ".mp3"}): "an audio recording, which is "
-    "no log; make a log folder of it with `pipistrelle hear` (docs/sound.md)",
+    "no log; make a log folder of it with `pipistrelle hear` (docs/sound.md)"
 }
 """Recordings without a reader, by the suffixes of their files."""
 Robot = int | str

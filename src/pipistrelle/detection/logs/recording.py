@@ -26,21 +26,14 @@ from pipistrelle.geometry import wrap
 from pipistrelle.refusals import refusal
 from pipistrelle.text_tables import Schema, Table, check_columns, check_unique, place_of, rows_kept
 
-STATED = (
-    "bearing_std",
-    "range_std",
-    "excess_path",
-    "excess_path_std",
-    "bearing_slope",
-    "level_db",
-)
+STATED = ("bearing_std", "range_std", "excess_path", "excess_path_std", "bearing_slope", "level_db")
 """Optional columns of a measurement: standard deviations, excess path, slope of the bearing in the
 speed of sound, and level. Without labels, an excess path of 0 marks the direct call."""
 CALLER = "caller"
 """Column of the caller's number, from 1; absent or NaN for the vehicle's own call."""
 MEASUREMENTS = Schema(
     file="measurements.csv",
-    row="landmark -1: clutter, empty: unknown; a row without bearing: a further excess path",
+    row="landmark -1: clutter, empty: unknown; a row without bearing: a range or excess path",
     columns=("time", "landmark", "bearing", "range"),
     optional=(*STATED, CALLER),
     empty=("landmark", "bearing", "range"),
@@ -168,7 +161,7 @@ def assemble(
 
     `odometry` has ``time`` and two controls or, for ``motion = "poses"``, the columns of
     `motions_between`. `measurements` has the required columns of `MEASUREMENTS`, and any of the
-    optional ones (NaN if unknown); a row without a bearing is a further excess path of a landmark.
+    optional ones (NaN if unknown); a row without a bearing has a range, or a further excess path.
     `step` [s]: length of the steps into which rows are merged (None: each row is a step);
     `time_offset` [s]: delay of the measurements' times relative to the odometry's clock; `span`
     [s]: times to which the log is cut; `ignored_rows`: rows dropped so far, by reason; `settings`:
@@ -336,12 +329,12 @@ def _of_callers(measurements: Table, callers: tuple[LogCaller, ...]) -> Table:
     caller, excess_path = column.get(CALLER, nothing), column.get("excess_path", nothing)
     own = np.array([UNLABELLED, *(one.landmark for one in callers)])
     whose = own[np.where(np.isnan(caller), OWN, caller).astype(np.int64)]
-    unheard = np.isnan(column["bearing"]) & (np.isnan(excess_path) | ~np.isnan(column["range"]))
+    unheard = np.isnan(column["bearing"]) & np.isnan(excess_path) & np.isnan(column["range"])
     for wrong, found, expected, fix in (
         (
             unheard,
             "bearing ''",
-            "a finite number, or a further excess path alone, without a range",
+            "a finite number, or a range or a further excess path without it",
             "correct the field",
         ),
         (

@@ -20,12 +20,7 @@ from jaxtyping import Bool, Float, Int
 
 from pipistrelle.estimation.beliefs import JointGaussian
 from pipistrelle.estimation.data_association.existence import WINDOW
-from pipistrelle.estimation.data_association.rows import (
-    CallerPlace,
-    Model,
-    Tracks,
-    in_window,
-)
+from pipistrelle.estimation.data_association.rows import CallerPlace, Model, Tracks, in_window
 from pipistrelle.estimation.measurement import NEAREST, excess_path_slopes, range_by_excess_path
 from pipistrelle.geometry import wrap_angle
 from pipistrelle.jit import kernel, no_alloc
@@ -133,10 +128,7 @@ def _write_slopes(
 
 @kernel
 def _add_priors(
-    normal: tuple[np.ndarray, ...],
-    unknown: Float[np.ndarray, " u"],
-    seen: Seen,
-    model: Model,
+    normal: tuple[np.ndarray, ...], unknown: Float[np.ndarray, " u"], seen: Seen, model: Model
 ) -> float:
     """Add the priors of a caller's range and motion and of the poses' errors; return the cost."""
     (times, poses, _, _), (along, turn, speed, walk, _) = seen, model

@@ -157,10 +157,7 @@ def merged(known: Known, pairs: Sequence[tuple[int, int]]) -> Known:
 
 
 RowColumns = tuple[
-    Int[np.ndarray, " m"],
-    Int[np.ndarray, " m"],
-    Float[np.ndarray, " m"],
-    Float[np.ndarray, " m"],
+    Int[np.ndarray, " m"], Int[np.ndarray, " m"], Float[np.ndarray, " m"], Float[np.ndarray, " m"]
 ]
 """Columns of a scan: label, caller, level and surety (0 to 1)."""
 Place = tuple[
@@ -241,9 +238,7 @@ def _lower(known: Known, n: Whole, fall: float, scan: Whole) -> None:
 
 @no_alloc
 def _count_together(
-    together: UInt8[np.ndarray, "l l"],
-    place: Int[np.ndarray, " m"],
-    caller: Int[np.ndarray, " m"],
+    together: UInt8[np.ndarray, "l l"], place: Int[np.ndarray, " m"], caller: Int[np.ndarray, " m"]
 ) -> None:
     """Increase the number of joint detections of each pair of landmarks by the same caller."""
     for a in range(place.size):

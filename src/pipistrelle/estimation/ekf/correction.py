@@ -24,16 +24,20 @@ import math
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from pipistrelle.detection.scans import RANGE
 from pipistrelle.estimation.ekf.delayed_initialization import (
     WAITING_WEIGHT,
     Scratch,
+    add_stored_range,
     add_waiting_bearing,
+    drop_stored,
     is_precise,
     member_linearity,
     members_of,
     place_at_crossing,
+    place_by_ranges,
     scratch_for,
-    second_order_bearing,
+    second_order,
 )
 from pipistrelle.estimation.ekf.gaussian import (
     APPLIED,
@@ -43,21 +47,21 @@ from pipistrelle.estimation.ekf.gaussian import (
     Labels,
     Mean,
     State,
-    bearing_variance,
     correct_active,
-    correct_bearing,
+    correct_scalar,
     drop_members,
     flush,
     inflated,
     initialise,
+    innovation_of,
     joint_of,
     point_rows,
+    predicted_variance,
+    range_only,
 )
-from pipistrelle.estimation.ekf.tdoa import (
-    correct_by_excess_path,
-    placed_by_excess_path,
-)
+from pipistrelle.estimation.ekf.tdoa import correct_by_excess_path, placed_by_excess_path
 from pipistrelle.estimation.measurement import (
+    SQUARED,
     Columns,
     ExcessPaths,
     Row,
@@ -133,15 +137,13 @@ def _merge(state: State, one: Whole, other: Whole) -> None:
 def _correct_ray(
     state: State, first: Whole, count: Whole, row: Row, params: UpdateParams, scratch: Scratch
 ) -> Whole:
-    """Update a bearing-only landmark's hypotheses by a bearing; return GATED if it fits none."""
-    joint, mean, size = state.joint, state.joint.mean, 3 + 2 * state.members[0]
+    """Update a landmark's hypotheses by a bearing or a range; return GATED if it fits none."""
+    joint, size = state.joint, 3 + 2 * state.members[0]
     weight, outcome = state.weight[first:], GATED
-    bearing, variance = row.bearing, row.bearing_variance
     for j in range(count):
         i = 3 + 2 * (first + j)
-        _, expected, c, s, k = observe(mean[0], mean[1], mean[2], mean[i], mean[i + 1])
-        innovation = wrap_angle(bearing - expected)
-        S = bearing_variance(joint, size, i, c, s, k) + variance
+        innovation, slopes, variance, _ = innovation_of(joint, i, row)
+        S = predicted_variance(joint, size, i, slopes) + variance
         scratch.likelihood[j] = log_likelihood(innovation, S, params.sharing == AS_PRINTED)
         if innovation * innovation <= params.passive_bound * S:
             outcome = APPLIED
@@ -152,8 +154,7 @@ def _correct_ray(
     )
     for j in range(count):
         if scratch.share[j] > 0.0:
-            i = 3 + 2 * (first + j)
-            correct_bearing(joint, size, i, bearing, variance / scratch.share[j], np.inf)
+            correct_scalar(joint, size, 3 + 2 * (first + j), row, np.inf, scratch.share[j])
     return APPLIED
 
 
@@ -181,7 +182,7 @@ def _correct_ranged_ray(
 def _correct_partial(
     state: State, first: Whole, count: Whole, row: Row, params: UpdateParams, scratch: Scratch
 ) -> Whole:
-    """Update, prune and merge a bearing-only landmark by a bearing; return GATED or APPLIED."""
+    """Update, prune and merge a landmark's hypotheses; return GATED or APPLIED."""
     if _correct_ray(state, first, count, row, params, scratch) == GATED:
         return GATED
     kept = survivors(state.weight[first:], count, params.prune, scratch.keep)
@@ -201,7 +202,7 @@ def _correct_precisely(
         variance = member_linearity(params) ** 2
         coarse = Row(row.landmark, row.bearing, row.range, variance, row.range_variance)
         return _correct_partial(state, first, count, coarse, params, scratch)
-    if place_at_crossing(state, first, row, params.robust):
+    if place_at_crossing(state, first, row, params.loss):
         scratch.keep[0], scratch.keep[1] = True, False
         drop_members(state, first, count, scratch.keep, scratch.source)
     return APPLIED
@@ -213,15 +214,12 @@ def _correct_placed(
 ) -> Whole:
     """Update an initialised landmark by a measurement; return GATED or APPLIED."""
     joint, size, i = state.joint, 3 + 2 * state.members[0], 3 + 2 * first
-    distance, bearing, variance = row.range, row.bearing, row.bearing_variance
-    if math.isnan(distance):
-        if is_precise(row, params):
-            bearing, variance = second_order_bearing(joint, size, i, row)
-        degrees, bound = 1.0, params.passive_bound
-        squared = correct_bearing(joint, size, i, bearing, variance, bound)
+    if math.isnan(row.range) or math.isnan(row.bearing):
+        if math.isnan(row.bearing) or is_precise(row, params):
+            row = second_order(joint, size, i, row)
+        degrees, squared = 1.0, correct_scalar(joint, size, i, row, params.passive_bound, 1.0)
     else:
-        degrees, bound, spread = 2.0, params.active_bound, row.range_variance
-        squared = correct_active(joint, size, i, distance, bearing, spread, variance, bound)
+        degrees, squared = 2.0, correct_active(joint, size, i, row, params.active_bound)
     if squared == BEYOND:
         return GATED
     if not math.isnan(squared):
@@ -234,16 +232,32 @@ def _correct_placed(
 def _correct_known(state: State, row: Row, params: UpdateParams, scratch: Scratch) -> Whole:
     """Update the joint Gaussian by a mapped landmark's measurement; return GATED or APPLIED."""
     first, count = members_of(state.landmark, state.members[0], row.landmark)
-    if params.robust and state.weight[first] != WAITING_WEIGHT:
-        row = inflated(state, first, count, row)
+    if state.weight[first] < WAITING_WEIGHT:
+        drop_stored(state, row.landmark, scratch, 0)
+        _add_new(state, row, params, False)
+        return APPLIED
+    if params.loss != SQUARED and state.weight[first] != WAITING_WEIGHT:
+        row = inflated(state, first, count, row, params.loss)
     if count == 1:
         return _correct_placed(state, first, row, params, scratch)
-    passive = math.isnan(row.range) or params.ranged == BEARING
+    passive = math.isnan(row.range + row.bearing) or params.ranged == BEARING
     if passive and (state.weight[first] == WAITING_WEIGHT or is_precise(row, params)):
         return _correct_precisely(state, first, count, row, params, scratch)
     if not passive:
         return _correct_ranged_ray(state, first, count, row, params, scratch)
     return _correct_partial(state, first, count, row, params, scratch)
+
+
+@no_alloc
+def _correct_by_range(state: State, row: Row, params: UpdateParams, scratch: Scratch) -> Whole:
+    """Update the state by a range-only measurement, or store it; return GATED or APPLIED."""
+    first, count = members_of(state.landmark, state.members[0], row.landmark)
+    if count > 0 and state.weight[first] > WAITING_WEIGHT:
+        return _correct_known(state, row, params, scratch)
+    stores = count == 0 or state.weight[first] < WAITING_WEIGHT
+    if stores and add_stored_range(state, row, scratch):
+        place_by_ranges(state, row, params.loss, scratch)
+    return APPLIED
 
 
 @no_alloc
@@ -285,7 +299,7 @@ def _take_in(
         if known[m]:
             row, placed = row_of(columns, m), False
             if paths is not None:
-                placed = placed_by_excess_path(state, row, paths, params.robust, scratch)
+                placed = placed_by_excess_path(state, row, paths, params.loss, scratch)
             if not placed:
                 gated += _correct_known(state, row, params, scratch)
     flush(state.joint, 3 + 2 * state.members[0])
@@ -293,10 +307,15 @@ def _take_in(
         if not known[m]:
             row, placed, moves = row_of(columns, m), False, False
             if paths is not None and moving is not None:
-                placed = placed_by_excess_path(state, row, paths, params.robust, scratch)
+                placed = placed_by_excess_path(state, row, paths, params.loss, scratch)
                 moves = row.landmark in moving
             if not placed:
                 _add_new(state, row, params, moves)
+    for m in range(known.size, columns[0].size):
+        if not math.isnan(columns[1][RANGE, m]):
+            gated += _correct_by_range(state, range_only(row_of(columns, m)), params, scratch)
+    if known.size < columns[0].size:
+        flush(state.joint, 3 + 2 * state.members[0])
     if paths is not None:
         for d in range(paths.landmark.size):
             if not paths.used[d]:
@@ -324,9 +343,11 @@ def corrected(
     most = members
     for m in range(known.size):
         row = row_of(columns, m)
-        known[m] = members_of(old_landmark, members, row.landmark)[1] > 0
-        if not known[m]:
+        first, count = members_of(old_landmark, members, row.landmark)
+        known[m] = count > 0
+        if not known[m] or old_weight[first] < WAITING_WEIGHT:
             most += max(params.ray_ranges.size, 2) if math.isnan(row.range) else 1
+    most += 2 * (columns[0].size - known.size)  # a stored range, and its place
     joint, scratch = joint_of(old_mean, old_covariance, 3 + 2 * most, turns), scratch_for(most)
     landmark, weight = np.empty(most, dtype=np.int64), np.empty(most)
     state = State(joint, landmark, weight, np.full(1, members))

@@ -1,4 +1,4 @@
-r"""Delayed initialization: store precise bearings until a second bearing crosses them.
+r"""Delayed initialization: store precise bearings, and ranges, until they place a landmark.
 
 **Stored bearings.** A landmark first measured by a bearing too precise for ray hypotheses
 (`is_precise`) enters the state as two points: :math:`p_0`, the position of the vehicle, and q, a
@@ -16,10 +16,15 @@ not used. The covariance of l follows from
 
 with t the position of the crossing on the first ray in units of :math:`|q - p_0|`.
 
+**Stored ranges.** Of a landmark with ranges only, the positions of the vehicle enter the state,
+with the range at each as a weight (`drop_stored`). When they leave a single place
+(`trilateration`), its derivatives by ranges and positions correlate it with the state.
+
 **Second order.** Let :math:`P_{aa}, P_{cc}, P_{ac}` be the covariance of a landmark relative to
 the vehicle, along and across the line of sight. Its bearing then has a bias of
-:math:`-P_{ac}/r^2` and the additional variance :math:`(P_{aa} P_{cc} + P_{ac}^2)/r^4`
-(Bar-Shalom, Li & Kirubarajan 2001, Sec. 10.3.2), for which precise bearings are corrected.
+:math:`-P_{ac}/r^2` and the additional variance :math:`(P_{aa} P_{cc} + P_{ac}^2)/r^4`, its range
+:math:`P_{cc} / 2r` and :math:`P_{cc}^2 / 2r^2` (Bar-Shalom, Li & Kirubarajan 2001, Sec. 10.3.2).
+Precise bearings and range-only measurements are corrected for it.
 """
 
 import math
@@ -32,6 +37,7 @@ from pipistrelle.estimation.ekf.gaussian import (
     Joint,
     Labels,
     State,
+    drop_members,
     flush,
     initialise,
     relative_covariance,
@@ -39,10 +45,13 @@ from pipistrelle.estimation.ekf.gaussian import (
 from pipistrelle.estimation.measurement import (
     MAX_RELATIVE_RANGE_STD,
     NEAREST,
+    SQUARED,
     Row,
     observe,
+    robust_loss,
 )
 from pipistrelle.estimation.rays import FITTED, UpdateParams
+from pipistrelle.estimation.trilateration import MIN_SPACING, Ranges, located, refined
 from pipistrelle.jit import Whole, kernel, no_alloc
 
 
@@ -103,8 +112,8 @@ def is_precise(row: Row, params: UpdateParams) -> bool:
 
 
 @no_alloc
-def second_order_bearing(joint: Joint, size: Whole, i: Whole, row: Row) -> tuple[float, float]:
-    """Correct a bearing for its second-order bias; return it and its larger variance."""
+def second_order(joint: Joint, size: Whole, i: Whole, row: Row) -> Row:
+    """Correct a bearing, or a range-only measurement, for its second-order bias and variance."""
     mean = joint.mean
     _, _, c, s, k = observe(mean[0], mean[1], mean[2], mean[i], mean[i + 1])
     xx, xy, yy = relative_covariance(joint, size, i)
@@ -112,8 +121,12 @@ def second_order_bearing(joint: Joint, size: Whole, i: Whole, row: Row) -> tuple
     across = s * s * xx - 2.0 * c * s * xy + c * c * yy
     cross = c * s * (yy - xx) + (c * c - s * s) * xy
     square = k * k
+    if math.isnan(row.bearing):
+        bent = max(across, 0.0) * k
+        wider = row.range_variance + 0.5 * bent * bent
+        return Row(row.landmark, row.bearing, row.range - 0.5 * bent, math.nan, wider)
     variance = row.bearing_variance + (along * across + cross * cross) * square * square
-    return row.bearing + cross * square, variance
+    return Row(row.landmark, row.bearing + cross * square, row.range, variance, row.range_variance)
 
 
 @no_alloc
@@ -128,11 +141,104 @@ def add_waiting_bearing(state: State, row: Row, params: UpdateParams) -> None:
         state.members[0] += 1
 
 
+MAX_STORED = 16
+"""Most stored ranges of a landmark; when reached, every second is dropped."""
+
+
 @no_alloc
-def place_at_crossing(state: State, first: Whole, row: Row, robust: bool) -> bool:
+def drop_stored(state: State, label: Whole, scratch: Scratch, spared: Whole) -> None:
+    """Drop a landmark's stored ranges; of ``spared`` successive ranges keep the first (0: none).
+
+    They are not contiguous; their weights are `WAITING_WEIGHT` minus the range [m].
+    """
+    members, count = state.members[0], 0
+    for member in range(members):
+        stored = state.landmark[member] == label and state.weight[member] < WAITING_WEIGHT
+        scratch.keep[member] = not stored or (spared > 0 and count % spared == 0)
+        count += stored
+    drop_members(state, 0, members, scratch.keep, scratch.source)
+
+
+@no_alloc
+def add_stored_range(state: State, row: Row, scratch: Scratch) -> bool:
+    """Store the vehicle's position and a range; return False if it is too near a stored range."""
+    mean, count, least = state.joint.mean, 0, MIN_SPACING**2 * row.range_variance
+    for member in range(state.members[0]):
+        if state.landmark[member] == row.landmark:
+            count += 1
+            dx, dy = mean[3 + 2 * member] - mean[0], mean[4 + 2 * member] - mean[1]
+            if dx * dx + dy * dy < least:
+                return False
+    if count == MAX_STORED:
+        drop_stored(state, row.landmark, scratch, 2)
+    flush(state.joint, 3 + 2 * state.members[0])
+    member = state.members[0]
+    initialise(state.joint, 3 + 2 * member, 3 + 2 * member, 0.0, 0.0, 0.0, 0.0)
+    state.landmark[member], state.weight[member] = row.landmark, WAITING_WEIGHT - row.range
+    state.members[0] += 1
+    return True
+
+
+@no_alloc
+def _stored_ranges(state: State, row: Row, scratch: Scratch) -> Ranges:
+    """Return the stored ranges of a measured landmark; nothing may be deferred."""
+    joint, points, at, count = state.joint, state.joint.W[0], scratch.source, 0
+    for member in range(state.members[0]):
+        if state.landmark[member] == row.landmark:
+            i = 3 + 2 * member
+            points[2 * count], points[2 * count + 1] = joint.mean[i], joint.mean[i + 1]
+            scratch.likelihood[count] = WAITING_WEIGHT - state.weight[member]
+            scratch.share[count], at[count] = row.range_variance, i
+            count += 1
+    measured = scratch.likelihood, scratch.share
+    return Ranges(points, *measured, at, joint.covariance, count, joint.W[1:])
+
+
+@no_alloc
+def place_by_ranges(state: State, row: Row, loss: Whole, scratch: Scratch) -> None:
+    """Initialise a landmark where its stored ranges leave a single place; correlate it."""
+    mean, P, i = state.joint.mean, state.joint.covariance, 3 + 2 * state.members[0]
+    ranges = _stored_ranges(state, row, scratch)
+    places, place, _ = located(ranges, mean[0], mean[1], loss)
+    if places != 1:
+        return
+    place = refined(ranges, place[0], place[1], loss)
+    mean[i], mean[i + 1] = place[0], place[1]
+    at, n, work = ranges.at, ranges.count, ranges.work
+    gx, gy, c, s = work[0], work[1], work[2], work[3]
+    xx = xy = yy = 0.0
+    for j in range(n):
+        dx, dy = mean[i] - mean[at[j]], mean[i + 1] - mean[at[j] + 1]
+        away = max(math.sqrt(dx * dx + dy * dy), NEAREST)
+        c[j], s[j], off = dx / away, dy / away, away - ranges.distance[j]
+        noise = row.range_variance * robust_loss(off * off / row.range_variance, loss)[0]
+        xx, xy = xx + noise * gx[j] * gx[j], xy + noise * gx[j] * gy[j]
+        yy += noise * gy[j] * gy[j]
+    for a in range(i):
+        px = py = 0.0
+        for j in range(n):
+            along = c[j] * P[at[j], a] + s[j] * P[at[j] + 1, a]
+            px, py = px + gx[j] * along, py + gy[j] * along
+        P[i, a] = P[a, i] = px
+        P[i + 1, a] = P[a, i + 1] = py
+    for j in range(n):
+        by_x = c[j] * P[i, at[j]] + s[j] * P[i, at[j] + 1]
+        by_y = c[j] * P[i + 1, at[j]] + s[j] * P[i + 1, at[j] + 1]
+        xx, xy, yy = xx + gx[j] * by_x, xy + gy[j] * by_x, yy + gy[j] * by_y
+    P[i, i], P[i + 1, i + 1] = xx, yy
+    P[i, i + 1] = P[i + 1, i] = xy
+    member = state.members[0]
+    state.landmark[member], state.weight[member] = row.landmark, 1.0
+    state.members[0] += 1
+    drop_stored(state, row.landmark, scratch, 0)
+
+
+@no_alloc
+def place_at_crossing(state: State, first: Whole, row: Row, loss: Whole) -> bool:
     """Initialise a landmark where two bearings cross; return False if this is too uncertain.
 
-    It replaces the first stored point; the caller drops the second. ``robust``: larger angles only.
+    It replaces the first stored point; the caller drops the second. A robust loss needs larger
+    angles.
     """
     joint, size, i = state.joint, 3 + 2 * state.members[0], 3 + 2 * first
     mean, P, turns = joint.mean, joint.covariance, joint.turns
@@ -143,7 +249,7 @@ def place_at_crossing(state: State, first: Whole, row: Row, robust: bool) -> boo
     nx, ny = -along_y / length, along_x / length
     ux, uy = math.cos(direction), math.sin(direction)
     sine = nx * ux + ny * uy
-    if abs(sine) < (MIN_CROSSING_SINE if robust else PARALLEL_SINE):
+    if abs(sine) < (PARALLEL_SINE if loss == SQUARED else MIN_CROSSING_SINE):
         return False
     dx, dy = mean[i] - mean[0], mean[i + 1] - mean[1]
     r = (nx * dx + ny * dy) / sine

@@ -68,7 +68,7 @@ from pipistrelle.estimation.ekf.gaussian import (
     rotated_left,
     shifted_covariance,
 )
-from pipistrelle.estimation.measurement import scan_columns, timings_of
+from pipistrelle.estimation.measurement import LOSSES, scan_columns, timings_of
 from pipistrelle.estimation.motion import Controls, Durations, Motion, Pose, motion_numbers
 from pipistrelle.estimation.rays import update_params
 from pipistrelle.estimation.recovery import Recoverable, recovering
@@ -148,13 +148,13 @@ MERGE_BOUND = 100.0
 
 
 @kernel
-def is_placed(landmark: Labels) -> Bool[np.ndarray, " h"]:
+def is_placed(landmark: Labels, weight: Float[np.ndarray, " h"]) -> Bool[np.ndarray, " h"]:
     """Return a mask of the hypotheses that are the only hypothesis of their landmark or caller.
 
-    >>> is_placed(np.array([4, 7, 7, 51, -53]))
+    >>> is_placed(np.array([4, 7, 7, 51, -53]), np.ones(5))
     array([ True, False, False,  True, False])
     """
-    placed = landmark >= 0
+    placed = (landmark >= 0) & (weight >= 0.0)
     for n in range(1, landmark.size):
         if landmark[n] == landmark[n - 1]:  # hypotheses of a landmark are contiguous
             placed[n - 1] = placed[n] = False
@@ -202,7 +202,7 @@ def merged(belief: "EkfBelief", kept: int, gone: int) -> "EkfBelief":
         raise InputError(
             f"association: found the landmarks {kept} and {gone} to merge; expected two that stand"
         )
-    placed = is_placed(landmark)
+    placed = is_placed(landmark, belief.weight)
     if placed[first].all() and placed[second].all():
         k, g = 3 + 2 * int(first.argmax()), 3 + 2 * int(second.argmax())
         mean, covariance = _equated(belief.mean, belief.covariance, k, g, belief.error)
@@ -263,7 +263,7 @@ class EkfBelief(Recoverable):
     entry for its velocity [m/s], with another label (`velocity_of`)."""
     weight: Float[np.ndarray, " h"]
     """Aggregated likelihood of each hypothesis within its landmark; `WAITING_WEIGHT` for stored
-    bearings."""
+    bearings, and less the range [m] for stored ranges, which are not on the map."""
     error: float = LINEAR
     """Error definition: `gaussian.LINEAR` or `gaussian.INVARIANT`."""
     origin: Float[np.ndarray, "2"] = field(default_factory=lambda: np.zeros(2))
@@ -281,7 +281,7 @@ class EkfBelief(Recoverable):
 
     def landmarks(self) -> Landmarks:
         """Return the map of landmarks that do not move, a row per hypothesis."""
-        return self.rows(is_standing(self.landmark))
+        return self.rows(is_standing(self.landmark) & (self.weight >= WAITING_WEIGHT))
 
     def moving(self) -> Landmarks:
         """Return the estimates of moving callers, a row per hypothesis."""
@@ -294,7 +294,7 @@ class EkfBelief(Recoverable):
 
     def joint(self, among: Int[np.ndarray, " n"] | None = None) -> JointGaussian:
         """Return the joint Gaussian of pose, initialised landmarks and moving callers."""
-        placed = is_placed(self.landmark)
+        placed = is_placed(self.landmark, self.weight)
         if among is not None:
             placed &= (self.landmark[:, np.newaxis] == among).any(axis=1)  # faster than np.isin
         mean, covariance = self._linear(placed, with_pose=True)
@@ -414,8 +414,8 @@ class EkfSlam:
     gate: float = 1.0
     """Gate: measurements outside this share of their predicted distribution (chi-square) are
     discarded; 1 keeps all."""
-    robust: bool = False
-    """Whether measurements of large innovation are down-weighted (Huber, `gaussian.inflated`)."""
+    robust: str = "none"
+    """Loss of measurements of large innovation: none, huber or cauchy (`gaussian.inflated`)."""
     speed_std: float = 1.0
     """Initial standard deviation of a moving caller's velocity along each axis [m/s]."""
     walk_std: float = 0.2
@@ -424,8 +424,8 @@ class EkfSlam:
     """Error of the initial belief: `gaussian.LINEAR` or `gaussian.INVARIANT`."""
 
     def __post_init__(self) -> None:
-        """Raise InputError unless the gate is a probability in (0, 1]."""
-        check_gate(self.gate)
+        """Raise InputError for an unknown loss, or a gate that is no probability in (0, 1]."""
+        check_gate(self.gate, self.robust)
 
     def init(self, pose: Gaussian) -> EkfBelief:
         """Return the initial belief at a start pose with its covariance, without landmarks."""
@@ -526,7 +526,7 @@ class EkfSlam:
             belief.weight,
             scan_columns(scan),
             timings_of(scan),
-            update_params(self.rays, self.gate, robust=self.robust),
+            update_params(self.rays, self.gate, loss=LOSSES.index(self.robust)),
             belief.error,
         )
         after = replace(

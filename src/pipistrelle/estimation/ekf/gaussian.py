@@ -11,15 +11,14 @@ The covariance is of the *linear* error, true state minus mean, or of the *right
 which has no heading column in H: ``turns`` multiplies it, 0 for the
 invariant and 1 for the linear error.
 
-**Huber's rule** (`inflated`): with the innovation :math:`\nu`, its expected variance S and
-:math:`e = |\nu| / \sqrt S`,
+**Robust losses** (`inflated`): an innovation :math:`\nu` with the expected variance S has the
+factor f of `measurement.robust_loss` at :math:`\nu^2 / S`, and
 
-.. math:: R' = R + S\,(e / k - 1) \quad (e > k = 2)
+.. math:: R' = R + S\,(f - 1)
 
-makes S' = S e / k, which limits the update to that of an innovation of k standard deviations. Range
-and bearing are treated separately, a ray by its hypothesis of least innovation. Source: Huber,
-Robust Statistics (1981); applied to innovations as by Karlgaard & Schaub, Journal of Guidance,
-Control, and Dynamics 30 (2007).
+makes S' = S f: Huber's loss limits the update to that of an innovation of k standard deviations.
+Range and bearing are treated separately, a ray by its hypothesis of least innovation. Applied to
+innovations as by Karlgaard & Schaub, Journal of Guidance, Control, and Dynamics 30 (2007).
 
 **The right-invariant error** avoids false information on the heading. The linear error is
 linearised at means that change between frames. Updates then reduce the variance of the common
@@ -54,7 +53,15 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from pipistrelle.estimation.measurement import HUBER_K, NEAREST, Row, observe
+from pipistrelle.estimation.measurement import (
+    NEAREST,
+    Row,
+    Slopes,
+    bearing_slopes,
+    observe,
+    range_slopes,
+    robust_loss,
+)
 from pipistrelle.estimation.motion import (
     Controls,
     Durations,
@@ -348,9 +355,9 @@ def relative_covariance(joint: Joint, size: Whole, i: Whole) -> tuple[float, flo
 
 
 @no_alloc
-def bearing_variance(joint: Joint, size: Whole, i: Whole, c: float, s: float, k: float) -> float:
-    """Return the predicted variance of the bearing to the hypothesis at index i."""
-    h0, h1, turns = s * k, -c * k, joint.turns  # by pose: (h0, h1, -turns); by point: (-h0, -h1)
+def predicted_variance(joint: Joint, size: Whole, i: Whole, slopes: Slopes) -> float:
+    """Return the predicted variance of a bearing or range of the hypothesis at index i."""
+    (h0, h1, turn), turns = slopes, joint.turns
     p0, p1, p2 = joint.covariance[0], joint.covariance[1], joint.covariance[2]
     pi, pj = point_rows(joint, size, i)
     pxx = p0[0] - 2.0 * p0[i] + pi[i]
@@ -360,56 +367,70 @@ def bearing_variance(joint: Joint, size: Whole, i: Whole, c: float, s: float, k:
     pyh = p1[2] - p2[i + 1]
     return (
         h0 * h0 * pxx + 2.0 * h0 * h1 * pxy + h1 * h1 * pyy
-        - turns * 2.0 * (h0 * pxh + h1 * pyh) + turns * p2[2]
+        + turn * turns * 2.0 * (h0 * pxh + h1 * pyh) + turn * turn * turns * p2[2]
     )  # fmt: skip
 
 
 @no_alloc
-def correct_bearing(
-    joint: Joint, size: Whole, i: Whole, bearing: float, variance: float, bound: float
-) -> float:
-    """Update the state by a bearing to the hypothesis at index i, unless it exceeds the gate.
+def innovation_of(joint: Joint, i: Whole, row: Row) -> tuple[float, Slopes, float, float]:
+    """Return the innovation of a bearing, or of a range-only measurement, at index i.
 
-    Returns the squared normalised innovation, BEYOND or UNFORESEEN.
+    Returns also its derivatives by the pose, its variance, and the distance.
     """
     mean = joint.mean
     distance, expected, c, s, k = observe(mean[0], mean[1], mean[2], mean[i], mean[i + 1])
-    if distance < NEAREST:
-        return UNFORESEEN
-    if joint.taken[WAITING] == MAX_WAITING:
-        flush(joint, size)
-    innovation = wrap_angle(bearing - expected)
-    h0, h1, turns = s * k, -c * k, joint.turns
-    p0, p1, p2 = joint.covariance[0], joint.covariance[1], joint.covariance[2]
-    pi, pj = point_rows(joint, size, i)
-    # w = P H^T / sqrt(S), x += w nu / sqrt(S), P -= w w^T
-    w0 = joint.W[joint.taken[WAITING]]
-    for a in range(size):
-        w0[a] = h0 * (p0[a] - pi[a]) + h1 * (p1[a] - pj[a]) - turns * p2[a]
-    S = h0 * (w0[0] - w0[i]) + h1 * (w0[1] - w0[i + 1]) - turns * w0[2] + variance
+    if math.isnan(row.bearing):
+        return row.range - distance, range_slopes(c, s), row.range_variance, distance
+    innovation = wrap_angle(row.bearing - expected)
+    return innovation, bearing_slopes(c, s, k), row.bearing_variance, distance
+
+
+@no_alloc
+def corrected_by(
+    joint: Joint, size: Whole, w: Float[np.ndarray, " m"], innovation: float, S: float, bound: float
+) -> float:
+    """Update the state by a number of covariances w with it; return squared innovation or BEYOND.
+
+    ``w`` is divided by the root of S: x += w nu / sqrt(S), P -= w w^T.
+    """
     if innovation * innovation > bound * S:
         return BEYOND
     root = 1.0 / math.sqrt(S)
     for a in range(size):
-        w0[a] *= root
+        w[a] *= root
     step = root * innovation
-    if turns == 0.0:
-        retract(joint.mean, size, w0, step, w0, 0.0)
-    defer(joint, size, w0, turns * step)
+    if joint.turns == 0.0:
+        retract(joint.mean, size, w, step, w, 0.0)
+    defer(joint, size, w, joint.turns * step)
     return step * step
 
 
 @no_alloc
-def correct_active(
-    joint: Joint,
-    size: Whole,
-    i: Whole,
-    distance: float,
-    bearing: float,
-    range_variance: float,
-    bearing_variance: float,
-    bound: float,
+def correct_scalar(
+    joint: Joint, size: Whole, i: Whole, row: Row, bound: float, share: float
 ) -> float:
+    """Update the state by a bearing, or a range-only measurement, at index i, unless gated.
+
+    ``share``: share of its information. Returns the squared normalised innovation, BEYOND or
+    UNFORESEEN.
+    """
+    innovation, (h0, h1, turn), variance, distance = innovation_of(joint, i, row)
+    if distance < NEAREST:
+        return UNFORESEEN
+    if joint.taken[WAITING] == MAX_WAITING:
+        flush(joint, size)
+    turned = turn * joint.turns
+    p0, p1, p2 = joint.covariance[0], joint.covariance[1], joint.covariance[2]
+    pi, pj = point_rows(joint, size, i)
+    w = joint.W[joint.taken[WAITING]]
+    for a in range(size):
+        w[a] = h0 * (p0[a] - pi[a]) + h1 * (p1[a] - pj[a]) + turned * p2[a]
+    S = h0 * (w[0] - w[i]) + h1 * (w[1] - w[i + 1]) + turned * w[2] + variance / share
+    return corrected_by(joint, size, w, innovation, S, bound)
+
+
+@no_alloc
+def correct_active(joint: Joint, size: Whole, i: Whole, row: Row, bound: float) -> float:
     """Update the state by range and bearing unless gated; return squared innovation or BEYOND."""
     mean = joint.mean
     near, expected, c, s, k = observe(mean[0], mean[1], mean[2], mean[i], mean[i + 1])
@@ -417,7 +438,7 @@ def correct_active(
         return UNFORESEEN
     if joint.taken[WAITING] + 2 > MAX_WAITING:
         flush(joint, size)
-    nu0, nu1 = distance - near, wrap_angle(bearing - expected)
+    nu0, nu1 = row.range - near, wrap_angle(row.bearing - expected)
     h0, h1, turns = s * k, -c * k, joint.turns
     p0, p1, p2 = joint.covariance[0], joint.covariance[1], joint.covariance[2]
     pi, pj = point_rows(joint, size, i)
@@ -427,9 +448,9 @@ def correct_active(
         east, north = p0[a] - pi[a], p1[a] - pj[a]
         w0[a] = -c * east - s * north
         w1[a] = h0 * east + h1 * north - turns * p2[a]
-    S00 = -c * (w0[0] - w0[i]) - s * (w0[1] - w0[i + 1]) + range_variance
+    S00 = -c * (w0[0] - w0[i]) - s * (w0[1] - w0[i + 1]) + row.range_variance
     S01 = h0 * (w0[0] - w0[i]) + h1 * (w0[1] - w0[i + 1]) - turns * w0[2]
-    S11 = h0 * (w1[0] - w1[i]) + h1 * (w1[1] - w1[i + 1]) - turns * w1[2] + bearing_variance
+    S11 = h0 * (w1[0] - w1[i]) + h1 * (w1[1] - w1[i + 1]) - turns * w1[2] + row.bearing_variance
     L00 = math.sqrt(S00)
     L10 = S01 / L00
     L11 = math.sqrt(S11 - L10 * L10)
@@ -510,34 +531,32 @@ def drop_members(
 
 
 @no_alloc
-def _excess(squared: float, S: float) -> float:
-    """Return the variance to add so that an innovation is within `HUBER_K` standard deviations."""
-    return S * max(math.sqrt(squared / S) / HUBER_K - 1.0, 0.0)
+def range_only(row: Row) -> Row:
+    """Return a measurement without its bearing."""
+    return Row(row.landmark, math.nan, row.range, math.nan, row.range_variance)
 
 
 @no_alloc
-def inflated(state: State, first: Whole, count: Whole, row: Row) -> Row:
-    """Return a measurement with variances inflated by Huber's rule, if its innovation is large."""
-    joint, mean, size = state.joint, state.joint.mean, 3 + 2 * state.members[0]
-    across, least, along = 0.0, math.inf, 0.0
+def _excess(joint: Joint, size: Whole, i: Whole, row: Row, loss: Whole) -> tuple[float, float]:
+    """Return a bearing's or a range's normalised innovation, and the variance that a loss adds."""
+    innovation, slopes, variance, _ = innovation_of(joint, i, row)
+    S = predicted_variance(joint, size, i, slopes) + variance
+    squared = innovation * innovation / S
+    return squared, S * (robust_loss(squared, loss)[0] - 1.0)
+
+
+@no_alloc
+def inflated(state: State, first: Whole, count: Whole, row: Row, loss: Whole) -> Row:
+    """Return a measurement with variances inflated by a robust loss, if its innovation is large."""
+    joint, size = state.joint, 3 + 2 * state.members[0]
+    least, across, along = math.inf, 0.0, 0.0
     for j in range(count):
-        i = 3 + 2 * (first + j)
-        near, expected, c, s, k = observe(mean[0], mean[1], mean[2], mean[i], mean[i + 1])
-        if near < NEAREST:
-            return row
-        innovation = wrap_angle(row.bearing - expected)
-        S = bearing_variance(joint, size, i, c, s, k) + row.bearing_variance
-        if innovation * innovation < least * S:
-            least = innovation * innovation / S
-            across = _excess(innovation * innovation, S)
-        if count == 1 and not math.isnan(row.range):
-            xx, xy, yy = relative_covariance(joint, size, i)
-            S = c * c * xx + 2.0 * c * s * xy + s * s * yy + row.range_variance
-            along = _excess((row.range - near) ** 2, S)
-    return Row(
-        row.landmark,
-        row.bearing,
-        row.range,
-        row.bearing_variance + across,
-        row.range_variance + along,
-    )
+        squared, excess = _excess(joint, size, 3 + 2 * (first + j), row, loss)
+        if squared < least:
+            least, across = squared, excess
+    if math.isnan(row.bearing):
+        across, along = 0.0, across
+    elif count == 1 and not math.isnan(row.range):
+        along = _excess(joint, size, 3 + 2 * first, range_only(row), loss)[1]
+    across, along = row.bearing_variance + across, row.range_variance + along
+    return Row(row.landmark, row.bearing, row.range, across, along)

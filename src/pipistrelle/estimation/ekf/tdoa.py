@@ -31,25 +31,26 @@ from jaxtyping import Float
 from pipistrelle.estimation.ekf.delayed_initialization import WAITING_WEIGHT, Scratch, members_of
 from pipistrelle.estimation.ekf.gaussian import (
     APPLIED,
+    BEYOND,
     GATED,
     MAX_WAITING,
     WAITING,
     Joint,
     State,
-    defer,
+    corrected_by,
     drop_members,
     flush,
     point_rows,
-    retract,
 )
 from pipistrelle.estimation.measurement import (
-    HUBER_K,
     MIN_TDOA_SIGMAS,
     NEAREST,
+    SQUARED,
     ExcessPaths,
     Row,
     excess_path_slopes,
     range_by_excess_path,
+    robust_loss,
 )
 from pipistrelle.estimation.rays import UpdateParams, log_likelihood, survivors, weigh_and_share
 from pipistrelle.jit import Flag, Whole, no_alloc
@@ -116,7 +117,7 @@ def correct_excess_path(
     excess_path: float,
     variance: float,
     bound: float,
-    robust: bool,
+    loss: Whole,
 ) -> Whole:
     """Update the state by an excess path via point i, caller at ib; return GATED or APPLIED."""
     if joint.taken[WAITING] == MAX_WAITING:
@@ -125,18 +126,8 @@ def correct_excess_path(
     expected, spread = _expected(joint, size, i, ib, w)
     longer, wider = _bends(joint, size, i, ib)
     innovation, S = excess_path - expected - longer, spread + wider + variance
-    if robust:
-        S *= max(abs(innovation) / (HUBER_K * math.sqrt(S)), 1.0)
-    if innovation * innovation > bound * S:
-        return GATED
-    root = 1.0 / math.sqrt(S)
-    for a in range(size):
-        w[a] *= root
-    step = root * innovation
-    if joint.turns == 0.0:
-        retract(joint.mean, size, w, step, w, 0.0)
-    defer(joint, size, w, joint.turns * step)
-    return APPLIED
+    S *= robust_loss(innovation * innovation / S, loss)[0]
+    return GATED if corrected_by(joint, size, w, innovation, S, bound) == BEYOND else APPLIED
 
 
 @no_alloc
@@ -250,16 +241,16 @@ def _single(state: State, label: Whole) -> Whole:
 
 
 @no_alloc
-def _surest(state: State, row: Row, paths: ExcessPaths, robust: bool) -> Whole:
+def _surest(state: State, row: Row, paths: ExcessPaths, loss: Whole) -> Whole:
     """Return the index of the excess path that best gives a landmark's range, or -1.
 
     It is of this landmark with an initialised caller, or via an initialised landmark if this
-    landmark is the caller. ``robust``: precise even with the bearing std multiplied by
+    landmark is the caller. With a robust loss precise even with the bearing std multiplied by
     `ROBUST_BEARING_FACTOR`.
     """
     best, least, size = -1, math.inf, 3 + 2 * state.members[0]
     across = row.bearing_variance * (
-        ROBUST_BEARING_FACTOR * ROBUST_BEARING_FACTOR if robust else 1.0
+        1.0 if loss == SQUARED else ROBUST_BEARING_FACTOR * ROBUST_BEARING_FACTOR
     )
     for d in range(paths.landmark.size):
         of_caller = paths.caller[d] == row.landmark
@@ -277,13 +268,13 @@ def _surest(state: State, row: Row, paths: ExcessPaths, robust: bool) -> Whole:
 
 @no_alloc
 def placed_by_excess_path(
-    state: State, row: Row, paths: ExcessPaths, robust: bool, scratch: Scratch
+    state: State, row: Row, paths: ExcessPaths, loss: Whole, scratch: Scratch
 ) -> bool:
     """Initialise a landmark by bearing and excess path, if precise; return whether it was."""
     first, count = members_of(state.landmark, state.members[0], row.landmark)
     if count == 1 or not math.isnan(row.range):
         return False
-    d = _surest(state, row, paths, robust)
+    d = _surest(state, row, paths, loss)
     if d < 0:
         return False
     if count > 0:
@@ -317,11 +308,11 @@ def correct_by_excess_path(
     if member >= 0 and caller >= 0:
         i, ib = 3 + 2 * member, 3 + 2 * caller
         return correct_excess_path(
-            joint, size, i, ib, excess_path, variance, params.passive_bound, params.robust
+            joint, size, i, ib, excess_path, variance, params.passive_bound, params.loss
         )
     label = paths.landmark[d] if caller >= 0 else paths.caller[d]
     first, count = members_of(state.landmark, state.members[0], label)
-    if (member < 0 and caller < 0) or count == 0 or state.weight[first] == WAITING_WEIGHT:
+    if (member < 0 and caller < 0) or count == 0 or state.weight[first] <= WAITING_WEIGHT:
         return APPLIED
     if joint.taken[WAITING] == MAX_WAITING:
         flush(joint, size)

@@ -244,6 +244,11 @@ class FastSlam:
         scan = usable_scan(scan)
         if scan.landmark.size == 0:
             return belief
+        if (np.isnan(scan.bearing) & ~np.isnan(scan.range)).any():
+            raise InputError(
+                f"scan at {scan.time} s: found a range without a bearing, which FastSLAM does not "
+                "use; take the filter ekf, iekf or smoother"
+            )
         if rng is None:
             raise InputError("update: found no generator, expected one: FastSLAM draws poses by it")
         particles, sampled = self.settings.particles, self.settings.weights == "sampled"

@@ -245,11 +245,7 @@ def _correct(
 
 @no_alloc
 def _place(
-    block: Block,
-    slot: Int[np.ndarray, " m"],
-    known: Whole,
-    columns: Columns,
-    params: UpdateParams,
+    block: Block, slot: Int[np.ndarray, " m"], known: Whole, columns: Columns, params: UpdateParams
 ) -> None:
     """Add new landmarks to a block of particles: a hypothesis, or several along a bearing."""
     new = known

@@ -1,5 +1,6 @@
 """Belief of the smoother: a solution of all measurements, with its trajectory and map."""
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
@@ -8,13 +9,14 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from pipistrelle.config import InputError, RayConfig
-from pipistrelle.detection.scans import BEARING, BEARING_STD
+from pipistrelle.detection.scans import BEARING, BEARING_STD, RANGE
 from pipistrelle.estimation.beliefs import Gaussian, JointGaussian, Landmarks
 from pipistrelle.estimation.motion import Pose
 from pipistrelle.estimation.rays import ray_members
 from pipistrelle.estimation.recovery import Recoverable
 from pipistrelle.estimation.smoother.elimination import joint
 from pipistrelle.estimation.smoother.history import STRETCH, History
+from pipistrelle.estimation.smoother.observations import places_left
 from pipistrelle.estimation.smoother.preintegration import Odometry, placed, poses_between
 from pipistrelle.estimation.smoother.records import CALLER, POSE, ChainState, NoiseModel, Stack
 from pipistrelle.estimation.smoother.sweep import (
@@ -108,10 +110,10 @@ def _without(history: History, ends: Int[np.ndarray, "r 4"], slots: Sequence[int
 def _link(
     ends: Int[np.ndarray, "r 4"], numbers: Float[np.ndarray, "r 8"], latest: Int[np.ndarray, " s"]
 ) -> None:
-    """Write into each measurement the index of its landmark's previous bearing."""
+    """Write into each measurement the index of its landmark's previous bearing or range."""
     for row in range(ends.shape[0]):
         ends[row, 3] = -1
-        if not np.isnan(numbers[row, BEARING]):
+        if not (np.isnan(numbers[row, BEARING]) and np.isnan(numbers[row, RANGE])):
             ends[row, 3], latest[ends[row, 0]] = latest[ends[row, 0]], row
 
 
@@ -304,7 +306,8 @@ class SmootherBelief(Recoverable):
     def _rays(self, *, moving: bool) -> list[MapRow]:
         """Return map rows of unlocated landmarks or callers: hypotheses along their last bearing.
 
-        The hypotheses of a ray, at least two, have equal weights.
+        The hypotheses of a ray, at least two, have equal weights. Ranges without bearings give
+        two mirrored places, or none.
         """
         history, rays = self.history, []
         waits = (history.index == 0) & (history.latest >= 0) & (history.moves == moving)
@@ -313,6 +316,9 @@ class SmootherBelief(Recoverable):
             row = history.latest[slot]
             node, numbers = history.rows.arrays[0][row, 2], history.rows.arrays[1][row]
             if moving and node != history.nodes - 1:
+                continue
+            if np.isnan(numbers[BEARING]):
+                rays += self._mirrored(labels[slot][0], row)
                 continue
             (x, y, heading), C = self.at.mean, self.at.covariance
             if not moving:
@@ -329,6 +335,21 @@ class SmootherBelief(Recoverable):
                 mean = np.array([x, y]) + far * along
                 rays.append((labels[slot][0], mean, noise + C[:2, :2], 1.0 / len(ranges)))
         return rays
+
+    def _mirrored(self, label: int, row: int) -> list[MapRow]:
+        """Return map rows of the two places that a landmark's ranges up to a row leave, if two."""
+        best, history = self.best(), self.history
+        border, poses = best.border.copy(), np.ascontiguousarray(self.smoothed().states)
+        border[: best.beta.size] += best.beta
+        places, noise = history.places(best.columns), (history.legs.arrays[1], self.noise.loss)
+        count, *both = places_left(history.rows.arrays, row, (poses, border), places, *noise)
+        if count < 2:
+            return []
+        share = 1.0 / (1.0 + math.exp(0.5 * (both[0][2] - both[1][2])))
+        return [
+            (label, np.array([x, y]), np.array([[xx, xy], [xy, yy]]), weight)
+            for (x, y, _, xx, xy, yy), weight in zip(both, (1.0 - share, share), strict=True)
+        ]
 
 
 def _placed(

@@ -3,15 +3,15 @@
 The smoother keeps every measurement, and eliminates the normal equations along the chain of poses
 (`elimination`): a frame adds a node, and unknowns that moved are relinearised (`chain`). Nodes are
 the times of scans (`preintegration` has the control steps between). Landmarks and callers are
-initialised by a range, a precise excess path, or crossing bearings (`entering_places`), with all
-their measurements so far; until then they are partially initialised. An excess path counts once its
-landmark and its caller are initialised. A moving caller has a position and a velocity at each node,
-and is no landmark.
+initialised by a range, a precise excess path, crossing bearings, or ranges that leave a
+place (`entering_places`), with all their measurements so far; until then they are partially
+initialised. An excess path counts once its landmark and its caller are initialised. A moving caller
+has a position and a velocity at each node, and is no landmark.
 
-``robust`` uses Huber's loss. With a gate, measurements outside a share of their predicted
-distribution are discarded: bearing and range jointly, an excess path separately, as an error such
-as a wrong direct call affects only it. The belief at a frame is the solution there; trajectory,
-caller tracks and map are the optimum of all measurements so far (`belief`).
+``robust`` names the loss. With a gate, measurements outside a share of their predicted distribution
+are discarded: bearing and range jointly, an excess path separately, as an error such as a wrong
+direct call affects only it. The belief at a frame is the solution there; trajectory, caller tracks
+and map are the optimum of all measurements so far (`belief`).
 
 **Initialisation** is delayed until the range is certain. A measured range initialises at once.
 Otherwise an excess path gives the range along the bearing: of a landmark if the caller is
@@ -50,7 +50,7 @@ from pipistrelle.estimation.checking import (
     usable_scan,
 )
 from pipistrelle.estimation.measurement import (
-    HUBER_K,
+    LOSSES,
     MAX_RELATIVE_RANGE_STD,
     MIN_TDOA_SIGMAS,
     observe,
@@ -76,7 +76,10 @@ from pipistrelle.estimation.smoother.observations import (
     View,
     bearing_of,
     direction_of,
+    distance_of,
+    places_left,
     point_of,
+    range_of,
     view_of,
     write_bearing,
     write_excess_path,
@@ -227,16 +230,27 @@ def entering_places(
     estimate: PointArrays,
     front: Arrays,
     R: Factor,
+    driven: tuple[Float[np.ndarray, "k 3 3"], Whole],
 ) -> Float[np.ndarray, "m 2"]:
-    """Return initial positions for new landmarks and callers in a scan; NaN if too uncertain."""
+    """Return initial positions for new landmarks and callers in a scan; NaN if too uncertain.
+
+    ``driven``: covariances of the motion between nodes, and the code of the robust loss.
+    """
     rows, places, front = Rows(*rows), Places(*places), Front(*front)
-    (k, first, last), found = span, np.full((span[2] - span[1], 2), np.nan)
+    (noise, loss), (k, first, last) = driven, span
+    found = np.full((last - first, 2), np.nan)
     view = view_of(estimate[0][k], estimate[1], places, k)
     for m in range(first, last):
         slot, numbers = rows.ends[m, 0], rows.numbers[m]
-        if places.index[slot] != 0 or math.isnan(numbers[BEARING]):
+        if places.index[slot] != 0:
             continue
-        away = numbers[RANGE] * view.scale
+        if math.isnan(numbers[BEARING]):
+            if not (math.isnan(numbers[RANGE]) or moves[slot]):
+                count, place, _ = places_left(rows, m, estimate, places, noise, loss)
+                if count == 1:
+                    found[m - first, 0], found[m - first, 1] = place[0], place[1]
+            continue
+        away = distance_of(view, numbers[RANGE])
         if math.isnan(away):
             heard = m, first, last
             away = excess_path_range(rows, heard, view, k, places, estimate, front, R)
@@ -308,21 +322,26 @@ def drop_outside(
                 if (numbers[EXCESS_PATH] - path) ** 2 / S > bounds[0]:
                     rows.ends[m, 1] = -1
                     dropped += 1
-        if math.isnan(numbers[BEARING]):
+        aimed, ranged = not math.isnan(numbers[BEARING]), not math.isnan(numbers[RANGE])
+        (i, px, py), size = point, int(aimed) + int(ranged)
+        if size == 0:
             continue
-        (i, px, py), size = point, 1 if math.isnan(numbers[RANGE]) else 2
         seen = observe(view.x, view.y, view.heading, px, py)
         by_chain, by_border = np.zeros((size, d)), np.zeros((size, n))
-        _part(work, write_bearing(work, view, seen, numbers[SLOPE], i), by_chain[0], by_border[0])
-        if size == 2:
-            _part(work, write_range(work, view, seen, i), by_chain[1], by_border[1])
+        if aimed:
+            row = write_bearing(work, view, seen, numbers[SLOPE], i)
+            _part(work, row, by_chain[0], by_border[0])
+        if ranged:
+            row = write_range(work, view, seen, i)
+            _part(work, row, by_chain[size - 1], by_border[size - 1])
         S = joint(front, R, n, by_chain, by_border)
         turn = wrap_angle(numbers[BEARING] - bearing_of(view, seen, numbers[SLOPE]))
+        far = numbers[RANGE] - range_of(view, seen[0])
         bb = S[0, 0] + numbers[BEARING_STD] * numbers[BEARING_STD]
+        rr = S[size - 1, size - 1] + numbers[RANGE_STD] ** 2
         if size == 1:
-            off = turn * turn / bb
+            off = turn * turn / bb if aimed else far * far / rr
         else:
-            rr, far = S[1, 1] + numbers[RANGE_STD] ** 2, numbers[RANGE] - seen[0] / view.scale
             off = rr * turn * turn - 2.0 * S[1, 0] * turn * far + bb * far * far
             off /= bb * rr - S[1, 0] * S[1, 0]
         if off > bounds[size - 1]:
@@ -373,7 +392,7 @@ class Smoother:
     motion: Motion
     rays: RayConfig  # ranges of an uninitialised landmark
     gate: float = 1.0  # this and the fields below as in `EkfSlam`
-    robust: bool = False
+    robust: str = "none"
     speed_std: float = 1.0
     walk_std: float = 0.2
     calibration: Calibration = NOTHING
@@ -381,14 +400,14 @@ class Smoother:
     """Time without measurements after which a landmark leaves the separator [s]."""
 
     def __post_init__(self) -> None:
-        """Raise InputError unless the gate is a probability in (0, 1]."""
-        check_gate(self.gate)
+        """Raise InputError for an unknown loss, or a gate that is no probability in (0, 1]."""
+        check_gate(self.gate, self.robust)
 
     @property
     def noise(self) -> NoiseModel:
         """Noise parameters of measurements and moving callers, from the settings."""
-        believed = HUBER_K if self.robust else math.inf
-        return NoiseModel(believed, PRIOR_STD, float(self.speed_std), float(self.walk_std))
+        loss = LOSSES.index(self.robust)
+        return NoiseModel(loss, PRIOR_STD, float(self.speed_std), float(self.walk_std))
 
     def init(self, pose: Gaussian) -> SmootherBelief:
         """Return the initial belief at a start pose with its covariance, without landmarks."""
@@ -551,7 +570,8 @@ def _frame(
 def _placed(history: History, here: Sweep, estimate: Solution) -> History:
     """Initialise landmarks and callers that the last scan locates; return the extended history."""
     rows, span, places, points, front, factor = _frame(history, here, estimate)
-    found = entering_places(rows, span, history.moves, places, points, front, factor)
+    driven = history.legs.arrays[1], here.noise.loss
+    found = entering_places(rows, span, history.moves, places, points, front, factor, driven)
     ends = rows[0][span[1] : span[2], 0]
     label_of, new = list(history.slots), {}
     for slot, place in zip(ends.tolist(), found, strict=True):

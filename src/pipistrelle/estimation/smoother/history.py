@@ -16,12 +16,7 @@ from pipistrelle.detection.scans import BEARING, NUMBERS, RANGE, Scan
 from pipistrelle.estimation.beliefs import Gaussian
 from pipistrelle.estimation.measurement import caller_labels
 from pipistrelle.estimation.motion import SMALLEST_STD
-from pipistrelle.estimation.smoother.preintegration import (
-    NOTHING,
-    Calibration,
-    Led,
-    Odometry,
-)
+from pipistrelle.estimation.smoother.preintegration import NOTHING, Calibration, Led, Odometry
 from pipistrelle.estimation.smoother.records import CALLER, POSE, Arrays, PlainLegs, Stack
 from pipistrelle.jit import Whole, optimised_once
 
@@ -49,7 +44,7 @@ class History:
     """For each slot 1 + its number in the separator, or minus its index in the chain; 0:
     uninitialised."""
     latest: Int[np.ndarray, " s"] = field(default_factory=lambda: np.empty(0, np.int64))
-    """Row of each slot's last bearing, or -1."""
+    """Row of each slot's last bearing or range, or -1."""
     heard: Int[np.ndarray, "s 2"] = field(default_factory=lambda: np.empty((0, 2), np.int64))
     """First and last node with a measurement of each slot; NEVER and -1 without."""
     moves: Int[np.ndarray, " s"] = field(default_factory=lambda: np.empty(0, np.int64))
@@ -86,7 +81,8 @@ class History:
         odometry's scale, as it would fall with a shrinking world.
         """
         (mean, noise, seconds, rows, _, slopes), names = self.legs.arrays, self.calibration.names
-        free = "speed_scale" in names and (not self.ranged or "speed_of_sound" in names)
+        unscaled = not {"speed_of_sound", "range_scale"}.isdisjoint(names)
+        free = "speed_scale" in names and (not self.ranged or unscaled)
         return mean, noise, seconds, rows, slopes, 1 if free else 0
 
     @property
@@ -207,7 +203,7 @@ def _write_rows(
         ends[row, 0], ends[row, 1], ends[row, 2], ends[row, 3] = slot, callers[m], k, -1
         for e in range(numbers.shape[0]):
             values[row, e] = numbers[e, m]
-        if not math.isnan(numbers[BEARING, m]):
+        if not (math.isnan(numbers[BEARING, m]) and math.isnan(numbers[RANGE, m])):
             ends[row, 3], latest[slot] = latest[slot], row
         for end in (slot, callers[m]):
             if end >= 0:

@@ -5,7 +5,8 @@ at :math:`p + R(\theta) l` with heading :math:`\theta + \delta`. A clock delay :
 back to :math:`p - \tau R(\theta - \tfrac12 \tau \omega) v`, :math:`\theta - \tau \omega`, with the
 velocities v and :math:`\omega` of the motion to the node; callers count as stationary meanwhile. If
 the true speed of sound is k times the assumed, a range r or an excess path is measured as r / k,
-and a bearing is off by its slope (`Scan`) times k - 1 plus the lean parameter.
+and a bearing is off by its slope (`Scan`) times k - 1 plus the lean parameter. A sensor with the
+range scale 1 + e and the range bias b measures a range as (1 + e) r / k + b.
 
 **Normal equations.** Jacobian rows are divided by the measurement's standard deviation, and
 multiplied by the root of the Huber weight (joint for bearing and range, separate for excess paths).
@@ -29,7 +30,15 @@ from pipistrelle.detection.scans import (
     RANGE_STD,
     SLOPE,
 )
-from pipistrelle.estimation.measurement import NEAREST, excess_path_slopes, observe
+from pipistrelle.estimation.measurement import (
+    NEAREST,
+    Slopes,
+    bearing_slopes,
+    excess_path_slopes,
+    observe,
+    range_slopes,
+    robust_loss,
+)
 from pipistrelle.estimation.motion import SMALLEST_STD
 from pipistrelle.estimation.smoother.records import (
     CALLER,
@@ -48,8 +57,9 @@ from pipistrelle.estimation.smoother.records import (
     work_of,
     write,
 )
+from pipistrelle.estimation.trilateration import MIN_SPACING, Place, Ranges, located
 from pipistrelle.geometry import wrap_angle
-from pipistrelle.jit import Whole, no_alloc, no_alloc_inlined, optimised_once
+from pipistrelle.jit import Whole, kernel, no_alloc, no_alloc_inlined, optimised_once
 
 MISFIT = POSE
 """Entry of a Jacobian row for its residual, before moving callers' entries are inserted."""
@@ -72,7 +82,9 @@ class View(NamedTuple):
     by_late: tuple[float, float, float]  # derivative of the sensor pose by the clock delay
     scale: float  # true over assumed speed of sound, k
     lean: float  # multiplier of the bearings' slopes, about k - 1
-    columns: tuple[Whole, Whole, Whole, Whole]  # columns as in `Places.sensor`
+    longer: float  # range scale, 1 + e
+    bias: float  # range bias b [m]
+    columns: tuple[Whole, Whole, Whole, Whole, Whole, Whole]  # as in `Places.sensor`
     known: bool  # whether no sensor parameter is estimated
 
 
@@ -97,8 +109,11 @@ def view_of(pose: ChainState, border: Border, places: Places, k: Whole) -> View:
     off = border[sound] if sound > 0 else 0.0
     lean = off + border[sound + 1] if sound > 0 else 0.0
     at = pose[0] + x, pose[1] + y, heading
-    columns, known = (sound, turned, place, clock), sound + turned + place + clock == 0
-    return View(*at, c, s, x, y, by_late, 1.0 + off, lean, columns, known)
+    longer = 1.0 + border[sensor[4]] if sensor[4] > 0 else 1.0
+    bias = border[sensor[5]] if sensor[5] > 0 else 0.0
+    columns = sound, turned, place, clock, sensor[4], sensor[5]
+    known = sensor.sum() == 0
+    return View(*at, c, s, x, y, by_late, 1.0 + off, lean, longer, bias, columns, known)
 
 
 @no_alloc
@@ -141,6 +156,18 @@ def direction_of(view: View, numbers: Float[np.ndarray, " 8"]) -> float:
 
 
 @no_alloc
+def range_of(view: View, distance: float) -> float:
+    """Return the predicted range [m] at a distance from the sensor."""
+    return view.longer * distance / view.scale + view.bias
+
+
+@no_alloc
+def distance_of(view: View, measured: float) -> float:
+    """Return the distance from the sensor [m] that a range measures."""
+    return (measured - view.bias) / view.longer * view.scale
+
+
+@no_alloc
 def write_bearing(
     work: Work, view: View, seen: Seen, slope: float, i: Whole
 ) -> tuple[Whole, Whole]:
@@ -148,19 +175,20 @@ def write_bearing(
 
     This and the following functions return the number of chain entries and of all entries.
     """
-    _, _, c, s, inverse = seen
-    lean = 0.0 if math.isnan(slope) else -slope
-    size = _write_view(work, view, (s * inverse, -c * inverse, -1.0), lean, lean)
-    return _write_point(work, POSE, size, i, -s * inverse, c * inverse)
+    by_pose, lean = bearing_slopes(seen[2], seen[3], seen[4]), 0.0 if math.isnan(slope) else -slope
+    size = _write_view(work, view, by_pose, (lean, lean, 0.0, 0.0))
+    return _write_point(work, POSE, size, i, -by_pose[0], -by_pose[1])
 
 
 @no_alloc
 def write_range(work: Work, view: View, seen: Seen, i: Whole) -> tuple[Whole, Whole]:
     """Write a Jacobian row: the derivatives of a range by pose, parameters and measured point."""
-    distance, _, c, s, _ = seen
-    k = 1.0 / view.scale
-    size = _write_view(work, view, (-k * c, -k * s, 0.0), -distance * k * k, 0.0)
-    return _write_point(work, POSE, size, i, k * c, k * s)
+    k, (by_x, by_y, _) = 1.0 / view.scale, range_slopes(seen[2], seen[3])
+    far = seen[0] * k
+    by_sensor = -view.longer * far * k, 0.0, far, 1.0
+    k *= view.longer
+    size = _write_view(work, view, (k * by_x, k * by_y, 0.0), by_sensor)
+    return _write_point(work, POSE, size, i, -k * by_x, -k * by_y)
 
 
 @no_alloc
@@ -171,7 +199,8 @@ def write_excess_path(
     (i, px, py), (j, bx, by) = ends
     path, lx, ly, cx, cy = excess_path_slopes(view.x, view.y, px, py, bx, by)
     k = 1.0 / view.scale
-    size = _write_view(work, view, (-k * (lx + cx), -k * (ly + cy), 0.0), -path * k * k, 0.0)
+    by_sensor = -path * k * k, 0.0, 0.0, 0.0
+    size = _write_view(work, view, (-k * (lx + cx), -k * (ly + cy), 0.0), by_sensor)
     chain, size = _write_point(work, POSE, size, i, k * lx, k * ly)
     chain, size = _write_point(work, chain, size, j, k * cx, k * cy)
     return path * k, chain, size
@@ -179,11 +208,14 @@ def write_excess_path(
 
 @no_alloc
 def _write_view(
-    work: Work, view: View, by_pose: tuple[float, float, float], by_scale: float, by_lean: float
+    work: Work, view: View, by_pose: Slopes, by_sensor: tuple[float, float, float, float]
 ) -> Whole:
-    """Convert derivatives by the sensor's pose to derivatives by vehicle's pose and parameters."""
+    """Convert derivatives by the sensor's pose to derivatives by vehicle's pose and parameters.
+
+    ``by_sensor``: derivatives by speed of sound, lean, range scale and range bias.
+    """
     at, slope, size, (by_x, by_y, by_heading) = work.at, work.slope, MISFIT + 1, by_pose
-    sound, turned, place, clock = view.columns
+    sound, turned, place, clock, longer, bias = view.columns
     for a in range(POSE):
         at[a] = a
     slope[0], slope[1] = by_x, by_y
@@ -191,7 +223,7 @@ def _write_view(
     at[MISFIT], slope[MISFIT] = 0, 0.0
     if sound > 0:
         at[size], at[size + 1] = sound, sound + 1
-        slope[size], slope[size + 1] = by_scale, by_lean
+        slope[size], slope[size + 1] = by_sensor[0], by_sensor[1]
         size += 2
     if turned > 0:
         at[size], slope[size] = turned, by_heading
@@ -204,6 +236,12 @@ def _write_view(
     if clock > 0:
         late_x, late_y, turn = view.by_late
         at[size], slope[size] = clock, by_x * late_x + by_y * late_y + by_heading * turn
+        size += 1
+    if longer > 0:
+        at[size], slope[size] = longer, by_sensor[2]
+        size += 1
+    if bias > 0:
+        at[size], slope[size] = bias, by_sensor[3]
         size += 1
     return size
 
@@ -243,17 +281,17 @@ def nonlinearity(rows: Arrays, span: Span, places: Arrays, points: PointArrays, 
         if there[0] == 0:
             continue
         here = _moved(there, off)
+        seen = observe(then.x, then.y, then.heading, there[1], there[2])
+        sight = observe(now.x, now.y, now.heading, here[1], here[2])
         if not math.isnan(numbers[BEARING]):
-            seen = observe(then.x, then.y, then.heading, there[1], there[2])
-            sight = observe(now.x, now.y, now.heading, here[1], here[2])
             row = write_bearing(work, then, seen, numbers[SLOPE], there[0])
             line = bearing_of(then, seen, numbers[SLOPE]) + _along(work, row, off)
-            angle, far = bearing_of(now, sight, numbers[SLOPE]), sight[0]
+            angle = bearing_of(now, sight, numbers[SLOPE])
             most = max(most, abs(wrap_angle(angle - line)) / numbers[BEARING_STD])
-            if not math.isnan(numbers[RANGE]):
-                row = write_range(work, then, seen, there[0])
-                line = seen[0] / then.scale + _along(work, row, off)
-                most = max(most, abs(far / now.scale - line) / numbers[RANGE_STD])
+        if not math.isnan(numbers[RANGE]):
+            row = write_range(work, then, seen, there[0])
+            line = range_of(then, seen[0]) + _along(work, row, off)
+            most = max(most, abs(range_of(now, sight[0]) - line) / numbers[RANGE_STD])
         if rows.ends[m, 1] >= 0:
             caller = point_of(rows.ends[m, 1], k, places, points)
             if caller[0] != 0:
@@ -302,7 +340,7 @@ def hear(
     noise: NoiseModel,
 ) -> float:
     """Add a scan's measurements to the normal equations; return twice their robust loss."""
-    (k, begin, end), believed, cost = span, noise.believed, 0.0
+    (k, begin, end), cost = span, 0.0
     work.T[:], work.G[:] = 0.0, 0.0
     work.alone[0] = _is_sure(front, span, rows, places, points, noise.damping)
     write(front.C, work.C)
@@ -314,17 +352,17 @@ def hear(
         numbers, landmark = rows.numbers[m], point_of(rows.ends[m, 0], k, places, points)
         if landmark[0] == 0:
             continue
-        if not math.isnan(numbers[BEARING]):
-            cost += _hear_direction(work, front, numbers, view, landmark, believed)
+        if not (math.isnan(numbers[BEARING]) and math.isnan(numbers[RANGE])):
+            cost += _hear_direction(work, front, numbers, view, landmark, noise.loss)
         if rows.ends[m, 1] >= 0:
             caller = point_of(rows.ends[m, 1], k, places, points)
             if caller[0] != 0:
                 path, chain, size = write_excess_path(work, view, (landmark, caller))
                 sure = 1.0 / max(numbers[EXCESS_PATH_STD], SMALLEST_STD)
                 off = (path - numbers[EXCESS_PATH]) * sure
-                less, loss = _huber(off * off, believed)
+                less, twice = _robust(off * off, noise.loss)
                 _add(work, front, chain, size, (less * sure, less * off))
-                cost += loss
+                cost += twice
     return cost
 
 
@@ -335,23 +373,24 @@ def _hear_direction(
     numbers: Float[np.ndarray, " 8"],
     view: View,
     point: Point,
-    believed: float,
+    loss: Whole,
 ) -> float:
-    """Add a bearing, and any range with it, to the normal equations; return twice their loss."""
+    """Add a bearing, a range or both to the normal equations; return twice their loss."""
     i, px, py = point
     seen = observe(view.x, view.y, view.heading, px, py)
-    across = 1.0 / max(numbers[BEARING_STD], SMALLEST_STD)
-    off = wrap_angle(bearing_of(view, seen, numbers[SLOPE]) - numbers[BEARING]) * across
-    ranged = not math.isnan(numbers[RANGE])
+    aimed, ranged = not math.isnan(numbers[BEARING]), not math.isnan(numbers[RANGE])
+    across = 1.0 / max(numbers[BEARING_STD], SMALLEST_STD) if aimed else 0.0
+    turn = wrap_angle(bearing_of(view, seen, numbers[SLOPE]) - numbers[BEARING]) if aimed else 0.0
     along = 1.0 / max(numbers[RANGE_STD], SMALLEST_STD) if ranged else 0.0
-    far = (seen[0] / view.scale - numbers[RANGE]) * along if ranged else 0.0
-    less, cost = _huber(off * off + far * far, believed)
+    off, far = turn * across, (range_of(view, seen[0]) - numbers[RANGE]) * along if ranged else 0.0
+    less, cost = _robust(off * off + far * far, loss)
     if i > 0 and not work.alone[0] and view.known:
         slopes = less * across * seen[4], less * along, less * across
         _add_direction(work, front, i, seen[2:4], slopes, (less * off, less * far))
         return cost
-    chain, size = write_bearing(work, view, seen, numbers[SLOPE], i)
-    _add(work, front, chain, size, (less * across, less * off))
+    if aimed:
+        chain, size = write_bearing(work, view, seen, numbers[SLOPE], i)
+        _add(work, front, chain, size, (less * across, less * off))
     if ranged:
         chain, size = write_range(work, view, seen, i)
         _add(work, front, chain, size, (less * along, less * far))
@@ -400,12 +439,10 @@ def _add_direction(
 
 
 @no_alloc
-def _huber(squared: float, believed: float) -> tuple[float, float]:
-    """Return the root of Huber's weight and twice Huber's loss for a squared residual."""
-    if squared <= believed * believed:
-        return 1.0, squared
-    size = math.sqrt(squared)
-    return math.sqrt(believed / size), believed * (2.0 * size - believed)
+def _robust(squared: float, loss: Whole) -> tuple[float, float]:
+    """Return the root of a robust loss's weight, and twice the loss, for a squared residual."""
+    factor, twice = robust_loss(squared, loss)
+    return math.sqrt(1.0 / factor), twice
 
 
 @no_alloc
@@ -470,9 +507,67 @@ def _is_sure(
             sure = 1.0 / max(numbers[BEARING_STD], SMALLEST_STD) ** 2
             turns += sure
             moves += sure / max((px - x) ** 2 + (py - y) ** 2, NEAREST * NEAREST)
-            if not math.isnan(numbers[RANGE]):
-                moves += 1.0 / max(numbers[RANGE_STD], SMALLEST_STD) ** 2
+        if i != 0 and not math.isnan(numbers[RANGE]):
+            moves += 1.0 / max(numbers[RANGE_STD], SMALLEST_STD) ** 2
         if i != 0 and rows.ends[m, 1] >= 0:
             moves += 4.0 / max(numbers[EXCESS_PATH_STD], SMALLEST_STD) ** 2
     P = front.P
     return turns * P[2, 2] > ALONE_ABOVE or moves * (P[0, 0] + P[1, 1]) > ALONE_ABOVE
+
+
+MOST = 64
+"""Most ranges that place a landmark; their spacing grows by a sixteenth of the way since."""
+
+
+@kernel
+def places_left(
+    rows: Arrays,
+    m: Whole,
+    estimate: PointArrays,
+    places: Arrays,
+    noise: Float[np.ndarray, "k 3 3"],
+    loss: Whole,
+) -> tuple[Whole, Place, Place]:
+    """Return the number of places that a landmark's ranges up to row m leave, and these.
+
+    An earlier position has the error of dead reckoning since, with isotropic steps.
+    """
+    rows, places, (poses, border) = Rows(*rows), Places(*places), estimate
+    node, count = rows.ends[m, 2], 0
+    points, distance, variance = np.empty(2 * MOST), np.empty(MOST), np.empty(MOST)
+    at, P = 2 + 2 * np.arange(MOST), np.zeros((2 + 2 * MOST, 2 + 2 * MOST))
+    here = view_of(poses[node], border, places, node)
+    x, y, way = here.x, here.y, 0.0
+    spread = turn = by_x = by_y = xx = xy = yy = 0.0  # of positions; of turns, and its moments
+    moments = np.zeros((MOST, 7))
+    while m >= 0 and count < MOST:
+        while node > rows.ends[m, 2]:
+            dx, dy, q = poses[node, 0] - here.x, poses[node, 1] - here.y, noise[node, 2, 2]
+            spread += 0.5 * (noise[node, 0, 0] + noise[node, 1, 1])
+            turn, by_x, by_y = turn + q, by_x + q * dx, by_y + q * dy
+            xx, xy, yy = xx + q * dx * dx, xy + q * dx * dy, yy + q * dy * dy
+            node -= 1
+            way += math.hypot(poses[node, 0] - here.x - dx, poses[node, 1] - here.y - dy)
+        view, std = view_of(poses[node], border, places, node), rows.numbers[m, RANGE_STD]
+        far = math.hypot(view.x - x, view.y - y)
+        if count == 0 or far >= max(MIN_SPACING * std, way / 16.0):
+            x, y = points[2 * count], points[2 * count + 1] = view.x, view.y
+            distance[count], variance[count] = distance_of(view, rows.numbers[m, RANGE]), std * std
+            moments[count] = np.array((spread, turn, by_x, by_y, xx, xy, yy))
+            count += not math.isnan(distance[count])
+        m = rows.ends[m, 3]
+    for i in range(count):  # a turn moves an earlier position at right angles to its lever
+        spread, turn, by_x, by_y, xx, xy, yy = moments[i]
+        ix, iy = points[2 * i] - here.x, points[2 * i + 1] - here.y
+        for j in range(i, count):
+            jx, jy = points[2 * j] - here.x, points[2 * j + 1] - here.y
+            a, b = at[i], at[j]
+            P[a, b] = spread + iy * jy * turn - (iy + jy) * by_y + yy
+            P[a + 1, b + 1] = spread + ix * jx * turn - (ix + jx) * by_x + xx
+            P[a, b + 1] = -(iy * jx * turn - iy * by_x - jx * by_y + xy)
+            P[a + 1, b] = -(ix * jy * turn - ix * by_y - jy * by_x + xy)
+            for u in range(2):
+                for v in range(2):
+                    P[b + v, a + u] = P[a + u, b + v]
+    work = np.empty((MOST + 3, MOST))
+    return located(Ranges(points, distance, variance, at, P, count, work), here.x, here.y, loss)

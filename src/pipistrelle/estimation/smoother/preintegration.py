@@ -53,23 +53,24 @@ from pipistrelle.estimation.smoother.records import (
 from pipistrelle.geometry import wrap_angle
 from pipistrelle.jit import no_alloc, optimised_once
 
-NUMBERS = {
-    "speed_scale": ("speed_scale",),
-    "turn_bias": ("turn_bias",),
-    "wheelbase": ("wheelbase",),
+_ODOMETRY: dict[str, tuple[str, ...]] = {
+    name: (name,) for name in ("speed_scale", "turn_bias", "wheelbase")
+}
+_SENSOR: dict[str, tuple[str, ...]] = {
     "speed_of_sound": ("speed_of_sound", "bearing_lean"),
     "sensor_heading": ("sensor_heading",),
     "sensor_place": ("sensor_place_x", "sensor_place_y"),
     "time_offset": ("time_offset",),
+    "range_scale": ("range_scale",),
+    "range_bias": ("range_bias",),
 }
+NUMBERS = _ODOMETRY | _SENSOR
 """Names of the numbers of each parameter, in the order of the separator."""
 LEAN_STD = 0.003
 """Prior std of the relative lean of bearings with the speed of sound, which other errors of an
 array resemble; the `physics` preset leans by 0.1 to 0.3 %."""
-OF_ODOMETRY = ("speed_scale", "turn_bias", "wheelbase")
-"""Odometry parameters, by their codes in kernels."""
-OF_SENSOR = ("speed_of_sound", "sensor_heading", "sensor_place", "time_offset")
-"""Sensor parameters, in the order of `records.Places.sensor`."""
+OF_ODOMETRY, OF_SENSOR = tuple(_ODOMETRY), tuple(_SENSOR)
+"""Parameters of odometry, by their codes in kernels, and of the sensor, as in `Places.sensor`."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -86,7 +87,7 @@ class Calibration:
     """Prior standard deviations, in the separator's units."""
     odometry: Int[np.ndarray, " q"]
     """Codes of the odometry parameters (`OF_ODOMETRY`), which come first."""
-    sensor: Int[np.ndarray, "4"]
+    sensor: Int[np.ndarray, "6"]
     """Separator columns of the sensor parameters (`OF_SENSOR`); 0 if not estimated."""
 
 
@@ -106,7 +107,7 @@ def calibration_of(config: Config, motion: Motion) -> Calibration:
     >>> from pipistrelle.config import FilterConfig
     >>> config = Config(filter=FilterConfig(calibrate=("sensor_place", "speed_of_sound")))
     >>> calibration_of(config, Motion(model="unicycle", control_std=(0.1, 0.1))).sensor
-    array([1, 0, 3, 0])
+    array([1, 0, 3, 0, 0, 0])
     """
     asked, about, sound = {*config.filter.calibrate}, config.prior, config.assumed_sound_speed
     if "wheelbase" in asked and motion.model != "bicycle":
@@ -116,14 +117,14 @@ def calibration_of(config: Config, motion: Motion) -> Calibration:
         )
     names = [name for name in NUMBERS if name in asked]
     units = {"speed_of_sound": sound, "wheelbase": motion.wheelbase}
-    assumed = units | {"speed_scale": 1.0}
+    assumed = units | {"speed_scale": 1.0, "range_scale": 1.0}
     stds = {"bearing_lean": LEAN_STD}
     for name in names:
         for number in NUMBERS[name]:
             stds.setdefault(number, getattr(about, f"{name}_std"))
     stds |= {"speed_of_sound": about.speed_of_sound_std / sound}
     numbers = numbers_of(names)
-    column = {name: 1 + numbers.index(NUMBERS[name][0]) for name in names}
+    column: dict[str, int] = {name: 1 + numbers.index(NUMBERS[name][0]) for name in names}
     return Calibration(
         names=numbers,
         assumed=np.array([assumed.get(number, 0.0) for number in numbers]),
@@ -157,9 +158,7 @@ class Odometry:
 def no_odometry(parameters: int = 0) -> Odometry:
     """Return odometry without control steps, for a number of calibration parameters."""
     return Odometry(
-        mean=np.empty((0, 3)),
-        covariance=np.empty((0, 3, 3)),
-        slopes=np.empty((0, 3, parameters)),
+        mean=np.empty((0, 3)), covariance=np.empty((0, 3, 3)), slopes=np.empty((0, 3, parameters))
     )
 
 

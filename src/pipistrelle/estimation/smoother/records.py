@@ -204,11 +204,7 @@ def solve_with(L: Float[np.ndarray, "d d"], x: Float[np.ndarray, " d"]) -> None:
 def posterior(
     P: Float[np.ndarray, "d d"],
     T: Float[np.ndarray, "d d"],
-    work: tuple[
-        Float[np.ndarray, "d d"],
-        Float[np.ndarray, "d d"],
-        Float[np.ndarray, "d d"],
-    ],
+    work: tuple[Float[np.ndarray, "d d"], Float[np.ndarray, "d d"], Float[np.ndarray, "d d"]],
     M: Float[np.ndarray, "d d"],
 ) -> None:
     """Write the posterior covariance (P^-1 + T)^-1 of prior covariance P and information T to M."""
@@ -280,8 +276,8 @@ class Rows(NamedTuple):
     """All measurements of a mission as arrays, sorted by scan."""
 
     ends: Int[np.ndarray, "m 4"]
-    """Slots of landmark and caller (-1: no excess path), node, and row of the previous bearing or
-    -1."""
+    """Slots of landmark and caller (-1: no excess path), node, and row of the landmark's previous
+    bearing or range, or -1."""
     numbers: Float[np.ndarray, "m 8"]  # columns of a scan
 
 
@@ -291,16 +287,16 @@ class Places(NamedTuple):
     index: Int[np.ndarray, " s"]  # separator column; minus the index in the chain; 0: no variable
     first: Int[np.ndarray, " v"]  # node at which each moving caller joins the chain
     begun: Float[np.ndarray, "v 2"]  # initial position of each moving caller [m]
-    sensor: Int[np.ndarray, "4"]
-    """Columns of speed of sound, sensor heading, sensor position and clock delay; 0: known."""
+    sensor: Int[np.ndarray, "6"]
+    """Columns of the parameters in `preintegration.OF_SENSOR`; 0: known."""
     way: Float[np.ndarray, "k 3"]  # as `Legs.mean`
     seconds: Float[np.ndarray, " k"]
 
 
 class NoiseModel(NamedTuple):
-    """The smoother's Huber threshold, priors and noise of moving callers, and damping."""
+    """The smoother's robust loss, priors and noise of moving callers, and damping."""
 
-    believed: float  # Huber threshold [standard deviations], or infinity
+    loss: Whole  # code of the robust loss (`measurement.robust_loss`)
     place_std: float  # std of a moving caller's initial position [m]
     speed_std: float  # std of a moving caller's initial velocity along each axis [m/s]
     walk_std: float  # std of a moving caller's velocity change after 1 s [m/s]

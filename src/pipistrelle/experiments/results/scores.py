@@ -163,7 +163,7 @@ def score(track: Track, truth: Truth, scans: Sequence[Scan], limit: float) -> Sc
     followed, walked = _followed(track, truth)
     finite = bool(np.all(np.isfinite(track.pose.mean)))
     squared, degrees = track.innovations
-    rows = np.count_nonzero(~np.isnan(np.concatenate([[], *(scan.bearing for scan in scans)])))
+    rows = sum(np.count_nonzero(~(np.isnan(s.bearing) & np.isnan(s.range))) for s in scans)
     return Scores(
         **path,
         map_rmse_m=_rmse(position_error(mapped, true)),
