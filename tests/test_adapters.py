@@ -1,6 +1,7 @@
 """Adapters of public data sets, on files of their formats that are made up here."""
 
 import runpy
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -12,6 +13,9 @@ from pipistrelle.detection.logs.folder import read_log
 from pipistrelle.estimation.motion import Motion, motion_step
 
 ADAPTERS = Path(__file__).resolve().parents[1] / "examples" / "adapters"
+
+
+sys.path.append(str(ADAPTERS))  # of modules that adapters share
 
 
 def functions(name):
@@ -130,3 +134,39 @@ def test_gospa_matches_the_authors_formula(world, tmp_path, capsys):
     (result / "map_x.csv").write_text("landmark,x,y\n1,23.0,5.0\n2,30.0,-9.0\n7,90.0,90.0\n")
     functions("phd_slam")["score"](files, result)
     assert capsys.readouterr().out == "position 2.00 m, GOSPA 20.22 m, 1 missed, 1 false\n"
+
+
+def test_plaza_steps_end_at_ranges(tmp_path, capsys):
+    # 1 m/s along x; the second range is heard between two rows of odometry, and out of order.
+    path = np.column_stack((np.arange(4.0), np.arange(4.0), np.zeros(4), np.zeros(4)))
+    turned = path + np.array([0, 0, 0, np.pi])  # as Plaza 2 has it
+    odometry = np.column_stack((path[1:, 0], np.ones(3), np.zeros(3)))
+    ranges = [[1.5, 2, 6, 8.5], [1.0, 2, 6, 9.0], [9.0, 2, 6, 1.0]]
+    beacon = [[6, 10.0, 0.0]]
+    file = tmp_path / "Plaza2_.mat"
+    savemat(file, {"GT": turned, "DRp": path, "DR": odometry, "TD": ranges, "TL": beacon})
+    plaza, log, result = functions("plaza"), tmp_path / "log", tmp_path / "result"
+    plaza["log"](file, log)
+    rows = (log / "measurements.csv").read_text()
+    assert rows == "time,landmark,bearing,range\n1.0,6,,9.0\n1.5,6,,8.5\n"
+    assert "\n1.5,1.0,0.0\n2.0,1.0,0.0\n" in (log / "odometry.csv").read_text()
+    assert "\n3.0,3.0,0.0,0.0\n" in (log / "truth.csv").read_text()
+    result.mkdir()
+    np.savetxt(result / "track_x.tum", np.hstack((path[:, [0, 2, 1]], np.zeros((4, 5)))))
+    (result / "map_x.csv").write_text("landmark,x,y\n6,0.0,10.5\n")
+    plaza["score"](file, result)
+    trajectory, landmarks = capsys.readouterr().out.splitlines()
+    assert "RMSE 0.000 m at 4 times" in trajectory, "a turned track is aligned"
+    assert landmarks == "landmarks: RMSE 0.500 m, 1 of 1 mapped: 6 0.50 m"
+
+
+def test_labyrinth_wheels_are_left_and_right(tmp_path):
+    rows = [f"odom2diff {k} 0.9 1.1 0 0.1 0.0001 0.0001 0.0001" for k in range(3)]
+    rows += ["range2 1 2.0 0.01 2.0 0.0 105 0", "range2 2 -1.0 0.01 2.0 0.0 105 0"]
+    (file := tmp_path / "Indoor_UWB_Input.txt").write_text("\n".join(rows))
+    truth = "\n".join(f"point2 {k} 0.0 {k} 0 0 0 0" for k in range(3))
+    (tmp_path / "Indoor_UWB_GT.txt").write_text(truth)
+    functions("librsf")["log"](file, tmp_path / "log")
+    rows = np.loadtxt(tmp_path / "log" / "odometry.csv", delimiter=",", skiprows=1)
+    np.testing.assert_allclose(rows[:2, 1:], [[1.0, 1.0]] * 2)
+    assert (tmp_path / "log" / "measurements.csv").read_text().endswith("range\n1.0,105,,2.0\n")
