@@ -345,7 +345,7 @@ class SmootherBelief(Recoverable):
         count, *both = places_left(history.rows.arrays, row, (poses, border), places, *noise)
         if count < 2:
             return []
-        share = 1.0 / (1.0 + math.exp(0.5 * (both[0][2] - both[1][2])))
+        share = 1.0 / (1.0 + math.exp(0.5 * (both[1][2] - both[0][2])))
         return [
             (label, np.array([x, y]), np.array([[xx, xy], [xy, yy]]), weight)
             for (x, y, _, xx, xy, yy), weight in zip(both, (1.0 - share, share), strict=True)
