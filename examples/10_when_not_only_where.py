@@ -16,8 +16,8 @@ from pipistrelle.config import RayConfig
 from pipistrelle.detection.scans import make_scan
 from pipistrelle.estimation.beliefs import Gaussian
 from pipistrelle.estimation.ekf.filter import InvariantEkfSlam
-from pipistrelle.estimation.measurement import excess_path_of
 from pipistrelle.estimation.motion import Motion
+from pipistrelle.estimation.observations.excess_path import excess_path_of
 from pipistrelle.figures.maps import RAY, ellipses, excess_path_ellipse
 from pipistrelle.figures.style import INK, STRATEGY_COLOURS, STYLE
 from pipistrelle.geometry import range_and_bearing

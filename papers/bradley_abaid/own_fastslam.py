@@ -28,8 +28,8 @@ from own_tracks import Swarm
 from pipistrelle.config import Config
 from pipistrelle.detection.scans import Scan
 from pipistrelle.estimation.beliefs import Landmarks
-from pipistrelle.estimation.measurement import NEAREST
 from pipistrelle.estimation.motion import Motion
+from pipistrelle.estimation.observations.range import NEAREST
 from pipistrelle.estimation.rays import SMALLEST_SHARE, ray_members
 from pipistrelle.geometry import wrap_angle
 from pipistrelle.jit import kernel

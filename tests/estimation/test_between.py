@@ -8,7 +8,7 @@ import pytest
 from pipistrelle.detection.scans import make_scan
 from pipistrelle.estimation.beliefs import Gaussian, placed
 from pipistrelle.estimation.ekf.filter import EkfSlam, InvariantEkfSlam
-from pipistrelle.estimation.measurement import excess_path_of, landmark_range
+from pipistrelle.estimation.observations.excess_path import excess_path_of, landmark_range
 from pipistrelle.estimation.smoother.filter import Smoother
 from reference.missions import BICYCLE, map_with, ray_config
 

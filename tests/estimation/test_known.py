@@ -10,7 +10,8 @@ from pipistrelle.detection.scans import make_scan
 from pipistrelle.estimation.beliefs import AcceptsMap, Gaussian
 from pipistrelle.estimation.ekf.filter import EkfSlam, InvariantEkfSlam
 from pipistrelle.estimation.fastslam.filter import FastSlam
-from pipistrelle.estimation.measurement import excess_path_of, measurement_jacobians
+from pipistrelle.estimation.observations.bearing import measurement_jacobians
+from pipistrelle.estimation.observations.excess_path import excess_path_of
 from pipistrelle.estimation.smoother.filter import Smoother
 from pipistrelle.experiments.drives import Drive
 from pipistrelle.experiments.runs.trial import run_filter

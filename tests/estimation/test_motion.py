@@ -6,7 +6,6 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from pipistrelle.config import InputError
-from pipistrelle.estimation.measurement import NEAREST, measurement_jacobians
 from pipistrelle.estimation.motion import (
     Motion,
     motion_jacobians,
@@ -15,6 +14,8 @@ from pipistrelle.estimation.motion import (
     motion_step,
     propagate_pose,
 )
+from pipistrelle.estimation.observations.bearing import measurement_jacobians
+from pipistrelle.estimation.observations.range import NEAREST
 from pipistrelle.geometry import range_and_bearing, wrap
 from reference.ekf_slam import moved, noise_of
 from reference.odometry import as_motions, by_poses, wandering

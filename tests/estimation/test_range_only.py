@@ -9,10 +9,10 @@ from pipistrelle.config import Config, FilterConfig, InputError, RayConfig
 from pipistrelle.detection.scans import labelled, make_scan, with_columns, without_excess_paths
 from pipistrelle.estimation.catalogue import entry
 from pipistrelle.estimation.ekf.filter import EkfSlam, InvariantEkfSlam
-from pipistrelle.estimation.measurement import CAUCHY, HUBER, SQUARED, robust_loss
+from pipistrelle.estimation.observations.losses import CAUCHY, HUBER, SQUARED, robust_loss
+from pipistrelle.estimation.observations.range import Ranges, located, refined
 from pipistrelle.estimation.smoother.filter import Smoother
 from pipistrelle.estimation.smoother.preintegration import calibration_of
-from pipistrelle.estimation.trilateration import Ranges, located, refined
 from pipistrelle.evaluation.bound import path_bound, pose_bound
 from reference.beacons import DT, EVERY, EXACT, UNICYCLE, bent, ranging, winding
 

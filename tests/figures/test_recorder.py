@@ -7,7 +7,7 @@ import pytest
 
 from pipistrelle.detection.scans import UNLABELLED, make_scan
 from pipistrelle.estimation.beliefs import no_landmarks, some_of
-from pipistrelle.estimation.measurement import excess_path_of
+from pipistrelle.estimation.observations.excess_path import excess_path_of
 from pipistrelle.figures.maps import drawn_excess_paths
 from pipistrelle.figures.recorder import (
     RECENT_FRAMES,

@@ -5,7 +5,7 @@ import math
 import gtsam
 import numpy as np
 
-from pipistrelle.estimation.measurement import excess_path_of
+from pipistrelle.estimation.observations.excess_path import excess_path_of
 from reference.everything import turned
 from reference.timing import excess_path_jacobians
 

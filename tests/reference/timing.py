@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 
 from pipistrelle.detection.scans import COLUMNS, EXCESS_PATH, EXCESS_PATH_STD, NUMBERS, make_scan
-from pipistrelle.estimation.measurement import excess_path_slopes
+from pipistrelle.estimation.observations.excess_path import excess_path_slopes
 
 
 def excess_paths_to(points, vehicle, caller):

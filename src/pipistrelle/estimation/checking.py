@@ -35,8 +35,8 @@ from pipistrelle.detection.scans import (
     labelled,
 )
 from pipistrelle.estimation.beliefs import Gaussian, Landmarks
-from pipistrelle.estimation.measurement import LOSSES
 from pipistrelle.estimation.motion import MOVED, Controls, Durations, Motion
+from pipistrelle.estimation.observations.losses import LOSSES
 from pipistrelle.jit import Flag, Whole, kernel
 from pipistrelle.refusals import shown
 

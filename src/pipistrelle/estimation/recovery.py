@@ -49,13 +49,10 @@ from pipistrelle.detection.scans import (
     with_columns,
 )
 from pipistrelle.estimation.beliefs import Belief, JointGaussian
-from pipistrelle.estimation.measurement import (
-    bearing_slopes,
-    excess_path_slopes,
-    observe,
-    range_slopes,
-)
 from pipistrelle.estimation.motion import Pose, PoseCovariance
+from pipistrelle.estimation.observations.bearing import bearing_slopes, observe
+from pipistrelle.estimation.observations.excess_path import excess_path_slopes
+from pipistrelle.estimation.observations.range import range_slopes
 from pipistrelle.geometry import wrap_angle
 from pipistrelle.jit import Whole, kernel, no_alloc
 

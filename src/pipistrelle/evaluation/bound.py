@@ -19,7 +19,6 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from pipistrelle.detection.scans import NUMBERS, UNLABELLED, Scan
-from pipistrelle.estimation.measurement import SQUARED, caller_labels
 from pipistrelle.estimation.motion import (
     Motion,
     MotionNumbers,
@@ -27,6 +26,8 @@ from pipistrelle.estimation.motion import (
     motion_numbers,
     propagate_pose,
 )
+from pipistrelle.estimation.observations.losses import SQUARED
+from pipistrelle.estimation.observations.rows import caller_labels
 from pipistrelle.estimation.smoother.elimination import (
     advance,
     correct,

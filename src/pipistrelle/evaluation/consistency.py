@@ -8,7 +8,7 @@ from jaxtyping import Bool, Float
 
 from pipistrelle.detection.scans import BEARING, BEARING_STD, RANGE, RANGE_STD, Scan
 from pipistrelle.estimation.beliefs import Gaussian, Track, placed, some_of
-from pipistrelle.estimation.measurement import NEAREST
+from pipistrelle.estimation.observations.range import NEAREST
 from pipistrelle.estimation.rays import gate_bounds
 from pipistrelle.evaluation.accuracy import pose_error
 from pipistrelle.geometry import wrap

@@ -11,7 +11,7 @@ from pipistrelle.estimation.data_association import caller_search
 from pipistrelle.estimation.data_association.caller_search import fitted, place_caller
 from pipistrelle.estimation.data_association.pairs import Rows
 from pipistrelle.estimation.data_association.rows import Tracks, followed, in_window
-from pipistrelle.estimation.measurement import excess_path_slopes
+from pipistrelle.estimation.observations.excess_path import excess_path_slopes
 
 CALLER = np.array([9.0, -7.0])
 TURN = 0.02

@@ -14,7 +14,7 @@ from pipistrelle.estimation.data_association.existence import nobody, with_new
 from pipistrelle.estimation.data_association.pairs import pair_costs
 from pipistrelle.estimation.data_association.rows import CallerPlace, CallerState, Memory
 from pipistrelle.estimation.data_association.sequential import association_of
-from pipistrelle.estimation.measurement import excess_path_slopes
+from pipistrelle.estimation.observations.excess_path import excess_path_slopes
 
 CHANCES = (25.0, 0.06, 1.2, 0.8, 0.06)
 PLACES = np.random.default_rng(2).uniform(-10.0, 10.0, (20, 2))

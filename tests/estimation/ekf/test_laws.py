@@ -10,8 +10,8 @@ from scipy.stats import chi2
 
 from pipistrelle.estimation.beliefs import Gaussian
 from pipistrelle.estimation.ekf.filter import EkfSlam, InvariantEkfSlam
-from pipistrelle.estimation.measurement import NEAREST
 from pipistrelle.estimation.motion import Motion
+from pipistrelle.estimation.observations.range import NEAREST
 from pipistrelle.geometry import wrap
 from reference.missions import (
     SENSING,

@@ -10,7 +10,11 @@ from hypothesis import strategies as st
 from pipistrelle.detection.scans import make_scan
 from pipistrelle.estimation.beliefs import Gaussian
 from pipistrelle.estimation.ekf.filter import EkfSlam, InvariantEkfSlam
-from pipistrelle.estimation.measurement import excess_path_of, landmark_range, range_by_excess_path
+from pipistrelle.estimation.observations.excess_path import (
+    excess_path_of,
+    landmark_range,
+    range_by_excess_path,
+)
 from pipistrelle.geometry import range_and_bearing
 from reference.missions import (
     BICYCLE,

@@ -28,7 +28,8 @@ from pipistrelle.estimation.fastslam.block import (
     scratch_for,
     weigh_by_active,
 )
-from pipistrelle.estimation.measurement import NEAREST, Row
+from pipistrelle.estimation.observations.range import NEAREST
+from pipistrelle.estimation.observations.rows import Row
 from pipistrelle.estimation.rays import update_params
 
 

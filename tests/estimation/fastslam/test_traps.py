@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from pipistrelle.estimation.beliefs import Gaussian
-from pipistrelle.estimation.measurement import NEAREST
 from pipistrelle.estimation.motion import Motion, motion_jacobians
+from pipistrelle.estimation.observations.range import NEAREST
 from pipistrelle.geometry import wrap
 from reference.missions import BICYCLE, START, STEP, ray_config, scan_of, scan_with
 from reference.swarms import (

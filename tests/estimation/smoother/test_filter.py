@@ -7,8 +7,8 @@ import pytest
 
 from pipistrelle.detection.scans import EXCESS_PATH, rows_of, with_columns
 from pipistrelle.estimation.beliefs import Gaussian, placed
-from pipistrelle.estimation.measurement import excess_path_of
 from pipistrelle.estimation.motion import Motion
+from pipistrelle.estimation.observations.excess_path import excess_path_of
 from pipistrelle.estimation.smoother.filter import Smoother
 from pipistrelle.evaluation.accuracy import alignment, moved
 from pipistrelle.experiments.drives import Drive

@@ -7,8 +7,8 @@ import pytest
 
 from pipistrelle.detection.scans import with_columns
 from pipistrelle.estimation.beliefs import Gaussian, placed
-from pipistrelle.estimation.measurement import excess_path_of
 from pipistrelle.estimation.motion import Motion
+from pipistrelle.estimation.observations.excess_path import excess_path_of
 from pipistrelle.estimation.smoother.filter import MAX_RELATIVE_RANGE_STD, Smoother, unscented_range
 from reference.missions import ray_config, scan_with
 

@@ -12,8 +12,8 @@ from pipistrelle.detection.logs.folder import read_log, write_log
 from pipistrelle.detection.logs.readers import Reader
 from pipistrelle.detection.logs.recording import Log, LogCaller
 from pipistrelle.detection.scans import COLUMNS, make_scan, with_columns
-from pipistrelle.estimation.measurement import excess_path_of
 from pipistrelle.estimation.motion import Motion, motion_step
+from pipistrelle.estimation.observations.excess_path import excess_path_of
 from pipistrelle.experiments.drives import NO_TRUTH, Truth
 from pipistrelle.experiments.results.writing import run_entry, tables_of
 from pipistrelle.experiments.runs.replay import as_heard_by, drive_of, load, log_motion, replay

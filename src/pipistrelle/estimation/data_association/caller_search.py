@@ -21,7 +21,8 @@ from jaxtyping import Bool, Float, Int
 from pipistrelle.estimation.beliefs import JointGaussian
 from pipistrelle.estimation.data_association.existence import WINDOW
 from pipistrelle.estimation.data_association.rows import CallerPlace, Model, Tracks, in_window
-from pipistrelle.estimation.measurement import NEAREST, excess_path_slopes, range_by_excess_path
+from pipistrelle.estimation.observations.excess_path import excess_path_slopes, range_by_excess_path
+from pipistrelle.estimation.observations.range import NEAREST
 from pipistrelle.geometry import wrap_angle
 from pipistrelle.jit import kernel, no_alloc
 

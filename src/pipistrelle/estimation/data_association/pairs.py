@@ -34,7 +34,9 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from pipistrelle.estimation.beliefs import JointGaussian
-from pipistrelle.estimation.measurement import excess_path_slopes, observe
+from pipistrelle.estimation.observations.bearing import bearing_slopes, observe
+from pipistrelle.estimation.observations.excess_path import excess_path_slopes
+from pipistrelle.estimation.observations.range import Slopes, range_slopes
 from pipistrelle.geometry import wrap_angle
 from pipistrelle.jit import Whole, kernel, no_alloc
 
@@ -226,17 +228,23 @@ def _expected(
     distance, bearing, c, s, k = observe(x, y, mean[2], mean[i], mean[i + 1])
     for e, column in enumerate((0, 1, 2, i, i + 1, max(caller, 0), max(caller, 0) + 1)):
         index[e] = column
-    for e, slope in enumerate((s * k, -c * k, -1.0, -s * k, c * k, 0.0, 0.0)):
-        H[0, e] = slope
+    _write(H[0], bearing_slopes(c, s, k))
     if caller < 0:
-        for e, slope in enumerate((-c, -s, 0.0, c, s, 0.0, 0.0)):
-            H[1, e] = slope
+        _write(H[1], range_slopes(c, s))
         return bearing, distance
     bx, by = mean[caller], mean[caller + 1]
-    path, lx, ly, cx, cy = excess_path_slopes(x, y, mean[i], mean[i + 1], bx, by)
-    for e, slope in enumerate((-lx - cx, -ly - cy, 0.0, lx, ly, cx, cy)):
-        H[1, e] = slope
+    path, lx, ly, H[1, 5], H[1, 6] = excess_path_slopes(x, y, mean[i], mean[i + 1], bx, by)
+    _write(H[1], (-lx - H[1, 5], -ly - H[1, 6], 0.0))
+    H[1, 3], H[1, 4] = lx, ly
     return bearing, path
+
+
+@no_alloc
+def _write(row: Float[np.ndarray, "7"], by_pose: Slopes) -> None:
+    """Write derivatives by the pose, and by the landmark, which are minus the first two."""
+    for e in range(3):
+        row[e] = by_pose[e]
+    row[3], row[4] = -by_pose[0], -by_pose[1]
 
 
 @no_alloc

@@ -1,8 +1,14 @@
 r"""EKF update of a joint Gaussian over pose and hypotheses by the measurements of a scan.
 
 Measurements are applied in sequence, each linearised at the current mean: first mapped landmarks,
-then new landmarks from the updated pose, last the excess paths (`tdoa`). A bearing that initialised
-a landmark together with an excess path is not used again.
+then new landmarks from the updated pose, last the excess paths. A bearing that initialised a
+landmark together with an excess path is not used again.
+
+**Excess paths** update vehicle, landmark and caller if both are initialised, to second order: a
+segment of length L with the variance t across it is longer by :math:`t / 2L` than between the
+means, with the square of that as variance (Bar-Shalom, Li & Kirubarajan 2001, Sec. 10.3.2). If one
+is a ray, they weigh its hypotheses. Between two rays an excess path is not used, as some pair of
+hypotheses fits any value.
 
 **Merging of hypotheses** (`merge_members`). Hypotheses of a ray that converge to a point fit all
 further bearings equally, and would never be pruned. Neighbours at a distance d within a limit of
@@ -36,19 +42,25 @@ from pipistrelle.estimation.ekf.delayed_initialization import (
     members_of,
     place_at_crossing,
     place_by_ranges,
+    placed_by_excess_path,
     scratch_for,
     second_order,
+    single,
 )
 from pipistrelle.estimation.ekf.gaussian import (
     APPLIED,
     BEYOND,
     GATED,
+    MAX_WAITING,
+    WAITING,
     Covariance,
+    Joint,
     Labels,
     Mean,
     State,
     correct_active,
     correct_scalar,
+    corrected_by,
     drop_members,
     flush,
     inflated,
@@ -59,15 +71,16 @@ from pipistrelle.estimation.ekf.gaussian import (
     predicted_variance,
     range_only,
 )
-from pipistrelle.estimation.ekf.tdoa import correct_by_excess_path, placed_by_excess_path
-from pipistrelle.estimation.measurement import (
-    SQUARED,
+from pipistrelle.estimation.observations.bearing import observe
+from pipistrelle.estimation.observations.excess_path import excess_path_slopes
+from pipistrelle.estimation.observations.losses import SQUARED, robust_loss
+from pipistrelle.estimation.observations.range import NEAREST
+from pipistrelle.estimation.observations.rows import (
     Columns,
     ExcessPaths,
     Row,
     Timings,
     excess_paths,
-    observe,
     row_of,
     rows_with_bearing,
 )
@@ -257,6 +270,114 @@ def _correct_by_range(state: State, row: Row, params: UpdateParams, scratch: Scr
     stores = count == 0 or state.weight[first] < WAITING_WEIGHT
     if stores and add_stored_range(state, row, scratch):
         place_by_ranges(state, row, params.loss, scratch)
+    return APPLIED
+
+
+@no_alloc
+def _bend(dx: float, dy: float, xx: float, xy: float, yy: float) -> float:
+    """Return the position variance perpendicular to a segment (dx, dy), divided by its length."""
+    square = dx * dx + dy * dy
+    across = dy * dy * xx - 2.0 * dx * dy * xy + dx * dx * yy
+    return max(across, 0.0) / max(square * math.sqrt(square), NEAREST**3)
+
+
+@no_alloc
+def _expected(
+    joint: Joint, size: Whole, i: Whole, ib: Whole, w: Float[np.ndarray, " m"]
+) -> tuple[float, float]:
+    """Predict an excess path via point i from the caller at ib; return it and its variance."""
+    mean = joint.mean
+    excess_path, lx, ly, bx, by = excess_path_slopes(
+        mean[0], mean[1], mean[i], mean[i + 1], mean[ib], mean[ib + 1]
+    )
+    px, py = -lx - bx, -ly - by
+    p0, p1 = joint.covariance[0], joint.covariance[1]
+    li, lj = point_rows(joint, size, i)
+    bi, bj = point_rows(joint, size, ib)
+    for a in range(size):
+        w[a] = px * p0[a] + py * p1[a] + lx * li[a] + ly * lj[a] + bx * bi[a] + by * bj[a]
+    variance = px * w[0] + py * w[1] + lx * w[i] + ly * w[i + 1] + bx * w[ib] + by * w[ib + 1]
+    return excess_path, variance
+
+
+@no_alloc
+def _bends(joint: Joint, size: Whole, i: Whole, ib: Whole) -> tuple[float, float]:
+    """Return the second-order bias of an excess path, and an upper bound of its variance."""
+    mean, p0, p1 = joint.mean, joint.covariance[0], joint.covariance[1]
+    li, lj = point_rows(joint, size, i)
+    bi, bj = point_rows(joint, size, ib)
+    near = _bend(
+        mean[i] - mean[0], mean[i + 1] - mean[1], li[i] - 2.0 * p0[i] + p0[0],
+        li[i + 1] - p0[i + 1] - p1[i] + p0[1], lj[i + 1] - 2.0 * p1[i + 1] + p1[1],
+    )  # fmt: skip
+    onward = _bend(
+        mean[i] - mean[ib], mean[i + 1] - mean[ib + 1], li[i] - 2.0 * li[ib] + bi[ib],
+        li[i + 1] - li[ib + 1] - lj[ib] + bi[ib + 1], lj[i + 1] - 2.0 * lj[ib + 1] + bj[ib + 1],
+    )  # fmt: skip
+    straight = _bend(
+        mean[ib] - mean[0], mean[ib + 1] - mean[1], bi[ib] - 2.0 * p0[ib] + p0[0],
+        bi[ib + 1] - p0[ib + 1] - p1[ib] + p0[1], bj[ib + 1] - 2.0 * p1[ib + 1] + p1[1],
+    )  # fmt: skip
+    bent = near + onward + straight
+    return 0.5 * (near + onward - straight), 0.5 * bent * bent
+
+
+@no_alloc
+def correct_excess_path(
+    joint: Joint,
+    size: Whole,
+    i: Whole,
+    ib: Whole,
+    excess_path: float,
+    variance: float,
+    bound: float,
+    loss: Whole,
+) -> Whole:
+    """Update the state by an excess path via point i, caller at ib; return GATED or APPLIED."""
+    if joint.taken[WAITING] == MAX_WAITING:
+        flush(joint, size)
+    w = joint.W[joint.taken[WAITING]]
+    expected, spread = _expected(joint, size, i, ib, w)
+    longer, wider = _bends(joint, size, i, ib)
+    innovation, S = excess_path - expected - longer, spread + wider + variance
+    S *= robust_loss(innovation * innovation / S, loss)[0]
+    return GATED if corrected_by(joint, size, w, innovation, S, bound) == BEYOND else APPLIED
+
+
+@no_alloc
+def correct_by_excess_path(
+    state: State, paths: ExcessPaths, d: Whole, params: UpdateParams, scratch: Scratch
+) -> Whole:
+    """Update landmark, caller and vehicle by excess path d of a scan; return GATED or APPLIED.
+
+    If the other end is a ray, its hypotheses are weighed and pruned.
+    """
+    member, caller = single(state, paths.landmark[d]), single(state, paths.caller[d])
+    joint, size, likelihood = state.joint, 3 + 2 * state.members[0], scratch.likelihood
+    excess_path, variance = paths.excess_path[d], paths.variance[d]
+    if member >= 0 and caller >= 0:
+        i, ib = 3 + 2 * member, 3 + 2 * caller
+        return correct_excess_path(
+            joint, size, i, ib, excess_path, variance, params.passive_bound, params.loss
+        )
+    label = paths.landmark[d] if caller >= 0 else paths.caller[d]
+    first, count = members_of(state.landmark, state.members[0], label)
+    if (member < 0 and caller < 0) or count == 0 or state.weight[first] <= WAITING_WEIGHT:
+        return APPLIED
+    if joint.taken[WAITING] == MAX_WAITING:
+        flush(joint, size)
+    w = joint.W[joint.taken[WAITING]]
+    for j in range(count):
+        ix = 3 + 2 * (first + j)
+        i, ib = (ix, 3 + 2 * caller) if caller >= 0 else (3 + 2 * member, ix)
+        expected, spread = _expected(joint, size, i, ib, w)
+        longer, wider = _bends(joint, size, i, ib)
+        off, S = excess_path - expected - longer, spread + wider + variance
+        likelihood[j] = log_likelihood(off, S, False)
+    weight = state.weight[first:]
+    weigh_and_share(likelihood, weight, count, params.power, params.aggregated, scratch.share)
+    if survivors(weight, count, params.prune, scratch.keep) < count:
+        drop_members(state, first, count, scratch.keep, scratch.source)
     return APPLIED
 
 

@@ -1,4 +1,4 @@
-r"""Delayed initialization: store precise bearings, and ranges, until they place a landmark.
+r"""Delayed initialization: by crossing bearings, by ranges, and by a bearing and an excess path.
 
 **Stored bearings.** A landmark first measured by a bearing too precise for ray hypotheses
 (`is_precise`) enters the state as two points: :math:`p_0`, the position of the vehicle, and q, a
@@ -18,7 +18,17 @@ with t the position of the crossing on the first ray in units of :math:`|q - p_0
 
 **Stored ranges.** Of a landmark with ranges only, the positions of the vehicle enter the state,
 with the range at each as a weight (`drop_stored`). When they leave a single place
-(`trilateration`), its derivatives by ranges and positions correlate it with the state.
+(`observations.range`), its derivatives by ranges and positions correlate it with the state.
+
+**Excess path.** With an excess path e, and the other end y in the state, a bearing in the direction
+u places a landmark or caller x at the range r of `observations.excess_path`. With the derivatives
+:math:`e_x, e_y`
+
+.. math:: dx = dp + u\, a^T (dy - dp) + q\,(d\theta + d\phi) + \frac{u}{k} de, \quad
+          k = e_x \cdot u, \quad a = -\frac{e_y}{k}, \quad
+          q = r \left( u_\perp - u \frac{e_x \cdot u_\perp}{k} \right)
+
+correlates it with caller and vehicle (`place_by_excess_path`).
 
 **Second order.** Let :math:`P_{aa}, P_{cc}, P_{ac}` be the covariance of a landmark relative to
 the vehicle, along and across the line of sight. Its bearing then has a bias of
@@ -40,19 +50,26 @@ from pipistrelle.estimation.ekf.gaussian import (
     drop_members,
     flush,
     initialise,
+    point_rows,
     relative_covariance,
 )
-from pipistrelle.estimation.measurement import (
-    MAX_RELATIVE_RANGE_STD,
-    NEAREST,
-    SQUARED,
-    Row,
-    observe,
-    robust_loss,
+from pipistrelle.estimation.observations.bearing import observe
+from pipistrelle.estimation.observations.excess_path import (
+    MIN_TDOA_SIGMAS,
+    range_with_slopes,
 )
+from pipistrelle.estimation.observations.losses import SQUARED, robust_loss
+from pipistrelle.estimation.observations.range import (
+    MAX_RELATIVE_RANGE_STD,
+    MIN_SPACING,
+    NEAREST,
+    Ranges,
+    located,
+    refined,
+)
+from pipistrelle.estimation.observations.rows import ExcessPaths, Row
 from pipistrelle.estimation.rays import FITTED, UpdateParams
-from pipistrelle.estimation.trilateration import MIN_SPACING, Ranges, located, refined
-from pipistrelle.jit import Whole, kernel, no_alloc
+from pipistrelle.jit import Flag, Whole, kernel, no_alloc
 
 
 class Scratch(NamedTuple):
@@ -289,4 +306,147 @@ def place_at_crossing(state: State, first: Whole, row: Row, loss: Whole) -> bool
     P[i, i + 1] = P[i + 1, i] = xy
     mean[i], mean[i + 1] = mean[0] + r * ux, mean[1] + r * uy
     state.weight[first] = 1.0
+    return True
+
+
+MAX_SHARE = 0.1
+"""Largest standard deviation of a range from an excess path, relative to the range."""
+ROBUST_BEARING_FACTOR = 3.0
+"""Factor on bearing standard deviations with the robust setting, as a wrong initial position would
+displace all later landmarks."""
+
+
+@no_alloc
+def relative_range_std(
+    joint: Joint,
+    size: Whole,
+    iy: Whole,
+    of_caller: Flag,
+    measured: tuple[float, float, float, float],
+) -> float:
+    """Return a range's relative standard deviation by excess path and bearing, or infinity.
+
+    ``measured`` is excess path, its variance, bearing and its variance. ``of_caller`` selects the
+    caller's range, with a landmark at index iy. It is infinite above `MAX_SHARE`, or
+    if the excess path may be 0 (`MIN_TDOA_SIGMAS`).
+    """
+    excess_path, along, bearing, across = measured
+    mean, turns = joint.mean, joint.turns
+    if excess_path <= MIN_TDOA_SIGMAS * math.sqrt(along):
+        return math.inf
+    x, y, px, py = mean[0], mean[1], mean[iy], mean[iy + 1]
+    r, ax, ay, k, side = range_with_slopes(excess_path, x, y, px, py, mean[2] + bearing, of_caller)
+    if r == 0.0:
+        return math.inf
+    p0, p1, p2 = joint.covariance[0], joint.covariance[1], joint.covariance[2]
+    yi, yj = point_rows(joint, size, iy)
+    xx = yi[iy] - 2.0 * p0[iy] + p0[0]
+    xy = yi[iy + 1] - p0[iy + 1] - p1[iy] + p0[1]
+    yy = yj[iy + 1] - 2.0 * p1[iy + 1] + p1[1]
+    xh, yh, turn = p2[iy] - p2[0], p2[iy + 1] - p2[1], -r * side / k
+    spread = (
+        ax * ax * xx + 2.0 * ax * ay * xy + ay * ay * yy
+        + 2.0 * turns * turn * (ax * xh + ay * yh) + turn * turn * (turns * p2[2] + across)
+        + along / (k * k)
+    )  # fmt: skip
+    share = math.sqrt(max(spread, 0.0)) / r
+    return share if share <= MAX_SHARE else math.inf
+
+
+@no_alloc
+def place_by_excess_path(
+    joint: Joint,
+    size: Whole,
+    i: Whole,
+    iy: Whole,
+    of_caller: Flag,
+    measured: tuple[float, float, float, float],
+) -> None:
+    """Write a point's position and covariance at index i, by its bearing and excess path.
+
+    Arguments as in `relative_range_std`; no columns may be deferred.
+    """
+    excess_path, along, bearing, across = measured
+    mean, covariance, turns = joint.mean, joint.covariance, joint.turns
+    direction = mean[2] + bearing
+    c, s = math.cos(direction), math.sin(direction)
+    x, y, px, py = mean[0], mean[1], mean[iy], mean[iy + 1]
+    r, ax, ay, k, side = range_with_slopes(excess_path, x, y, px, py, direction, of_caller)
+    qx, qy = r * (-s - c * side / k), r * (c - s * side / k)
+    mean[i], mean[i + 1] = mean[0] + r * c, mean[1] + r * s
+    for b in range(size):
+        if b != i and b != i + 1:
+            p0, p1, turned = covariance[0, b], covariance[1, b], turns * covariance[2, b]
+            far = ax * (covariance[iy, b] - p0) + ay * (covariance[iy + 1, b] - p1)
+            covariance[i, b] = covariance[b, i] = p0 + c * far + qx * turned
+            covariance[i + 1, b] = covariance[b, i + 1] = p1 + s * far + qy * turned
+    noise = along / (k * k)
+    x0, x1, x2 = covariance[i, 0], covariance[i, 1], turns * covariance[i, 2]
+    y0, y1, y2 = covariance[i + 1, 0], covariance[i + 1, 1], turns * covariance[i + 1, 2]
+    far_x = ax * (covariance[i, iy] - x0) + ay * (covariance[i, iy + 1] - x1)
+    far_y = ax * (covariance[i + 1, iy] - y0) + ay * (covariance[i + 1, iy + 1] - y1)
+    covariance[i, i] = x0 + c * far_x + qx * x2 + c * c * noise + qx * qx * across
+    covariance[i + 1, i + 1] = y1 + s * far_y + qy * y2 + s * s * noise + qy * qy * across
+    cross = x1 + s * far_x + qy * x2 + c * s * noise + qx * qy * across
+    covariance[i, i + 1] = covariance[i + 1, i] = cross
+
+
+@no_alloc
+def single(state: State, label: Whole) -> Whole:
+    """Return the index of a landmark's only hypothesis, or -1 if it has none or several."""
+    first, count = members_of(state.landmark, state.members[0], label)
+    return first if count == 1 else -1
+
+
+@no_alloc
+def _surest(state: State, row: Row, paths: ExcessPaths, loss: Whole) -> Whole:
+    """Return the index of the excess path that best gives a landmark's range, or -1.
+
+    It is of this landmark with an initialised caller, or via an initialised landmark if this
+    landmark is the caller. With a robust loss precise even with the bearing std multiplied by
+    `ROBUST_BEARING_FACTOR`.
+    """
+    best, least, size = -1, math.inf, 3 + 2 * state.members[0]
+    across = row.bearing_variance * (
+        1.0 if loss == SQUARED else ROBUST_BEARING_FACTOR * ROBUST_BEARING_FACTOR
+    )
+    for d in range(paths.landmark.size):
+        of_caller = paths.caller[d] == row.landmark
+        if paths.used[d] or not (of_caller or paths.landmark[d] == row.landmark):
+            continue
+        other = single(state, paths.landmark[d] if of_caller else paths.caller[d])
+        if other < 0:
+            continue
+        measured = (paths.excess_path[d], paths.variance[d], row.bearing, across)
+        share = relative_range_std(state.joint, size, 3 + 2 * other, of_caller, measured)
+        if share < least:
+            best, least = d, share
+    return best
+
+
+@no_alloc
+def placed_by_excess_path(
+    state: State, row: Row, paths: ExcessPaths, loss: Whole, scratch: Scratch
+) -> bool:
+    """Initialise a landmark by bearing and excess path, if precise; return whether it was."""
+    first, count = members_of(state.landmark, state.members[0], row.landmark)
+    if count == 1 or not math.isnan(row.range):
+        return False
+    d = _surest(state, row, paths, loss)
+    if d < 0:
+        return False
+    if count > 0:
+        for j in range(count):
+            scratch.keep[j] = j == 0
+        drop_members(state, first, count, scratch.keep, scratch.source)
+    else:
+        state.landmark[first] = row.landmark
+        state.members[0] += 1
+    state.weight[first] = 1.0
+    of_caller = paths.caller[d] == row.landmark
+    other = single(state, paths.landmark[d] if of_caller else paths.caller[d])
+    measured = (paths.excess_path[d], paths.variance[d], row.bearing, row.bearing_variance)
+    size = 3 + 2 * state.members[0]
+    place_by_excess_path(state.joint, size, 3 + 2 * first, 3 + 2 * other, of_caller, measured)
+    paths.used[d] = True
     return True

@@ -12,7 +12,7 @@ which has no heading column in H: ``turns`` multiplies it, 0 for the
 invariant and 1 for the linear error.
 
 **Robust losses** (`inflated`): an innovation :math:`\nu` with the expected variance S has the
-factor f of `measurement.robust_loss` at :math:`\nu^2 / S`, and
+factor f of `losses.robust_loss` at :math:`\nu^2 / S`, and
 
 .. math:: R' = R + S\,(f - 1)
 
@@ -53,15 +53,6 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from pipistrelle.estimation.measurement import (
-    NEAREST,
-    Row,
-    Slopes,
-    bearing_slopes,
-    observe,
-    range_slopes,
-    robust_loss,
-)
 from pipistrelle.estimation.motion import (
     Controls,
     Durations,
@@ -69,6 +60,10 @@ from pipistrelle.estimation.motion import (
     PoseCovariance,
     propagate_pose,
 )
+from pipistrelle.estimation.observations.bearing import bearing_slopes, observe
+from pipistrelle.estimation.observations.losses import robust_loss
+from pipistrelle.estimation.observations.range import NEAREST, Slopes, range_slopes
+from pipistrelle.estimation.observations.rows import Row
 from pipistrelle.geometry import wrap_angle
 from pipistrelle.jit import Whole, kernel, no_alloc
 
@@ -439,16 +434,16 @@ def correct_active(joint: Joint, size: Whole, i: Whole, row: Row, bound: float) 
     if joint.taken[WAITING] + 2 > MAX_WAITING:
         flush(joint, size)
     nu0, nu1 = row.range - near, wrap_angle(row.bearing - expected)
-    h0, h1, turns = s * k, -c * k, joint.turns
+    (h0, h1, _), (r0, r1, _), turns = bearing_slopes(c, s, k), range_slopes(c, s), joint.turns
     p0, p1, p2 = joint.covariance[0], joint.covariance[1], joint.covariance[2]
     pi, pj = point_rows(joint, size, i)
     # W = P H^T L^-T with L L^T = S, e = L^-1 nu, x += W e, P -= W W^T
     w0, w1 = joint.W[joint.taken[WAITING]], joint.W[joint.taken[WAITING] + 1]
     for a in range(size):
         east, north = p0[a] - pi[a], p1[a] - pj[a]
-        w0[a] = -c * east - s * north
+        w0[a] = r0 * east + r1 * north
         w1[a] = h0 * east + h1 * north - turns * p2[a]
-    S00 = -c * (w0[0] - w0[i]) - s * (w0[1] - w0[i + 1]) + row.range_variance
+    S00 = r0 * (w0[0] - w0[i]) + r1 * (w0[1] - w0[i + 1]) + row.range_variance
     S01 = h0 * (w0[0] - w0[i]) + h1 * (w0[1] - w0[i + 1]) - turns * w0[2]
     S11 = h0 * (w1[0] - w1[i]) + h1 * (w1[1] - w1[i + 1]) - turns * w1[2] + row.bearing_variance
     L00 = math.sqrt(S00)

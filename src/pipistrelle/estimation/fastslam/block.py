@@ -29,7 +29,8 @@ from pipistrelle.arithmetic.elementary import (
     logarithm,
     wrapped,
 )
-from pipistrelle.estimation.measurement import NEAREST, Row
+from pipistrelle.estimation.observations.range import NEAREST
+from pipistrelle.estimation.observations.rows import Row
 from pipistrelle.estimation.rays import (
     AS_PRINTED,
     EXACT,

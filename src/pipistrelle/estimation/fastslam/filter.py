@@ -80,8 +80,8 @@ from pipistrelle.estimation.fastslam.particles import (
     stratified,
     summarise,
 )
-from pipistrelle.estimation.measurement import scan_columns
 from pipistrelle.estimation.motion import SMALLEST_STD, Controls, Durations, Motion, motion_numbers
+from pipistrelle.estimation.observations.rows import scan_columns
 from pipistrelle.estimation.rays import UpdateParams, update_params
 from pipistrelle.geometry import wrap
 

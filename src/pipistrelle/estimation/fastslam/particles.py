@@ -56,7 +56,6 @@ from pipistrelle.estimation.fastslam.block import (
     weigh_by_bearing,
     weigh_sample,
 )
-from pipistrelle.estimation.measurement import Columns, Row, row_of, rows_with_bearing
 from pipistrelle.estimation.motion import (
     BY_POSES,
     SMALLEST_STD,
@@ -68,6 +67,7 @@ from pipistrelle.estimation.motion import (
     motion_increment,
     relative_noise,
 )
+from pipistrelle.estimation.observations.rows import Columns, Row, row_of, rows_with_bearing
 from pipistrelle.estimation.rays import ANEW, MOVED, UpdateParams
 from pipistrelle.jit import Whole, kernel, no_alloc, no_alloc_inlined
 

@@ -46,6 +46,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from pipistrelle.estimation.motion import PoseCovariance
+from pipistrelle.estimation.observations.range import cholesky
 from pipistrelle.estimation.smoother.observations import hear
 from pipistrelle.estimation.smoother.records import (
     CALLER,
@@ -70,7 +71,6 @@ from pipistrelle.estimation.smoother.records import (
     add_image,
     add_multiple,
     add_product,
-    cholesky,
     congruent,
     multiply,
     posterior,

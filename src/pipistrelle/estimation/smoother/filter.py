@@ -15,7 +15,7 @@ and map are the optimum of all measurements so far (`belief`).
 
 **Initialisation** is delayed until the range is certain. A measured range initialises at once.
 Otherwise an excess path gives the range along the bearing: of a landmark if the caller is
-initialised, of a caller if the landmark is (`estimation.measurement`). It is strongly nonlinear
+initialised, of a caller if the landmark is (`observations.excess_path`). It is strongly nonlinear
 near the line from vehicle to caller, so its uncertainty is an unscented transform of offset,
 bearing and excess path (eight sigma points at two standard deviations; Julier & Uhlmann 1997),
 unknown if a sigma point has no range. Without it, a landmark is initialised where its newest
@@ -29,7 +29,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Float, Int
 
-from pipistrelle.config import FARTHEST, RayConfig
+from pipistrelle.config import RayConfig
 from pipistrelle.detection.scans import (
     BEARING,
     BEARING_STD,
@@ -49,14 +49,13 @@ from pipistrelle.estimation.checking import (
     usable_pose,
     usable_scan,
 )
-from pipistrelle.estimation.measurement import (
-    LOSSES,
-    MAX_RELATIVE_RANGE_STD,
-    MIN_TDOA_SIGMAS,
-    observe,
-    range_by_excess_path,
-)
 from pipistrelle.estimation.motion import SMALLEST_STD, Controls, Durations, Motion
+from pipistrelle.estimation.observations.bearing import observe
+from pipistrelle.estimation.observations.excess_path import (
+    unscented_range,
+)
+from pipistrelle.estimation.observations.losses import LOSSES
+from pipistrelle.estimation.observations.range import MAX_RELATIVE_RANGE_STD
 from pipistrelle.estimation.rays import gate_bounds
 from pipistrelle.estimation.recovery import recovering
 from pipistrelle.estimation.smoother.belief import SmootherBelief
@@ -104,7 +103,6 @@ from pipistrelle.estimation.smoother.records import (
     Span,
     Stack,
     Work,
-    cholesky,
     work_of,
 )
 from pipistrelle.estimation.smoother.sweep import (
@@ -172,47 +170,6 @@ def excess_path_range(
     spread[3, 3] = rows.numbers[clue, EXCESS_PATH_STD] ** 2
     found, share = unscented_range(way, spread, caller)
     return found if share <= MAX_RELATIVE_RANGE_STD else math.nan
-
-
-@kernel
-def unscented_range(
-    way: Float[np.ndarray, "4"], spread: Float[np.ndarray, "4 4"], caller: bool
-) -> tuple[float, float]:
-    """Compute a range [m] from an excess path, and its relative std by an unscented transform.
-
-    ``way`` (4) is the offset to the other point (2), the direction of the unknown point, and the
-    excess path; ``spread`` (4, 4) is their covariance. ``caller`` selects the range of the caller.
-    In the example the landmark is at (3, 4), then between the two, and the caller at (6, 0).
-
-    >>> way, spread = np.array([6.0, 0.0, np.arctan2(4.0, 3.0), 4.0]), np.diag([0, 0, 0, 0.01])
-    >>> [round(float(number), 3) for number in unscented_range(way, spread, False)]
-    [5.0, 0.016]
-    >>> unscented_range(np.array([6.0, 0.0, 0.0, 0.0]), spread, False)[1]
-    inf
-    """
-    if way[3] <= MIN_TDOA_SIGMAS * math.sqrt(spread[3, 3]):
-        return math.nan, math.inf
-    L, at, total = np.zeros((4, 4)), np.empty(4), 0.0
-    cholesky(spread, L)
-    first = _range(way, caller)
-    for e in range(4):
-        for side in (-2.0, 2.0):
-            for a in range(4):
-                at[a] = way[a] + side * L[a, e]
-            other = _range(at, caller)
-            if not (0.0 < other < FARTHEST):
-                return math.nan, math.inf
-            total += (other - first) ** 2
-    if not (0.0 < first < FARTHEST):
-        return math.nan, math.inf
-    return first, math.sqrt(total / 8.0) / first
-
-
-@no_alloc
-def _range(way: Float[np.ndarray, "4"], caller: bool) -> float:
-    """Return the range [m] of a landmark or caller from an excess path and a direction."""
-    c, s = math.cos(way[2]), math.sin(way[2])
-    return range_by_excess_path(way[3], way[0], way[1], c, s, caller)
 
 
 MIN_CROSSING_ANGLE = 0.5

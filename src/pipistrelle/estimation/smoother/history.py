@@ -14,8 +14,8 @@ from jaxtyping import Bool, Float, Int
 
 from pipistrelle.detection.scans import BEARING, NUMBERS, RANGE, Scan
 from pipistrelle.estimation.beliefs import Gaussian
-from pipistrelle.estimation.measurement import caller_labels
 from pipistrelle.estimation.motion import SMALLEST_STD
+from pipistrelle.estimation.observations.rows import caller_labels
 from pipistrelle.estimation.smoother.preintegration import NOTHING, Calibration, Led, Odometry
 from pipistrelle.estimation.smoother.records import CALLER, POSE, Arrays, PlainLegs, Stack
 from pipistrelle.jit import Whole, optimised_once

@@ -30,16 +30,19 @@ from pipistrelle.detection.scans import (
     RANGE_STD,
     SLOPE,
 )
-from pipistrelle.estimation.measurement import (
-    NEAREST,
-    Slopes,
-    bearing_slopes,
-    excess_path_slopes,
-    observe,
-    range_slopes,
-    robust_loss,
-)
 from pipistrelle.estimation.motion import SMALLEST_STD
+from pipistrelle.estimation.observations.bearing import bearing_slopes, observe
+from pipistrelle.estimation.observations.excess_path import excess_path_slopes
+from pipistrelle.estimation.observations.losses import robust_loss
+from pipistrelle.estimation.observations.range import (
+    MIN_SPACING,
+    NEAREST,
+    Place,
+    Ranges,
+    Slopes,
+    located,
+    range_slopes,
+)
 from pipistrelle.estimation.smoother.records import (
     CALLER,
     POSE,
@@ -57,7 +60,6 @@ from pipistrelle.estimation.smoother.records import (
     work_of,
     write,
 )
-from pipistrelle.estimation.trilateration import MIN_SPACING, Place, Ranges, located
 from pipistrelle.geometry import wrap_angle
 from pipistrelle.jit import Whole, kernel, no_alloc, no_alloc_inlined, optimised_once
 
@@ -66,7 +68,7 @@ MISFIT = POSE
 Point = tuple[Whole, float, float]
 """Unknown of a position (as `Places.index`), and x and y [m]."""
 Seen = tuple[float, float, float, float, float]
-"""Range, bearing, cosines and inverse range of a point, from `estimation.measurement.observe`."""
+"""Range, bearing, cosines and inverse range of a point, from `observations.bearing.observe`."""
 
 
 class View(NamedTuple):

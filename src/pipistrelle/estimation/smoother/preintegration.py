@@ -36,13 +36,13 @@ from pipistrelle.estimation.motion import (
     motion_numbers,
     propagate_pose,
 )
+from pipistrelle.estimation.observations.range import cholesky
 from pipistrelle.estimation.smoother.records import (
     Arrays,
     Legs,
     PlainLegs,
     add,
     add_product,
-    cholesky,
     congruent,
     multiply,
     solve_with,

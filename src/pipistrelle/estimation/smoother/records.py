@@ -4,13 +4,13 @@ The *separator* (`border`) holds the landmarks and parameters that all poses sha
 routines are loops with a fixed order of additions, so that results are reproducible.
 """
 
-import math
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple, Self
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from pipistrelle.estimation.observations.range import cholesky
 from pipistrelle.jit import Whole, kernel, no_alloc
 
 ROOM = 64
@@ -172,21 +172,6 @@ def congruent(
 
 
 @no_alloc
-def cholesky(A: Float[np.ndarray, "d d"], L: Float[np.ndarray, "d d"]) -> None:
-    """Write the Cholesky factor L of a positive semidefinite A; pivots not above 0 become 0."""
-    for j in range(A.shape[0]):
-        pivot = A[j, j]
-        for e in range(j):
-            pivot -= L[j, e] * L[j, e]
-        L[j, j] = math.sqrt(pivot) if pivot > 0.0 else 0.0
-        for i in range(j + 1, A.shape[0]):
-            total = A[i, j]
-            for e in range(j):
-                total -= L[i, e] * L[j, e]
-            L[i, j] = total / L[j, j] if pivot > 0.0 else 0.0
-
-
-@no_alloc
 def solve_with(L: Float[np.ndarray, "d d"], x: Float[np.ndarray, " d"]) -> None:
     """Solve L L^T y = x for y and write it to x; entries with a zero pivot of L become 0."""
     d = x.size
@@ -296,7 +281,7 @@ class Places(NamedTuple):
 class NoiseModel(NamedTuple):
     """The smoother's robust loss, priors and noise of moving callers, and damping."""
 
-    loss: Whole  # code of the robust loss (`measurement.robust_loss`)
+    loss: Whole  # code of the robust loss (`losses.robust_loss`)
     place_std: float  # std of a moving caller's initial position [m]
     speed_std: float  # std of a moving caller's initial velocity along each axis [m/s]
     walk_std: float  # std of a moving caller's velocity change after 1 s [m/s]

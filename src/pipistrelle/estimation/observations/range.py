@@ -1,13 +1,16 @@
-r"""Trilateration: the places of a landmark by its ranges from several positions.
+r"""Range of a point: derivatives, the rule that a range is certain, and places by ranges only.
 
-Ranges :math:`d_i` with variances :math:`\sigma_i^2` from positions :math:`p_i` of error
-covariance P place a landmark at a minimum of
+A landmark is initialised when its range, or its place seen from the vehicle, is certain: beyond a
+standard deviation of a fifth (`MAX_RELATIVE_RANGE_STD`) its position is not Gaussian.
+
+**Trilateration.** Ranges :math:`d_i` with variances :math:`\sigma_i^2` from positions :math:`p_i`
+of error covariance P place a landmark at a minimum of
 
 .. math:: c(l) = r^T R^{-1} r, \quad r_i = |l - p_i| - d_i, \quad
           R = \operatorname{diag}(f_i \sigma_i^2) + U P U^T
 
 with the directions :math:`u_i` from the positions in U and the factors :math:`f_i` of a robust loss
-(`measurement.robust_loss`). There :math:`dl = A^{-1} U^T R^{-1} (U\,dp + dd)` with the covariance
+(`losses.robust_loss`). There :math:`dl = A^{-1} U^T R^{-1} (U\,dp + dd)` with the covariance
 :math:`A^{-1} = (U^T R^{-1} U)^{-1}`. Errors that all positions share move the landmark, but do not
 change c; P is therefore of the positions relative to the newest.
 
@@ -25,9 +28,15 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float, Int
 
-from pipistrelle.estimation.measurement import MAX_RELATIVE_RANGE_STD, NEAREST, robust_loss
-from pipistrelle.jit import Whole, no_alloc
+from pipistrelle.estimation.observations.losses import robust_loss
+from pipistrelle.jit import Whole, kernel, no_alloc
 
+NEAREST = 1e-3
+"""Distance [m] below which a measurement is not linearised."""
+MAX_RELATIVE_RANGE_STD = 0.2
+"""Largest standard deviation of a range that initialises a landmark, relative to the range."""
+Slopes = tuple[float, float, float]
+"""Derivatives by x, y and heading of the pose; by a point they are minus the first two."""
 MIN_SPACING = 3.0
 """Least distance between positions, in standard deviations of the range."""
 EXCLUDED = 2.0 * math.log(1e6)
@@ -52,6 +61,27 @@ class Ranges(NamedTuple):
     P: Float[np.ndarray, "m m"]  # covariance of positions; the newest is at index 0
     count: Whole
     work: Float[np.ndarray, "w n"]  # of n + 3 rows
+
+
+@kernel
+def range_slopes(c: float, s: float) -> Slopes:
+    """Return the derivatives of a range by the pose, from the numbers of `observe`."""
+    return -c, -s, 0.0
+
+
+@no_alloc
+def cholesky(A: Float[np.ndarray, "d d"], L: Float[np.ndarray, "d d"]) -> None:
+    """Write the Cholesky factor L of a positive semidefinite A; pivots not above 0 become 0."""
+    for j in range(A.shape[0]):
+        pivot = A[j, j]
+        for e in range(j):
+            pivot -= L[j, e] * L[j, e]
+        L[j, j] = math.sqrt(pivot) if pivot > 0.0 else 0.0
+        for i in range(j + 1, A.shape[0]):
+            total = A[i, j]
+            for e in range(j):
+                total -= L[i, e] * L[j, e]
+            L[i, j] = total / L[j, j] if pivot > 0.0 else 0.0
 
 
 @no_alloc
