@@ -8,7 +8,7 @@ from scipy.optimize import brentq
 from reference.ekf_slam import BELIEVED, NEAREST, POSE, WAITS, SlowEkfSlam, normalised
 from reference.invariant_ekf import QUARTER, SlowInvariantEkfSlam
 
-SURE = 0.1
+SURE = 0.2
 SOME = 3.0
 FARTHER = 3.0
 TINY = 1e-6
@@ -107,6 +107,23 @@ class Timed:
         self.aggregated[block] = 1.0
         return True
 
+    def deviation(self, z, pose, place, *, of_caller):
+        """Standard deviation of the range over eight sigma points; infinite if one has none."""
+        J = np.zeros((3, self.X.size))
+        J[:2, place], J[:2, pose.start : pose.start + 2] = np.eye(2), -np.eye(2)
+        J[2, pose.stop - 1] = self.turns
+        farther = FARTHER if self.robust else 1.0
+        C = np.diag([0.0, 0.0, farther**2 * self.bearing_variance, self.excess_path_variance])
+        C[:3, :3] += J @ self.P @ J.T
+        way = np.array([*(z[3:5] - z[:2]), z[2] + z[5], z[6]])
+
+        def ranged(way):
+            return range_on_ray(np.zeros(2), way[2], way[:2], way[3], of_caller=of_caller)
+
+        steps = 2.0 * np.linalg.cholesky(C + 1e-18 * np.eye(4)).T
+        off = np.array([ranged(way + side * step) for step in steps for side in (1, -1)])
+        return math.sqrt(np.mean((off - ranged(way)) ** 2)) if np.isfinite(off).all() else math.inf
+
     def where(self, block, e, bearing, *, of_caller):
         """Relative standard deviation of the range, the point, its Jacobian by the state, noise."""
         pose, place = self.at(POSE), self.at(block)
@@ -123,20 +140,18 @@ class Timed:
         if not math.isfinite(r) or not np.isfinite(slopes(ranged, z)).all():
             return math.inf, None, None, None
         R = np.diag([self.bearing_variance, self.excess_path_variance])
-        by_state, noise = np.zeros((3, self.X.size)), np.zeros((3, 2))
-        both = np.vstack([slopes(pointed, z), slopes(ranged, z)])
+        by_state = np.zeros((2, self.X.size))
+        both = slopes(pointed, z)
         by_state[:, pose], by_state[:, place], noise = both[:, :3], both[:, 3:5], both[:, 5:]
         point = pointed(z)
         if self.turns == 0.0:
             by_state = by_state @ np.linalg.inv(self.change())
-            by_state[:2, 2] -= QUARTER @ point
-        spread = by_state @ self.P @ by_state.T + noise @ R @ noise.T
-        farther = (FARTHER**2 - 1.0) * noise[2, 0] ** 2 * R[0, 0] if self.robust else 0.0
+            by_state[:, 2] -= QUARTER @ point
         return (
-            math.sqrt(max(spread[2, 2] + farther, 0.0)) / r,
+            self.deviation(z, pose, place, of_caller=of_caller) / r,
             point,
-            by_state[:2],
-            (noise @ R @ noise.T)[:2, :2],
+            by_state,
+            noise @ R @ noise.T,
         )
 
     # Update and weights

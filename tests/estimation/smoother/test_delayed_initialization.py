@@ -8,8 +8,9 @@ import pytest
 
 from pipistrelle.estimation.beliefs import Gaussian, placed
 from pipistrelle.estimation.motion import Motion
+from pipistrelle.estimation.observations.bearing import MIN_CROSSING_SINE
 from pipistrelle.estimation.smoother.elimination import Places, Rows
-from pipistrelle.estimation.smoother.filter import MIN_CROSSING_ANGLE, Smoother, range_by_crossing
+from pipistrelle.estimation.smoother.filter import Smoother, range_by_crossing
 from pipistrelle.estimation.smoother.preintegration import OF_SENSOR
 from pipistrelle.experiments.drives import Drive
 from pipistrelle.experiments.runs.trial import run_filter
@@ -78,15 +79,15 @@ def test_the_earlier_bearing_that_crosses_most_squarely_counts():
 
 @pytest.mark.parametrize(("more", "there"), [(1e-6, True), (-1e-6, False)])
 def test_bearings_cross_clearly_from_the_least_parallax_on(more, there):
-    heard = Bearing(0, 0.7, 1e-4), Bearing(1, 0.7 + MIN_CROSSING_ANGLE + more, 1e-4)
+    heard = Bearing(0, 0.7, 1e-4), Bearing(1, 0.7 + np.arcsin(MIN_CROSSING_SINE) + more, 1e-4)
     assert (crossing(poses(2), heard) is not None) == there
 
 
 @pytest.mark.parametrize(
     ("earlier", "last", "there"),
-    [(0.249, 1e-4, True), (0.251, 1e-4, False), (1e-4, 0.353, True), (1e-4, 0.355, False)],
+    [(0.0999, 1e-4, True), (0.1001, 1e-4, False), (1e-4, 0.141, True), (1e-4, 0.142, False)],
 )
-def test_bearings_cross_where_the_place_is_known_to_half_the_range(earlier, last, there):
+def test_bearings_cross_where_the_range_is_known_to_a_fifth(earlier, last, there):
     """From (0, 0) and (2, 0) to (2, 2): 2 m and sqrt(8) m away, at an angle of 45 degrees."""
     poses = np.array([[0.0, 0.0, 0.0], [2.0, 0.0, 0.0]])
     heard = Bearing(0, np.pi / 4, earlier), Bearing(1, np.pi / 2, last)

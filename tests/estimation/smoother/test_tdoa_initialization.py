@@ -1,5 +1,6 @@
 """Placing by an excess path: how sure a range is, and that what is not sure places nothing."""
 
+import math
 from dataclasses import replace
 
 import numpy as np
@@ -8,8 +9,9 @@ import pytest
 from pipistrelle.detection.scans import with_columns
 from pipistrelle.estimation.beliefs import Gaussian, placed
 from pipistrelle.estimation.motion import Motion
-from pipistrelle.estimation.observations.excess_path import excess_path_of
-from pipistrelle.estimation.smoother.filter import MAX_RELATIVE_RANGE_STD, Smoother, unscented_range
+from pipistrelle.estimation.observations.excess_path import excess_path_of, unscented_range
+from pipistrelle.estimation.observations.range import is_certain
+from pipistrelle.estimation.smoother.filter import Smoother
 from reference.missions import ray_config, scan_with
 
 UNICYCLE = Motion(model="unicycle", control_std=(0.05, 0.02), noise_at_rest=False)
@@ -24,52 +26,45 @@ def bearing_of(place):
 
 def way_to(place, caller=CALLER):
     """The way to the caller, the landmark's direction, and its excess path."""
-    return np.array([*caller, bearing_of(place), excess_path_of(HERE, place, caller)])
+    return (*caller.tolist(), bearing_of(place), excess_path_of(HERE, place, caller))
 
 
 # How sure
 
 
 def test_an_excess_path_gives_the_range_of_landmark_or_caller():
-    no_noise = np.zeros((4, 4))
-    assert unscented_range(way_to(BESIDE), no_noise, False) == pytest.approx(
-        (np.hypot(*BESIDE), 0.0)
-    )
-    way = np.array([*BESIDE, bearing_of(CALLER), excess_path_of(HERE, BESIDE, CALLER)])
-    found = unscented_range(way, no_noise, True)
-    assert found == pytest.approx((np.hypot(*CALLER), 0.0))
+    exact = (0.0,) * 7
+    assert unscented_range(way_to(BESIDE), exact, False) == pytest.approx((np.hypot(*BESIDE), 0.0))
+    way = (*BESIDE, bearing_of(CALLER), excess_path_of(HERE, BESIDE, CALLER))
+    assert unscented_range(way, exact, True) == pytest.approx((np.hypot(*CALLER), 0.0))
 
 
 @pytest.mark.parametrize("caller", [False, True])
 def test_the_deviation_of_a_range_matches_draws_with_small_noise(caller):
     rng = np.random.default_rng(1)
     L = 0.02 * rng.normal(size=(4, 4))
-    spread = L @ L.T
-    way = way_to(BESIDE)
+    L[3, :3] = L[:3, 3] = 0.0
+    P, way = L @ L.T, way_to(BESIDE)
     if caller:
-        way = np.array([*BESIDE, bearing_of(CALLER), way[3]])
-    distance, share = unscented_range(way, spread, caller)
-    draws = rng.multivariate_normal(way, spread, 4000)
-    ranges = [unscented_range(one, np.zeros((4, 4)), caller)[0] for one in draws]
-    assert share * distance == pytest.approx(np.std(ranges), rel=0.06)
+        way = (*BESIDE, bearing_of(CALLER), way[3])
+    spread = P[0, 0], P[0, 1], P[1, 1], P[0, 2], P[1, 2], P[2, 2], P[3, 3]
+    _, variance = unscented_range(way, spread, caller)
+    draws = rng.multivariate_normal(way, P, 4000).tolist()
+    ranges = [unscented_range(tuple(one), (0.0,) * 7, caller)[0] for one in draws]
+    assert math.sqrt(variance) == pytest.approx(np.std(ranges), rel=0.06)
 
 
 @pytest.mark.parametrize("along", [0.2, 0.5, 0.8])
 @pytest.mark.parametrize("off", [-0.04, 0.0, 0.04, 0.14])
 def test_between_vehicle_and_caller_no_range_is_sure_whatever_the_excess_path_is_off(along, off):
-    way = way_to(along * CALLER)
-    way[3] += off
-    assert (
-        unscented_range(way, np.diag([0.01, 0.01, 0.01, 0.05]) ** 2, False)[1]
-        > MAX_RELATIVE_RANGE_STD
-    )
+    (*end, path), spread = way_to(along * CALLER), (1e-4, 0.0, 1e-4, 0.0, 0.0, 1e-4, 0.05**2)
+    assert not is_certain(*unscented_range((*end, path + off), spread, False))
 
 
 def test_an_excess_path_that_may_be_zero_gives_no_range():
     way = way_to(BESIDE)
     for std, known in ((way[3] / 2.99, False), (way[3] / 20.0, True)):
-        share = unscented_range(way, np.diag([0.0, 0.0, 0.0, std**2]), False)[1]
-        assert (share <= MAX_RELATIVE_RANGE_STD) == known
+        assert is_certain(*unscented_range(way, (*(0.0,) * 6, std**2), False)) == known
 
 
 # In the graph

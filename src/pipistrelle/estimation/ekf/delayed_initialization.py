@@ -50,20 +50,19 @@ from pipistrelle.estimation.ekf.gaussian import (
     drop_members,
     flush,
     initialise,
-    point_rows,
     relative_covariance,
 )
-from pipistrelle.estimation.observations.bearing import observe
+from pipistrelle.estimation.observations.bearing import MIN_CROSSING_SINE, observe
 from pipistrelle.estimation.observations.excess_path import (
-    MIN_TDOA_SIGMAS,
     range_with_slopes,
+    unscented_range,
 )
 from pipistrelle.estimation.observations.losses import SQUARED, robust_loss
 from pipistrelle.estimation.observations.range import (
-    MAX_RELATIVE_RANGE_STD,
     MIN_SPACING,
     NEAREST,
     Ranges,
+    is_certain,
     located,
     refined,
 )
@@ -110,9 +109,6 @@ WAITING_WEIGHT = -1.0
 """Weight that marks the two points of a stored bearing."""
 PARALLEL_SINE = 1e-9
 """Sine of the angle below which two bearings count as parallel."""
-MIN_CROSSING_SINE = 0.35
-"""Least sine of a crossing angle with the robust setting, where bearings may have gross errors:
-many bearings of small angle would seem to cross at once."""
 
 
 @no_alloc
@@ -273,8 +269,7 @@ def place_at_crossing(state: State, first: Whole, row: Row, loss: Whole) -> bool
     t = ((r * ux - dx) * along_x + (r * uy - dy) * along_y) / (length * length)
     lever = r * (nx * uy - ny * ux) / sine  # dr = lever dphi
     by_bearing = lever * lever * bearing_variance
-    most = MAX_RELATIVE_RANGE_STD * MAX_RELATIVE_RANGE_STD * r * r
-    if r < NEAREST or t <= 0.0 or by_bearing > most:
+    if r < NEAREST or t <= 0.0 or not is_certain(r, by_bearing):
         return False
     flush(joint, size)
     # w: covariances of r with the state; its variance, without the bearing's.
@@ -286,7 +281,7 @@ def place_at_crossing(state: State, first: Whole, row: Row, loss: Whole) -> bool
     own = nx * ((1.0 - t) * w[i] + t * w[i + 2] - w[0])
     own += ny * ((1.0 - t) * w[i + 1] + t * w[i + 3] - w[1])
     variance = own / sine + turn * w[2]
-    if variance + by_bearing > most:
+    if not is_certain(r, variance + by_bearing):
         return False
     # dl = dp + u dr + r u' (turns dtheta + dphi), with u' perpendicular to u.
     gx, gy = -r * uy * turns, r * ux * turns
@@ -309,48 +304,32 @@ def place_at_crossing(state: State, first: Whole, row: Row, loss: Whole) -> bool
     return True
 
 
-MAX_SHARE = 0.1
-"""Largest standard deviation of a range from an excess path, relative to the range."""
 ROBUST_BEARING_FACTOR = 3.0
 """Factor on bearing standard deviations with the robust setting, as a wrong initial position would
 displace all later landmarks."""
 
 
 @no_alloc
-def relative_range_std(
+def relative_range_variance(
     joint: Joint,
     size: Whole,
     iy: Whole,
     of_caller: Flag,
     measured: tuple[float, float, float, float],
 ) -> float:
-    """Return a range's relative standard deviation by excess path and bearing, or infinity.
+    """Return the relative variance of a range by excess path and bearing; infinity if uncertain.
 
     ``measured`` is excess path, its variance, bearing and its variance. ``of_caller`` selects the
-    caller's range, with a landmark at index iy. It is infinite above `MAX_SHARE`, or
-    if the excess path may be 0 (`MIN_TDOA_SIGMAS`).
+    caller's range, with a landmark at index iy.
     """
-    excess_path, along, bearing, across = measured
-    mean, turns = joint.mean, joint.turns
-    if excess_path <= MIN_TDOA_SIGMAS * math.sqrt(along):
-        return math.inf
-    x, y, px, py = mean[0], mean[1], mean[iy], mean[iy + 1]
-    r, ax, ay, k, side = range_with_slopes(excess_path, x, y, px, py, mean[2] + bearing, of_caller)
-    if r == 0.0:
-        return math.inf
-    p0, p1, p2 = joint.covariance[0], joint.covariance[1], joint.covariance[2]
-    yi, yj = point_rows(joint, size, iy)
-    xx = yi[iy] - 2.0 * p0[iy] + p0[0]
-    xy = yi[iy + 1] - p0[iy + 1] - p1[iy] + p0[1]
-    yy = yj[iy + 1] - 2.0 * p1[iy + 1] + p1[1]
-    xh, yh, turn = p2[iy] - p2[0], p2[iy + 1] - p2[1], -r * side / k
-    spread = (
-        ax * ax * xx + 2.0 * ax * ay * xy + ay * ay * yy
-        + 2.0 * turns * turn * (ax * xh + ay * yh) + turn * turn * (turns * p2[2] + across)
-        + along / (k * k)
-    )  # fmt: skip
-    share = math.sqrt(max(spread, 0.0)) / r
-    return share if share <= MAX_SHARE else math.inf
+    (path, along, bearing, across), mean, turns = measured, joint.mean, joint.turns
+    p2 = joint.covariance[2]
+    xx, xy, yy = relative_covariance(joint, size, iy)
+    xh, yh = turns * (p2[iy] - p2[0]), turns * (p2[iy + 1] - p2[1])
+    clue = mean[iy] - mean[0], mean[iy + 1] - mean[1], mean[2] + bearing, path
+    spread = xx, xy, yy, xh, yh, turns * turns * p2[2] + across, along
+    away, variance = unscented_range(clue, spread, of_caller)
+    return variance / (away * away) if is_certain(away, variance) else math.inf
 
 
 @no_alloc
@@ -364,7 +343,7 @@ def place_by_excess_path(
 ) -> None:
     """Write a point's position and covariance at index i, by its bearing and excess path.
 
-    Arguments as in `relative_range_std`; no columns may be deferred.
+    Arguments as in `relative_range_variance`; no columns may be deferred.
     """
     excess_path, along, bearing, across = measured
     mean, covariance, turns = joint.mean, joint.covariance, joint.turns
@@ -418,7 +397,7 @@ def _surest(state: State, row: Row, paths: ExcessPaths, loss: Whole) -> Whole:
         if other < 0:
             continue
         measured = (paths.excess_path[d], paths.variance[d], row.bearing, across)
-        share = relative_range_std(state.joint, size, 3 + 2 * other, of_caller, measured)
+        share = relative_range_variance(state.joint, size, 3 + 2 * other, of_caller, measured)
         if share < least:
             best, least = d, share
     return best

@@ -9,6 +9,10 @@ from pipistrelle.estimation.observations.range import NEAREST, Slopes, range_slo
 from pipistrelle.geometry import wrap_angle
 from pipistrelle.jit import kernel
 
+MIN_CROSSING_SINE = 0.48
+"""Least sine of the angle at which two bearings initialise a landmark, if they may have gross
+errors or the errors of poses are not counted: many at small angles would seem to cross at once."""
+
 
 @kernel
 def observe(

@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Float
 
 from pipistrelle.config import FARTHEST
-from pipistrelle.estimation.observations.range import NEAREST, cholesky
+from pipistrelle.estimation.observations.range import NEAREST
 from pipistrelle.jit import Flag, kernel, no_alloc
 
 MIN_TDOA_SIGMAS = 3.0
@@ -122,42 +122,47 @@ def range_with_slopes(
     return r, -ax / k, -ay / k, k, -bx * s + by * c
 
 
-@kernel
-def unscented_range(
-    way: Float[np.ndarray, "4"], spread: Float[np.ndarray, "4 4"], caller: bool
-) -> tuple[float, float]:
-    """Compute a range [m] from an excess path, and its relative std by an unscented transform.
-
-    ``way`` (4) is the offset to the other point (2), the direction of the unknown point, and the
-    excess path; ``spread`` (4, 4) is their covariance. ``caller`` selects the range of the caller.
-    In the example the landmark is at (3, 4), then between the two, and the caller at (6, 0).
-
-    >>> way, spread = np.array([6.0, 0.0, np.arctan2(4.0, 3.0), 4.0]), np.diag([0, 0, 0, 0.01])
-    >>> [round(float(number), 3) for number in unscented_range(way, spread, False)]
-    [5.0, 0.016]
-    >>> unscented_range(np.array([6.0, 0.0, 0.0, 0.0]), spread, False)[1]
-    inf
-    """
-    if way[3] <= MIN_TDOA_SIGMAS * math.sqrt(spread[3, 3]):
-        return math.nan, math.inf
-    L, at, total = np.zeros((4, 4)), np.empty(4), 0.0
-    cholesky(spread, L)
-    first = _range(way, caller)
-    for e in range(4):
-        for side in (-2.0, 2.0):
-            for a in range(4):
-                at[a] = way[a] + side * L[a, e]
-            other = _range(at, caller)
-            if not (0.0 < other < FARTHEST):
-                return math.nan, math.inf
-            total += (other - first) ** 2
-    if not (0.0 < first < FARTHEST):
-        return math.nan, math.inf
-    return first, math.sqrt(total / 8.0) / first
+Clue = tuple[float, float, float, float]
+"""Offset from the vehicle to the other end (2) [m], world direction [rad], and excess path [m]."""
+Spread = tuple[float, float, float, float, float, float, float]
+"""Covariance of a `Clue`: xx, xy, yy of the offset; x, y with the direction; both variances."""
 
 
 @no_alloc
-def _range(way: Float[np.ndarray, "4"], caller: bool) -> float:
-    """Return the range [m] of a landmark or caller from an excess path and a direction."""
-    c, s = math.cos(way[2]), math.sin(way[2])
-    return range_by_excess_path(way[3], way[0], way[1], c, s, caller)
+def unscented_range(clue: Clue, spread: Spread, of_caller: Flag) -> tuple[float, float]:
+    """Compute a range [m] from an excess path, and its variance by an unscented transform.
+
+    The eight sigma points are at two standard deviations (Julier & Uhlmann 1997); NaN if one has no
+    range. In the example the landmark is at (3, 4), then between the two, and the caller at (6, 0).
+
+    >>> spread = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.01
+    >>> r, variance = unscented_range((6.0, 0.0, np.arctan2(4.0, 3.0), 4.0), spread, False)
+    >>> round(r, 3), round(variance, 4)
+    (5.0, 0.0064)
+    >>> unscented_range((6.0, 0.0, 0.0, 0.0), spread, False)
+    (nan, nan)
+    """
+    (dx, dy, direction, path), (xx, xy, yy, xh, yh, hh, ee) = clue, spread
+    if path <= MIN_TDOA_SIGMAS * math.sqrt(ee):
+        return math.nan, math.nan
+    a = math.sqrt(xx) if xx > 0.0 else 0.0  # the Cholesky factor, by columns
+    b, c = (xy / a, xh / a) if xx > 0.0 else (0.0, 0.0)
+    d = math.sqrt(max(yy - b * b, 0.0))
+    e = (yh - b * c) / d if d > 0.0 else 0.0
+    f, g = math.sqrt(max(hh - c * c - e * e, 0.0)), math.sqrt(ee)
+    steps = (a, b, c, 0.0), (0.0, d, e, 0.0), (0.0, 0.0, f, 0.0), (0.0, 0.0, 0.0, g)
+    middle, total = _range(path, dx, dy, direction, of_caller), 0.0
+    for step in steps:
+        for side in (-2.0, 2.0):
+            x, y, turned, longer = side * step[0], side * step[1], side * step[2], side * step[3]
+            other = _range(path + longer, dx + x, dy + y, direction + turned, of_caller)
+            total += (other - middle) ** 2
+    return (middle, total / 8.0) if 0.0 < middle < FARTHEST else (math.nan, math.nan)
+
+
+@no_alloc
+def _range(path: float, dx: float, dy: float, direction: float, of_caller: Flag) -> float:
+    """Return a range [m] as `range_by_excess_path`, or NaN if nothing has the excess path."""
+    c, s = math.cos(direction), math.sin(direction)
+    found = range_by_excess_path(path, dx, dy, c, s, of_caller)
+    return found if 0.0 < found < FARTHEST else math.nan

@@ -70,6 +70,12 @@ def range_slopes(c: float, s: float) -> Slopes:
 
 
 @no_alloc
+def is_certain(distance: float, variance: float) -> bool:
+    """Return whether a range's std is small enough to initialise a landmark; False for NaN."""
+    return variance <= MAX_RELATIVE_RANGE_STD * MAX_RELATIVE_RANGE_STD * distance * distance
+
+
+@no_alloc
 def cholesky(A: Float[np.ndarray, "d d"], L: Float[np.ndarray, "d d"]) -> None:
     """Write the Cholesky factor L of a positive semidefinite A; pivots not above 0 become 0."""
     for j in range(A.shape[0]):
@@ -207,8 +213,7 @@ def _is_located(place: Place, x: float, y: float) -> bool:
     """Return whether a place's largest std is small against its distance from (x, y)."""
     px, py, _, xx, xy, yy = place
     largest = 0.5 * (xx + yy + math.sqrt((xx - yy) ** 2 + 4.0 * xy * xy))
-    square = (px - x) ** 2 + (py - y) ** 2
-    return largest <= MAX_RELATIVE_RANGE_STD * MAX_RELATIVE_RANGE_STD * square
+    return is_certain(math.hypot(px - x, py - y), largest)
 
 
 @no_alloc

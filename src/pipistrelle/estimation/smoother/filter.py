@@ -50,12 +50,12 @@ from pipistrelle.estimation.checking import (
     usable_scan,
 )
 from pipistrelle.estimation.motion import SMALLEST_STD, Controls, Durations, Motion
-from pipistrelle.estimation.observations.bearing import observe
+from pipistrelle.estimation.observations.bearing import MIN_CROSSING_SINE, observe
 from pipistrelle.estimation.observations.excess_path import (
     unscented_range,
 )
 from pipistrelle.estimation.observations.losses import LOSSES
-from pipistrelle.estimation.observations.range import MAX_RELATIVE_RANGE_STD
+from pipistrelle.estimation.observations.range import is_certain
 from pipistrelle.estimation.rays import gate_bounds
 from pipistrelle.estimation.recovery import recovering
 from pipistrelle.estimation.smoother.belief import SmootherBelief
@@ -131,51 +131,43 @@ def excess_path_range(
 ) -> float:
     """Return the range [m] of a landmark or caller from its most precise excess path, or NaN."""
     m, first, last = heard
-    slot, scale = rows.ends[m, 0], view.scale
-    angle, across = direction_of(view, rows.numbers[m]), rows.numbers[m, BEARING_STD]
-    spread, way, best, other = np.zeros((4, 4)), np.zeros(4), math.inf, -1
-    clue, caller = -1, False
+    slot, angle = rows.ends[m, 0], direction_of(view, rows.numbers[m])
+    across = rows.numbers[m, BEARING_STD] ** 2
+    least, found, other = math.inf, -1, (0, 0.0, 0.0)
     for e in range(first, last):
-        asked, ends = rows.ends[e, 1] == slot, (rows.ends[e, 0], rows.ends[e, 1])
-        if ends[1] < 0 or not (asked or ends[0] == slot):
+        of_caller, ends = rows.ends[e, 1] == slot, (rows.ends[e, 0], rows.ends[e, 1])
+        if ends[1] < 0 or not (of_caller or ends[0] == slot):
             continue
-        i, x, y = point_of(ends[0] if asked else ends[1], k, places, estimate)
-        if i == 0:
+        end = point_of(ends[0] if of_caller else ends[1], k, places, estimate)
+        if end[0] == 0:
             continue
-        way[0], way[1], way[2] = x - view.x, y - view.y, angle
-        way[3] = scale * rows.numbers[e, EXCESS_PATH]
-        spread[2, 2], spread[3, 3] = across * across, rows.numbers[e, EXCESS_PATH_STD] ** 2
-        share = unscented_range(way, spread, asked)[1]
-        if share < best:
-            best, other, clue, caller = share, ends[0] if asked else ends[1], e, asked
-    if best > MAX_RELATIVE_RANGE_STD:
+        clue = end[1] - view.x, end[2] - view.y, angle, view.scale * rows.numbers[e, EXCESS_PATH]
+        spread = 0.0, 0.0, 0.0, 0.0, 0.0, across, rows.numbers[e, EXCESS_PATH_STD] ** 2
+        away, variance = unscented_range(clue, spread, of_caller)
+        if is_certain(away, variance) and variance < least * away * away:
+            least, found, other = variance / (away * away), e, end
+    if found < 0:
         return math.nan
-    i, x, y = point_of(other, k, places, estimate)
-    way[0], way[1] = x - view.x, y - view.y
-    way[3] = scale * rows.numbers[clue, EXCESS_PATH]
     # The covariance of the offset to the other end (2) and of the heading.
     by_chain, by_border = np.zeros((3, front.P.shape[0])), np.zeros((3, R.shape[0]))
     for a in range(2):
         by_chain[a, a] = -1.0
-        if i > 0:
-            by_border[a, i + a] = 1.0
+        if other[0] > 0:
+            by_border[a, other[0] + a] = 1.0
         else:
-            by_chain[a, a - i] = 1.0
+            by_chain[a, a - other[0]] = 1.0
     by_chain[2, 2] = 1.0
-    known = joint(front, R, R.shape[0], by_chain, by_border)
-    for a in range(3):
-        for b in range(3):
-            spread[a, b] = known[a, b]
-    spread[2, 2] += across * across
-    spread[3, 3] = rows.numbers[clue, EXCESS_PATH_STD] ** 2
-    found, share = unscented_range(way, spread, caller)
-    return found if share <= MAX_RELATIVE_RANGE_STD else math.nan
-
-
-MIN_CROSSING_ANGLE = 0.5
-"""Least angle [rad] between bearings that initialise a landmark."""
-MAX_RELATIVE_PLACE_STD = 0.5
-"""Largest standard deviation of a crossing, relative to the range."""
+    P = joint(front, R, R.shape[0], by_chain, by_border)
+    clue = (
+        other[1] - view.x,
+        other[2] - view.y,
+        angle,
+        view.scale * rows.numbers[found, EXCESS_PATH],
+    )
+    variances = P[2, 2] + across, rows.numbers[found, EXCESS_PATH_STD] ** 2
+    spread = P[0, 0], P[1, 0], P[1, 1], P[2, 0], P[2, 1], variances[0], variances[1]
+    away, variance = unscented_range(clue, spread, rows.ends[found, 1] == slot)
+    return away if is_certain(away, variance) else math.nan
 
 
 @optimised_once
@@ -225,7 +217,7 @@ def range_by_crossing(rows: Rows, m: Whole, estimate: PointArrays, places: Place
     numbers, (poses, border) = rows.numbers[m], estimate
     k = rows.ends[m, 2]
     view = view_of(poses[k], border, places, k)
-    angle, best, found = direction_of(view, numbers), math.sin(MIN_CROSSING_ANGLE), math.nan
+    angle, best, found = direction_of(view, numbers), MIN_CROSSING_SINE, math.nan
     earlier = rows.ends[m, 3]
     while earlier >= 0:
         k = rows.ends[earlier, 2]
@@ -238,8 +230,8 @@ def range_by_crossing(rows: Rows, m: Whole, estimate: PointArrays, places: Place
             far = (dx * math.sin(angle) - dy * math.cos(angle)) / sine
             along = far * rows.numbers[earlier, BEARING_STD]
             across = near * numbers[BEARING_STD]
-            off = math.sqrt(along * along + across * across)
-            if near > 0.0 and far > 0.0 and off <= MAX_RELATIVE_PLACE_STD * near * abs(sine):
+            variance = (along * along + across * across) / (sine * sine)
+            if near > 0.0 and far > 0.0 and is_certain(near, variance):
                 best, found = abs(sine), near
         earlier = rows.ends[earlier, 3]
     return found
