@@ -32,10 +32,9 @@ from jaxtyping import Float, Int
 
 from pipistrelle.config import FilterConfig
 from pipistrelle.detection.scans import (
-    BEARING_STD,
-    EXCESS_PATH_STD,
-    RANGE_STD,
+    KINDS,
     SLOPE,
+    STD_OF,
     Scan,
     without,
     without_excess_paths,
@@ -233,7 +232,7 @@ def snapshot(
     return 0, 0
 
 
-STDS = BEARING_STD, RANGE_STD, EXCESS_PATH_STD
+STDS = tuple(len(KINDS) + row for row in range(len(KINDS)))
 """Rows of the standard deviations in `Scan.numbers`."""
 
 
@@ -256,8 +255,9 @@ class ConstantNoise:
 
     def __call__(self, scan: Scan) -> Scan:
         """Fill a scan's missing standard deviations with the constants."""
-        stds = self.bearing_std, self.range_std, self.excess_path_std
-        numbers = _filled(np.ascontiguousarray(scan.numbers), *stds)
+        numbers = scan.numbers.copy()
+        for row, name in zip(STDS, STD_OF.values(), strict=True):
+            numbers[row, np.isnan(numbers[row])] = getattr(self, name)
         return replace(scan, numbers=numbers)
 
     def hidden(self, heard: Scan, stated: Scan) -> Scan:
@@ -267,22 +267,6 @@ class ConstantNoise:
         same = (heard.numbers == stated.numbers) | np.isnan(stated.numbers)
         bare = unstated(stated)
         return replace(bare, numbers=np.where(same, bare.numbers, stated.numbers))
-
-
-@kernel
-def _filled(
-    numbers: Float[np.ndarray, "8 m"], bearing_std: float, range_std: float, excess_path_std: float
-) -> Float[np.ndarray, "8 m"]:
-    """Return a scan's numbers, with constants in place of missing standard deviations."""
-    filled = numbers.copy()
-    for m in range(filled.shape[1]):
-        if math.isnan(filled[BEARING_STD, m]):
-            filled[BEARING_STD, m] = bearing_std
-        if math.isnan(filled[RANGE_STD, m]):
-            filled[RANGE_STD, m] = range_std
-        if math.isnan(filled[EXCESS_PATH_STD, m]):
-            filled[EXCESS_PATH_STD, m] = excess_path_std
-    return filled
 
 
 def unstated(scan: Scan) -> Scan:
@@ -309,9 +293,5 @@ def without_hidden(scan: Scan, settings: FilterConfig, *, timing: bool, known: b
 
 def noise_of(settings: FilterConfig) -> ConstantNoise:
     """Return the model of constant measurement noise from the settings."""
-    return ConstantNoise(
-        range_std=settings.range_std,
-        bearing_std=settings.bearing_std,
-        excess_path_std=settings.excess_path_std,
-        instead=settings.noise == "constant",
-    )
+    stds = {name: getattr(settings, name) for name in STD_OF.values()}
+    return ConstantNoise(**stds, instead=settings.noise == "constant")

@@ -25,18 +25,10 @@ OWN = 0
 NO_CALLERS = np.empty(0, dtype=np.int64)
 """An empty array of labels: no caller's label is known, or no caller moves."""
 
-COLUMNS = (
-    "landmark",
-    "caller",
-    "bearing",
-    "range",
-    "excess_path",
-    "bearing_std",
-    "range_std",
-    "excess_path_std",
-    "level_db",
-    "bearing_slope",
-)
+KINDS = ("bearing", "range", "excess_path")
+"""Kinds of measurements that a row may have; each has a column, and one of its deviation."""
+STD_OF = {kind: f"{kind}_std" for kind in KINDS}
+COLUMNS = ("landmark", "caller", *KINDS, *STD_OF.values(), "level_db", "bearing_slope")
 """Names of a scan's columns."""
 NUMBERS = len(COLUMNS) - 2
 BEARING, RANGE, EXCESS_PATH, BEARING_STD, RANGE_STD, EXCESS_PATH_STD, LEVEL, SLOPE = range(NUMBERS)

@@ -23,12 +23,8 @@ from pipistrelle.config import (
 )
 from pipistrelle.detection.scans import (
     BEARING,
-    BEARING_STD,
-    EXCESS_PATH,
-    EXCESS_PATH_STD,
     NUMBERS,
-    RANGE,
-    RANGE_STD,
+    STD_OF,
     UNLABELLED,
     Scan,
     is_merged,
@@ -39,6 +35,7 @@ from pipistrelle.estimation.motion import MOVED, Controls, Durations, Motion
 from pipistrelle.estimation.observations.losses import LOSSES
 from pipistrelle.jit import Flag, Whole, kernel
 from pipistrelle.refusals import shown
+from pipistrelle.text_tables import TEXT_COLUMNS
 
 FLOAT, INTEGER = np.dtype(np.float64), np.dtype(np.int64)
 WHOLES = ("landmark", "caller", "callers", "moving")
@@ -62,6 +59,12 @@ MAX_CONTROLS = {
     ),
 }
 """Largest controls of each motion model, as numbers and in words."""
+BOUNDS = tuple(
+    (-column.high if kind == "excess_path" else column.low, column.high, TEXT_COLUMNS[std].high)
+    for kind, std in STD_OF.items()
+    for column in [TEXT_COLUMNS[kind]]
+)
+"""Least and largest value, and largest standard deviation, of each kind of measurement."""
 LABELS_END = 2**53
 """Upper bound of labels, as in a log."""
 INDEFINITE = 1e-6
@@ -312,24 +315,17 @@ def _fault_of_row(
         return NO_LABEL
     if caller[m] < 0:
         return NO_CALLER
-    bearing, distance, excess_path = numbers[BEARING, m], numbers[RANGE, m], numbers[EXCESS_PATH, m]
-    silent = math.isnan(bearing)
-    if silent and math.isnan(excess_path) and math.isnan(distance):
-        return NO_NUMBER
-    if (
-        abs(bearing) > LARGEST
-        or distance <= 0.0
-        or distance > FARTHEST
-        or abs(excess_path) > FARTHEST
-    ):
-        return NO_NUMBER
-    if not (silent or MIN_STD <= numbers[BEARING_STD, m] <= WIDEST):
-        return UNSTATED
-    if not (math.isnan(distance) or MIN_STD <= numbers[RANGE_STD, m] <= FARTHEST):
-        return UNSTATED
-    if not (math.isnan(excess_path) or MIN_STD <= numbers[EXCESS_PATH_STD, m] <= FARTHEST):
-        return UNSTATED
-    for other in range(0 if silent or landmark[m] == UNLABELLED else m):
+    measured, unstated = False, False
+    for kind, (low, high, most) in enumerate(BOUNDS):
+        value, std = numbers[kind, m], numbers[len(BOUNDS) + kind, m]
+        if math.isnan(value):
+            continue
+        if not low <= value <= high:
+            return NO_NUMBER
+        measured, unstated = True, unstated or not MIN_STD <= std <= most
+    if not measured or unstated:
+        return UNSTATED if measured else NO_NUMBER
+    for other in range(0 if math.isnan(numbers[BEARING, m]) or landmark[m] == UNLABELLED else m):
         again = landmark[other] == landmark[m] and caller[other] == caller[m]
         if again and not math.isnan(numbers[BEARING, other]):
             return TWICE

@@ -286,8 +286,8 @@ def test_two_filters_of_one_strategy_share_their_measurements(tmp_path):
     write(tmp_path, trial(track), trial(track, name="fastslam"), trial(track, "active"))
     measurements = pl.read_parquet(tmp_path / "measurements.parquet")
     assert measurements.columns == [
-        "strategy", "filter", "time_s", "landmark", "bearing_rad", "range_m", "excess_path_m",
-        "excess_path_std_m", "caller", "bearing_std_rad", "range_std_m", "assigned",
+        "strategy", "filter", "time_s", "landmark", "caller", "bearing_rad", "range_m",
+        "excess_path_m", "bearing_std_rad", "range_std_m", "excess_path_std_m", "assigned",
         "true_landmark",
     ]  # fmt: skip
     assert measurements["filter"].null_count() == 6

@@ -29,7 +29,7 @@ from jaxtyping import Float, Int
 from pydantic import BaseModel
 
 from pipistrelle.config import InputError
-from pipistrelle.detection.scans import OWN, UNLABELLED, Scan
+from pipistrelle.detection.scans import KINDS, OWN, STD_OF, UNLABELLED, Scan
 from pipistrelle.estimation.beliefs import Gaussian, Landmarks, Track, placed
 from pipistrelle.estimation.catalogue import short_name
 from pipistrelle.evaluation.accuracy import heaviest, pose_error, position_error
@@ -48,6 +48,7 @@ from pipistrelle.files import (
     remove_empty,
 )
 from pipistrelle.settings import to_toml
+from pipistrelle.text_tables import TEXT_COLUMNS
 from pipistrelle.version import find_version
 
 _OURS = re.compile(r"\d{8}-\d{6}-(run|slam)(-\d+)?")
@@ -472,27 +473,24 @@ def measurement_table(
         {
             "time_s": joined([np.full(len(s.landmark), s.time) for s in scans], np.float64),
             "landmark": recorded,
-            "bearing_rad": joined([s.bearing for s in scans], np.float64),
-            "range_m": joined([s.range for s in scans], np.float64),
-            "excess_path_m": joined([s.excess_path for s in scans], np.float64),
-            "excess_path_std_m": joined([s.excess_path_std for s in scans], np.float64),
             "caller": [_name(j, callers) for s in scans for j in s.caller.tolist()],
-            "bearing_std_rad": joined([s.bearing_std for s in scans], np.float64),
-            "range_std_m": joined([s.range_std for s in scans], np.float64),
+            **{
+                f"{name}_{TEXT_COLUMNS[name].unit}": joined(
+                    [getattr(s, name) for s in scans], np.float64
+                )
+                for name in (*KINDS, *STD_OF.values())
+            },
             "assigned": decided,
             "true_landmark": true,
         },
         schema_overrides={"caller": pl.String},
     ).with_columns(
-        pl.col("bearing_rad", "range_m", "excess_path_m").fill_nan(None),
         pl.col("assigned", "true_landmark").replace(UNLABELLED, None),
         # Every row has all standard deviations, whether it has these measurements or not.
         *(
-            pl.when(pl.col(f"{name}_{unit}").is_not_nan())
-            .then(f"{name}_std_{unit}")
-            .fill_nan(None)
-            .alias(f"{name}_std_{unit}")
-            for name, unit in (("bearing", "rad"), ("range", "m"), ("excess_path", "m"))
+            pl.when(pl.col(f"{kind}_{unit}").is_not_nan()).then(name).fill_nan(None).alias(name)
+            for kind, unit in ((kind, TEXT_COLUMNS[kind].unit) for kind in KINDS)
+            for name in (f"{kind}_{unit}", f"{kind}_std_{unit}")
         ),
     )
 
