@@ -64,6 +64,7 @@ from pipistrelle.estimation.observations.range import (
     Ranges,
     is_certain,
     located,
+    misfit,
     refined,
 )
 from pipistrelle.estimation.observations.rows import ExcessPaths, Row
@@ -219,12 +220,12 @@ def place_by_ranges(state: State, row: Row, loss: Whole, scratch: Scratch) -> No
     mean[i], mean[i + 1] = place[0], place[1]
     at, n, work = ranges.at, ranges.count, ranges.work
     gx, gy, c, s = work[0], work[1], work[2], work[3]
-    xx = xy = yy = 0.0
+    xx, xy, yy, variance = 0.0, 0.0, 0.0, row.range_variance * misfit(place[2], n)
     for j in range(n):
         dx, dy = mean[i] - mean[at[j]], mean[i + 1] - mean[at[j] + 1]
         away = max(math.sqrt(dx * dx + dy * dy), NEAREST)
         c[j], s[j], off = dx / away, dy / away, away - ranges.distance[j]
-        noise = row.range_variance * robust_loss(off * off / row.range_variance, loss)[0]
+        noise = variance * robust_loss(off * off / variance, loss)[0]
         xx, xy = xx + noise * gx[j] * gx[j], xy + noise * gx[j] * gy[j]
         yy += noise * gy[j] * gy[j]
     for a in range(i):

@@ -20,6 +20,10 @@ the axes of the positions, along and across their line, with the origin at their
 (a, b). For small b its regression on a has the slope -2 u and the mean :math:`u^2 + h^2`, hence the
 two starts (u, h) and (u, -h) of a Levenberg-Marquardt search, first with the diagonal of R. A
 mirrored place is excluded if the other is a million times as likely.
+
+**Misfit.** Of n ranges as precise as stated, the least c is near n - 2. Where it is larger, because
+of gross or skewed errors, all variances are multiplied by c / (n - 2), the Birge ratio (Birge,
+Physical Review 40, 1932), so that a place waits for more ranges.
 """
 
 import math
@@ -205,7 +209,14 @@ def refined(ranges: Ranges, x: float, y: float, loss: Whole) -> Place:
         gx[j], gy[j] = gx[j] / R[j, j], gy[j] / R[j, j]
     for j in range(n):
         gx[j], gy[j] = xx * gx[j] + xy * gy[j], xy * gx[j] + yy * gy[j]
-    return x, y, cost, xx, xy, yy
+    ratio = misfit(cost, n)
+    return x, y, cost, ratio * xx, ratio * xy, ratio * yy
+
+
+@no_alloc
+def misfit(cost: float, count: Whole) -> float:
+    """Return the factor on all variances for which the cost of a number of ranges is credible."""
+    return max(cost / max(count - 2, 1), 1.0)
 
 
 @no_alloc
@@ -229,6 +240,6 @@ def located(ranges: Ranges, x: float, y: float, loss: Whole) -> tuple[Whole, Pla
     apart = (one[5] * dx * dx - 2.0 * one[4] * dx * dy + one[3] * dy * dy) / max(det, 1e-300)
     if ranges.count < 3 or not _is_located(one, x, y):
         return 0, one, other
-    if apart < SAME or other[2] - one[2] > EXCLUDED:
+    if apart < SAME or other[2] - one[2] > EXCLUDED * misfit(one[2], ranges.count):
         return 1, one, other
     return (2 if _is_located(other, x, y) else 0), one, other
