@@ -74,7 +74,7 @@ class CheckedFiles(IndexDataCacheFile):
             return True
         except OSError:
             return False
-        say(f"{path.parent.parent}: compiled kernels were damaged, and are compiled anew")
+        say(f"{path.parent.parent}: compiled kernels were damaged, and are compiled again")
         with suppress(OSError):
             path.unlink()
         return False

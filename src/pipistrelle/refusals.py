@@ -73,6 +73,10 @@ def table_refusal(
         faults,
         key=lambda f: rank.get(str([*f["loc"], ""][0]), unknown.get(f["type"], len(rank) + 1)),
     )
+    if fault["type"] == "json_invalid":
+        return refusal(where, "text that is no JSON", "JSON", "restore the file or make it again")
+    if not fault["loc"] and fault["type"].startswith("model"):
+        return refusal(where, shown(fault["input"]), "a table", "correct it")
     if not fault["loc"]:
         return refusal(where, "keys that do not go together", expectation(fault), "correct them")
     *within, last = fault["loc"]

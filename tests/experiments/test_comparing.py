@@ -23,12 +23,12 @@ from pipistrelle.evaluation.accuracy import rmse
 from pipistrelle.evaluation.comparison import Statement, judge
 from pipistrelle.evaluation.scores import SCORES
 from pipistrelle.experiments.comparing import (
+    are_studies,
     compare_missions,
     compare_studies,
     comparison_table,
     differing,
     draw_of,
-    kind_of,
     matched,
     path_view,
     settings_table,
@@ -200,13 +200,13 @@ def test_a_folder_is_given_once_whatever_its_name(tmp_path):
     (tmp_path / "latest").symlink_to("one")
     for other in (one, tmp_path / "x" / ".." / "one", tmp_path / "latest"):
         with pytest.raises(InputError, match="one: is given twice, as A and B"):
-            kind_of([one, other])
+            are_studies([one, other])
 
 
 @pytest.mark.parametrize("count", [0, 1, 27])
 def test_two_folders_or_more_are_compared_up_to_the_alphabet(tmp_path, count):
     with pytest.raises(InputError, match=rf"found {count} folders?, expected 2 to 26"):
-        kind_of([tmp_path / f"{i}" for i in range(count)])
+        are_studies([tmp_path / f"{i}" for i in range(count)])
 
 
 def test_missions_and_studies_are_not_compared(tmp_path):
@@ -215,10 +215,10 @@ def test_missions_and_studies_are_not_compared(tmp_path):
     (tmp_path / "study" / "plan.toml").write_text("format = 1")
     for pair in ([mission, tmp_path / "study"], [tmp_path / "study", mission]):
         with pytest.raises(InputError, match=r"study: is a study's folder, and .*one is not"):
-            kind_of(pair)
+            are_studies(pair)
     with pytest.raises(InputError, match="nowhere: found no such folder"):
-        kind_of([tmp_path / "study", tmp_path / "nowhere"])
-    assert kind_of([mission, tmp_path / "nowhere"]) == "missions"
+        are_studies([tmp_path / "study", tmp_path / "nowhere"])
+    assert not are_studies([mission, tmp_path / "nowhere"])
 
 
 def test_which_logs_were_solved_and_how_is_named_where_it_differs(folders):

@@ -279,7 +279,7 @@ def test_a_plan_is_written_with_the_name_and_reads_back_the_same(tmp_path):
         ({"settings": "bset"}, "plan: settings: found 'bset', expected best, paper, physics"),
         ({"settings": 3}, "plan: settings: found 3"),
         ({"grid": {"settings": ["best", "paper"]}}, "grid.settings: holds for a whole plan"),
-        ({"own": 3}, "plan: own: found 3"),
+        ({"own": 3}, "plan, key 'own': found 3"),
     ],
 )
 def test_a_plan_that_names_nothing_is_refused(change, said):

@@ -197,12 +197,12 @@ def nees_of(error, covariance):
     return error @ np.linalg.solve(covariance, error)
 
 
-def followed(slam, mission, start=START):
-    """Yield belief and poses, frame by frame."""
+def followed(slam, mission, start=START, *draws):
+    """Yield belief and poses, frame by frame; `draws`: a generator for particles."""
     belief = slam.init(start)
     for controls, dt, scan in zip(mission.controls, mission.dt, mission.scans, strict=True):
-        belief, poses = slam.predict(belief, controls, dt)
-        belief = slam.update(belief, scan)
+        belief, poses = slam.predict(belief, controls, dt, *draws)
+        belief = slam.update(belief, scan, *draws)
         yield belief, poses
 
 

@@ -144,15 +144,6 @@ def small_mission(strategy, frames=100, seed=3, landmarks=16, **changes):
     return draw_mission(rng, BICYCLE, START, field, drive, **(SENSING[strategy] | changes))
 
 
-def followed(slam, mission, rng, start=START):
-    """Yield belief and poses, frame by frame."""
-    belief = slam.init(start)
-    for controls, dt, scan in zip(mission.controls, mission.dt, mission.scans, strict=True):
-        belief, poses = slam.predict(belief, controls, dt, rng)
-        belief = slam.update(belief, scan, rng)
-        yield belief, poses
-
-
 def all_members(belief):
     """Return (p, c, 6) hypotheses, log weights last, with zeros in unused columns."""
     particles = particles_of(belief)

@@ -381,7 +381,7 @@ def test_a_damaged_or_missing_file_is_refused_with_a_remedy(spoilt, table, conte
     said = str(refused.value)
     assert said.startswith(f"{path}: {flaw}")
     assert "remove trials/iteration_00001.parquet" in said
-    assert "its world is done anew" in said
+    assert "its world is run again" in said
     assert said.isprintable()
 
 

@@ -77,13 +77,13 @@ def test_a_plan_as_a_table_is_accepted_and_its_mistakes_named():
     for changes, why in (
         ({"grid": {"beacon.level": [30.0]}}, r"plan: grid\.beacon\.level: no such setting"),
         ({"grid": {"beacon.level_db": 30.0}}, r"plan: grid\.beacon\.level_db: found 30"),
-        ({"worlds": 3}, "plan: worlds: no such key"),
-        ({"strategies": "fused"}, "plan: strategies: found"),
-        ({"iterations": None}, "plan: iterations: found"),
+        ({"worlds": 3}, "plan: found the unknown key 'worlds'"),
+        ({"strategies": "fused"}, "plan, key 'strategies': found"),
+        ({"iterations": None}, "plan, key 'iterations': found"),
     ):
         with pytest.raises(InputError, match=why):
             pipistrelle.study(levels | changes)
-    with pytest.raises(InputError, match="plan: no key 'iterations'; add iterations = 20"):
+    with pytest.raises(InputError, match="plan: found no key 'iterations'"):
         pipistrelle.study({})
 
 

@@ -148,7 +148,7 @@ def test_a_restarted_odometry_frame_is_questioned(obey, undrawn):
     _, _, said = obey("slam", log, "-o", "two", "--quiet")
     assert (
         "warning: log: the odometry moves by 29.9 m and turns by 0.167 rad in the 0.2 s from 1.8 s "
-        "on; was its frame begun anew?\n"
+        "on; did its frame change?\n"
     ) in said
 
 

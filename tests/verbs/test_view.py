@@ -190,8 +190,8 @@ def test_a_study_is_refused_with_what_to_do_instead(obey, refused, undrawn):
     Path("tiny.toml").write_text(TINY)
     assert obey("study", "tiny.toml", "--workers", "1", "--quiet", "-o", "study")[0] == 0
     said = refused("view", "study")
-    assert said.startswith("study: found a study, which keeps many worlds and the frames of none")
-    assert "`pipistrelle report` puts it on a page; `pipistrelle run --settings study/con" in said
+    assert said.startswith("study: found a study, expected the result folder of")
+    assert "`pipistrelle report study` puts it on a page; `pipistrelle run --settings" in said
     assert obey("run", "--settings", "study/config.toml", "--quiet", "-o", "one")[0] == 0
     assert obey("view", "one", "--quiet")[0] == 0
 
@@ -224,7 +224,7 @@ def test_a_log_that_was_solved_is_played_too_and_may_be_moved(
     assert "<h1>Log log</h1>" in page
     assert "ranges within 60°" in page
     Path("log").rename("moved")
-    assert "put it back, or say with --log where it is" in refused("view", "two")
+    assert "restore it, or give its new path by --log" in refused("view", "two")
     assert obey("view", "two", "--quiet", "--log", "moved") == (0, "two/view.html\n", "")
     assert "option --log: found moved, expected none" in refused("view", "one", "--log", "moved")
 

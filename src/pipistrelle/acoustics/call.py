@@ -282,7 +282,7 @@ def read_call(path: Path, frequency: float, duration: float, where: str) -> Reco
         raise refusal(place, f"{samples.size} samples at {rate:g} Hz", expected, fix)
     if not np.isfinite(samples).all() or not np.ptp(samples) > 0.0:
         found = "samples that are no finite numbers" if np.ptp(samples) != 0.0 else "silence"
-        raise refusal(place, found, "a call", "record it anew")
+        raise refusal(place, found, "a call", "record it again")
     power = np.abs(np.fft.rfft(samples - samples.mean(), 8 * samples.size)) ** 2
     centre = float(np.sum(power * np.arange(power.size)) / power.sum() * rate / (8 * samples.size))
     section = where.rpartition(".")[0]

@@ -18,13 +18,14 @@ import re
 from collections.abc import Callable, Hashable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 from jaxtyping import Float
 
 from pipistrelle import __version__
 from pipistrelle.config import Config, InputError
+from pipistrelle.detection.logs.readers import STUDY, kind_of
 from pipistrelle.estimation.catalogue import short_name
 from pipistrelle.evaluation.accuracy import alignment, moved, position_error
 from pipistrelle.evaluation.comparison import INTERVALS, Contrast, contrasts
@@ -151,8 +152,8 @@ class ComparedStudies(Compared):
     """Position RMSE of each other study, averaged over the cases of a world."""
 
 
-def kind_of(folders: Sequence[Path]) -> Literal["missions", "studies"]:
-    """Return whether all folders hold missions or all hold studies.
+def are_studies(folders: Sequence[Path]) -> bool:
+    """Return whether all folders hold studies; otherwise none does.
 
     Raises InputError if they are too few or too many, repeated, or not of one kind.
     """
@@ -168,15 +169,13 @@ def kind_of(folders: Sequence[Path]) -> Literal["missions", "studies"]:
             twice = f"is given twice, as {LETTERS[first]} and {LETTERS[i]}"
             also = "" if folders[first].absolute() == folder.absolute() else f" ({folder})"
             raise InputError(f"{folders[first]}: {twice}{also}; name each folder once")
-    studies = [(folder / "plan.toml").is_file() for folder in folders]
-    if all(studies):
-        return "studies"
-    if any(studies):
+    studies = [kind_of(folder) == STUDY for folder in folders]
+    if any(studies) and not all(studies):
         one, other = folders[studies.index(True)], folders[studies.index(False)]
         results_in(other)
         expected = "folders of one kind"
         raise InputError(f"{one}: is a study's folder, and {other} is not; expected {expected}")
-    return "missions"
+    return all(studies)
 
 
 def distinguishing(folders: Iterable[Iterable[Estimate]]) -> tuple[bool, bool]:
@@ -419,7 +418,7 @@ def _read(folder: Path) -> tuple[Plan, "pl.DataFrame"]:
         trials.select("case", "iteration", "status", "diverged", "beamwidth_deg", POSITION)
     except (OSError, pl.exceptions.PolarsError) as error:
         why = "its trials have not the columns of this version"
-        raise InputError(f"{folder}: {why}; run the study anew") from error
+        raise InputError(f"{folder}: {why}; run the study again") from error
     return stored.plan, trials
 
 

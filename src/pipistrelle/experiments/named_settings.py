@@ -124,10 +124,13 @@ def check_own(layer: Layer) -> None:
 
 def own_config(config: Config, name: str) -> Config:
     """Return the common settings with the overrides for an estimator applied."""
-    if config.own is None:
-        return config
-    own = from_flags(config.own.get(name, {}))
-    return resolve(from_flags(config.model_dump(mode="json", exclude={"own"})) | own)
+    own = {} if config.own is None else config.own.get(name, {})
+    return with_settings(config.model_copy(update={"own": None}), from_flags(own))
+
+
+def with_settings(config: Config, over: Layer) -> Config:
+    """Return settings with a layer of others over them."""
+    return resolve(from_flags(config.model_dump(mode="json")) | over) if over else config
 
 
 def of_estimators(config: Config, names: Sequence[str]) -> Config:

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from pipistrelle.config import Config, InputError
+from pipistrelle.detection.logs.readers import wrong_kind
 from pipistrelle.files import (
     LOG,
     OwnFiles,
@@ -17,7 +18,6 @@ from pipistrelle.files import (
     read_text,
     remove_empty,
 )
-from pipistrelle.refusals import refusal
 from pipistrelle.scripting.arguments import Door, Progress, folder_named, frames_named
 from pipistrelle.settings import Key, Layer, from_keywords, resolve
 
@@ -121,8 +121,8 @@ def hear(
     >>> import pipistrelle
     >>> pipistrelle.hear("nowhere")
     Traceback (most recent call last):
-    pipistrelle.config.InputError: nowhere: found no such folder, expected a sound recording's;
-    check the path
+    pipistrelle.config.InputError: nowhere: found no such folder, expected the folder of a sound
+    recording; check the path
     """
     door = Door(
         asked={**locals()},
@@ -207,10 +207,6 @@ def described(folder: Path) -> "Description":
     """Read the description of a sound recording; raise if the folder holds no recording."""
     from pipistrelle.detection.sounds.sound_file import FILE, read_description
 
-    if not folder.is_dir():
-        found = "a file" if folder.exists() else "no such folder"
-        raise refusal(folder, found, "a sound recording's", "check the path")
-    if lexists(folder / "log.toml") and not lexists(folder / FILE):
-        found, fix = "a log, which was heard already", f"solve it by 'pipistrelle slam {folder}'"
-        raise refusal(folder, found, f"a sound recording's {FILE}", fix)
+    if not lexists(folder / FILE):
+        raise wrong_kind(folder, "the folder of a sound recording", FILE)
     return read_description(folder)

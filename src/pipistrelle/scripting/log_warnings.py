@@ -116,7 +116,7 @@ def _jumps(recorded: "Log") -> Iterator[str]:
         yield (
             f"the odometry moves by {hypot(ahead, aside):.3g} m and turns by {turn:.3g} rad "
             f"in the {recorded.dt[step]:.3g} s from {recorded.time[step]:.15g} s on{others}; "
-            "was its frame begun anew?"
+            "did its frame change?"
         )
 
 

@@ -214,9 +214,9 @@ def keep(
         save_figure(figure, room, "mission")
         film(room)
         if save_bag:
-            from pipistrelle.experiments.results.ros import BAG, told_of, write_bag
+            from pipistrelle.experiments.results.ros import BAG, messages_of, write_bag
 
-            write_bag(room / BAG, [*told_of(mission.trials)])
+            write_bag(room / BAG, [*messages_of(mission.trials)])
 
     write_results(
         own,

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 from pipistrelle.config import Config, InputError
-from pipistrelle.detection.logs.readers import Robot
+from pipistrelle.detection.logs.readers import STUDY, Robot, kind_of
 from pipistrelle.evaluation.scores import shown_in
 from pipistrelle.experiments.named_settings import over_named
 from pipistrelle.files import RESULTS, OwnFiles, claim, read_file
@@ -514,7 +514,7 @@ def load(
     from pipistrelle.experiments.runs.replay import rerun
 
     place = folder_named(folder, "load")
-    if (place / "plan.toml").is_file():
+    if kind_of(place) == STUDY:
         from pipistrelle.scripting.studies import StudyResults
 
         return StudyResults(place)

@@ -16,7 +16,6 @@ from cyclopts import (
     UnusedCliTokensError,
 )
 
-from pipistrelle.detection.logs.readers import recording_of
 from pipistrelle.verbs.streams import flush_results, say
 from pipistrelle.version import find_version
 
@@ -183,7 +182,10 @@ def _too_many(error: UnusedCliTokensError, word: str, words: Sequence[str]) -> s
         return f"--animate: found {word!r}, expected {' or '.join(FILMS)}"
     verb, kinds = " ".join(error.command_chain or ()), signature(error.target or obey).parameters
     takes = sum(kind.kind is Argument.POSITIONAL_ONLY for kind in kinds.values())
-    if verb == "run" and (what := recording_of(Path(word))):
-        return f"run: found {word!r}, {what}; run makes up its own sound, and slam solves a log"
+    if verb == "run":
+        from pipistrelle.detection.logs.readers import kind_of, wrong_kind
+
+        if kind_of(Path(word)):
+            return str(wrong_kind(Path(word), "no argument, as run simulates a drive", ""))
     most = "no arguments" if not takes else "one argument" if takes == 1 else f"{takes} arguments"
     return f"{verb}: found {word!r}, but {verb} takes {most}; options begin with --"

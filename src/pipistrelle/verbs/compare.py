@@ -120,7 +120,7 @@ def compare(
         raise InputError(f"{flag}: nothing is kept without -o DIR; add it, or leave the flag out")
     compared: ComparedMissions | ComparedStudies
     names = dict(zip(comparing.LETTERS, map(spelt, folders), strict=False))
-    if comparing.kind_of(folders) == "studies":
+    if comparing.are_studies(folders):
         compared = comparing.compare_studies(folders, drop_diverged=drop_diverged)
         from pipistrelle.report.effects import headline
 

@@ -7,11 +7,10 @@ import pytest
 
 from pipistrelle.estimation.beliefs import placed, some_of
 from pipistrelle.estimation.fastslam.particles import normalised
-from reference.missions import START
+from reference.missions import START, followed
 from reference.swarms import (
     assert_same,
     drawing,
-    followed,
     members,
     never_resampling,
     small_mission,
@@ -26,7 +25,7 @@ def by(estimate, particles=50, **changes):
 
 
 def last(slam, strategy="fused", frames=60):
-    *_, (belief, _) = followed(slam, small_mission(strategy, frames), drawing())
+    *_, (belief, _) = followed(slam, small_mission(strategy, frames), START, drawing())
     return belief
 
 
@@ -98,7 +97,7 @@ def test_the_mixtures_map_is_consistent_and_one_particles_is_not():
     mission, squared = small_mission("active", 60), {"mixture": [], "separate": []}
     for estimate, found in squared.items():
         for seed in range(3):
-            *_, (belief, _) = followed(by(estimate, particles=200), mission, drawing(seed))
+            *_, (belief, _) = followed(by(estimate, particles=200), mission, START, drawing(seed))
             shown = some_of(belief.landmarks(), placed(belief.landmarks()))
             off = shown.mean - mission.landmarks[shown.landmark - 1]
             found += np.einsum("na,nab,nb->n", off, np.linalg.inv(shown.covariance), off).tolist()

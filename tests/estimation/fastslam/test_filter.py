@@ -21,6 +21,7 @@ from reference.missions import (
     STEPS_PER_FRAME,
     Mission,
     draw_mission,
+    followed,
     measured_to,
     ray_config,
     scan_of,
@@ -31,7 +32,6 @@ from reference.swarms import (
     Drawn,
     arrays_of,
     assert_same,
-    followed,
     members,
     never_resampling,
     particles_of,
@@ -269,7 +269,9 @@ def permuted(belief, order):
 def test_permuting_particles_with_their_draws_permutes_the_weights_exactly(mixture):
     slam = never_resampling(swarm_filter(50, mixture))
     mission, rng = small_mission("fused", frames=30), np.random.default_rng(4)
-    *_, (belief, _) = followed(swarm_filter(50, mixture), small_mission("fused", frames=10), rng)
+    *_, (belief, _) = followed(
+        swarm_filter(50, mixture), small_mission("fused", frames=10), START, rng
+    )
     order = rng.permutation(50)
     other = permuted(belief, order)
     for frame in range(10, 30):

@@ -23,13 +23,14 @@ from reference.missions import (
     SURE,
     active_mission,
     draw_mission,
+    followed,
     nees_of,
     paper_filter,
     scan_of,
     scattered,
     steady,
 )
-from reference.swarms import followed, never_resampling, slow_twin, swarm_filter
+from reference.swarms import never_resampling, slow_twin, swarm_filter
 
 SIZES = np.array([30, 100, 300, 1000, 3000])
 FAR = np.array([1e5, 1.3e5, -1e5])
@@ -240,7 +241,7 @@ def final_nees(assumed, particles, runs=100):
     slam, values = swarm_filter(particles, motion=STEADY, **assumed_noise), []
     for run in range(runs):
         rng, mission = active_mission(run)
-        *_, (belief, _) = followed(slam, mission, rng, SURE)
+        *_, (belief, _) = followed(slam, mission, SURE, rng)
         pose = belief.pose()
         values.append(nees_of(pose.mean - mission.path[-1], pose.covariance))
     return np.mean(values)

@@ -9,14 +9,13 @@ from pipistrelle.estimation.beliefs import Gaussian
 from pipistrelle.estimation.fastslam.filter import SMALLEST_STD
 from pipistrelle.estimation.fastslam.particles import normalised
 from pipistrelle.geometry import wrap
-from reference.missions import START, STEP, scan_of
+from reference.missions import START, STEP, followed, scan_of
 from reference.swarms import (
     Drawn,
     all_members,
     assert_same,
     began,
     drawing,
-    followed,
     never_resampling,
     particles_of,
     small_mission,
@@ -55,15 +54,15 @@ def test_half_a_turn_of_the_world_turns_the_swarm():
 def test_labels_are_only_names():
     slam, mission = swarm_filter(), small_mission("fused", frames=20)
     renamed = [replace(scan, landmark=1000 - scan.landmark) for scan in mission.scans]
-    *_, (belief, _) = followed(slam, mission, drawing())
-    *_, (other, _) = followed(slam, replace(mission, scans=renamed), drawing())
+    *_, (belief, _) = followed(slam, mission, START, drawing())
+    *_, (other, _) = followed(slam, replace(mission, scans=renamed), START, drawing())
     np.testing.assert_array_equal(other.landmark, 1000 - belief.landmark)
     np.testing.assert_array_equal(all_members(other), all_members(belief))
 
 
 def test_steps_of_a_frame_are_the_steps_one_by_one():
     slam, mission = swarm_filter(), small_mission("fused", frames=10)
-    *_, (belief, _) = followed(slam, mission, drawing())
+    *_, (belief, _) = followed(slam, mission, START, drawing())
     together, poses = slam.predict(belief, mission.controls[0], mission.dt[0])
     for k in range(4):
         belief, pose = slam.predict(
@@ -86,7 +85,7 @@ def test_new_landmarks_are_placed_last_in_any_order():
 
 def test_estimate_is_the_weighted_mean_and_covariance_of_the_swarm_regularised():
     slam = never_resampling(swarm_filter(50))
-    *_, (belief, _) = followed(slam, small_mission("fused", frames=10), drawing())
+    *_, (belief, _) = followed(slam, small_mission("fused", frames=10), START, drawing())
     belief, _ = slam.predict(belief, np.tile([0.75, 0.027], (4, 1)), np.full(4, STEP))
     weight = normalised(belief.log_weight)
     assert weight.max() > 3 * weight.min()
@@ -117,7 +116,7 @@ def test_mean_number_of_full_landmarks_is_weighted():
     slam = never_resampling(swarm_filter(50, bearing_std=0.05))
     mission = small_mission("passive", frames=60)
     fractional = 0
-    for belief, _ in followed(slam, mission, drawing()):
+    for belief, _ in followed(slam, mission, START, drawing()):
         weight = normalised(belief.log_weight)
         assert belief.full == pytest.approx(
             weight @ (particles_of(belief).count == 1).sum(axis=1), abs=1e-12

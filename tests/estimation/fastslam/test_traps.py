@@ -7,14 +7,13 @@ from pipistrelle.estimation.beliefs import Gaussian
 from pipistrelle.estimation.motion import Motion, motion_jacobians
 from pipistrelle.estimation.observations.range import NEAREST
 from pipistrelle.geometry import wrap
-from reference.missions import BICYCLE, START, STEP, ray_config, scan_of, scan_with
+from reference.missions import BICYCLE, START, STEP, followed, ray_config, scan_of, scan_with
 from reference.swarms import (
     Drawn,
     assert_same,
     assert_sound,
     began,
     drawing,
-    followed,
     members,
     particles_of,
     small_mission,
@@ -141,7 +140,7 @@ def test_a_ray_through_the_vehicles_position_stays_sound(row, mixture):
 @pytest.mark.parametrize("particles", [1, 2])
 def test_few_particles_have_a_pose_with_an_inverse_covariance(particles):
     slam = swarm_filter(particles)
-    for belief, poses in followed(slam, small_mission("fused", frames=20), drawing()):
+    for belief, poses in followed(slam, small_mission("fused", frames=20), START, drawing()):
         assert_sound(belief)
         assert (np.linalg.eigvalsh(poses.covariance)[:, 0] > 0).all()
 

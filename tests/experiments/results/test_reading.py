@@ -44,12 +44,12 @@ def test_a_summary_with_unknown_keys_is_read(tmp_path):
 @pytest.mark.parametrize(
     ("files", "said"),
     [
-        (["plan.toml", "summary.json"], "found a study, which keeps many worlds and the frames of"),
+        (["plan.toml", "summary.json"], "found a study, expected"),
         (["trials/one"], "found a study"),
         (["index.html"], "found a report"),
-        (["log.toml"], "found a recorded log"),
-        (["Robot3_Odometry.dat"], "found a recorded log"),
-        (["config.toml"], "it was stopped before it was whole"),
+        (["log.toml"], "found a log folder"),
+        (["Robot3_Odometry.dat"], "found a MRCLAM set"),
+        (["config.toml"], "found results that are not complete"),
         (["notes.txt"], "found no summary.json"),
         ([], "found no summary.json"),
     ],
@@ -68,12 +68,12 @@ def test_another_folder_is_refused_with_its_kind_and_a_remedy(tmp_path, files, s
 @pytest.mark.parametrize("kind", [COMPARISON, WORLD])
 def test_another_pipistrelle_folder_is_refused_with_its_kind(tmp_path, kind):
     OwnFiles(tmp_path, kind).replace({"README.md": "one"})
-    assert f"{tmp_path}: found {kind.title} of Pipistrelle, expected" in refused(tmp_path)
+    assert f"{tmp_path}: found {kind.title}, expected" in refused(tmp_path)
 
 
 def test_a_summary_that_is_cut_is_no_json(tmp_path):
     (tmp_path / "summary.json").write_text("{")
-    assert "summary.json: found text that is no JSON, expected a mission's" in refused(tmp_path)
+    assert "summary.json: found text that is no JSON, expected JSON" in refused(tmp_path)
 
 
 def test_a_reports_own_summary_is_no_missions(tmp_path):
@@ -91,20 +91,18 @@ def test_a_missing_folder_or_a_file_is_refused(tmp_path):
 @pytest.mark.parametrize(
     ("changed", "said"),
     [
-        ({"format": 2}, "summary.json: format: found 2, expected 1"),
-        ({"version": None}, "summary.json: version: found nothing"),
+        ({"format": 2}, "summary.json, key 'format': found 2, expected 1"),
+        ({"version": None}, "summary.json: found no key 'version'"),
         ({"runs": []}, "summary.json: runs: found none, expected an estimate"),
-        ({"runs": "all"}, "summary.json: runs: found 'all', expected a valid array"),
-        ({"runs": [{"strategy": "loud", "filter": "ekf"}]}, "runs.0.strategy: found 'loud'"),
-        ({"runs": [{"strategy": "fused"}]}, "runs.0.filter: found nothing"),
-        ({"log": {"path": "here"}}, "summary.json: log.robot: found nothing"),
-        ({"log": "here"}, "summary.json: log: found 'here'"),
+        ({"runs": "all"}, "summary.json, key 'runs': found 'all', expected a valid array"),
+        ({"runs": [{"strategy": "loud", "filter": "ekf"}]}, "key 'runs.1.strategy': found 'loud'"),
+        ({"runs": [{"strategy": "fused"}]}, "found no key 'runs.1.filter'"),
+        ({"log": {"path": "here"}}, "summary.json: found no keys 'log.robot'"),
+        ({"log": "here"}, "summary.json, key 'log': found 'here'"),
     ],
 )
 def test_an_incomplete_summary_is_refused_with_the_key(tmp_path, changed, said):
-    told = refused(written(tmp_path, **changed))
-    assert said in told
-    assert "anew" in told
+    assert said in refused(written(tmp_path, **changed))
 
 
 @pytest.mark.parametrize("text", [b"", b"{", b"\xff\xfe", b"[" * 100_000, b"[1]", b"null"])
@@ -173,7 +171,7 @@ def test_another_kind_of_folder_is_refused_with_its_kind(tmp_path):
     mission_refused(tmp_path / "empty", "found no summary.json")
     OwnFiles(tmp_path / "log", LOG).folder.mkdir()
     OwnFiles(tmp_path / "log", LOG).replace({"log.toml": "format = 1"})
-    mission_refused(tmp_path / "log", "found a recorded log")
+    mission_refused(tmp_path / "log", "found a log")
 
 
 @pytest.mark.parametrize(
@@ -186,7 +184,7 @@ def test_a_file_that_is_changed_cut_or_gone_is_named(folder, name):
         (folder / name).write_text(other)
         mission_refused(folder, f"{folder / name}: was changed since Pipistrelle wrote it")
     (folder / name).unlink()
-    none = f"{folder}: found no summary.json"
+    none = f"{folder}: found results that are not complete"
     mission_refused(folder, none if name == "summary.json" else f"{folder / name}: is missing")
     (folder / name).mkdir()
     mission_refused(folder, f"{folder / name}: found a folder")
@@ -203,13 +201,13 @@ def test_files_that_nothing_is_read_from_may_be_changed(folder):
 def test_results_that_were_interrupted_are_not_whole(folder):
     lines = (folder / SUMS).read_text().splitlines()
     (folder / SUMS).write_text("\n".join(line for line in lines if "summary" not in line))
-    mission_refused(folder, "a summary.json that SHA256SUMS does not name", "run or solve it anew")
+    mission_refused(folder, "a summary.json that SHA256SUMS does not name", "run or solve it again")
 
 
 @pytest.mark.parametrize(
     ("name", "text", "part"),
     [
-        ("summary.json", '{"format": 2, "runs": []}', "format: found 2"),
+        ("summary.json", '{"format": 2, "runs": []}', "key 'format': found 2"),
         ("summary.json", "[]", "summary.json: found []"),
         ("summary.json", "{", "found text that is no JSON"),
         ("config.toml", "seed = ", "would not write"),

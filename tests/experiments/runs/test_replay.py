@@ -132,7 +132,7 @@ def test_a_folder_that_is_not_there_is_refused(tmp_path):
 @pytest.mark.parametrize(
     ("names", "what", "fix"),
     [
-        (["walk.WAV"], "an audio recording, which is no log", "pipistrelle hear"),
+        (["walk.WAV"], "an audio recording", "pipistrelle hear"),
         (["tape/walk.flac", "tape/notes.txt"], "an audio recording", "docs/sound.md"),
         (["walk.txt"], "a file", "check the path"),
     ],

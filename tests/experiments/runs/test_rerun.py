@@ -199,7 +199,7 @@ def test_a_folder_without_the_name_of_its_log_is_refused(folders):
     Path("slam/summary.json").write_text(json.dumps(summary))
     assert refused("slam") == (
         "slam/summary.json: log: found nothing, expected which log was solved (it is the folder of "
-        "an earlier version); solve it anew, `pipistrelle slam LOG -o DIR`, and name DIR"
+        "an earlier version); solve it again, `pipistrelle slam LOG -o DIR`, and name DIR"
     )
 
 

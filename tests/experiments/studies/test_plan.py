@@ -143,12 +143,10 @@ def test_settings_may_vary_that_are_no_numbers(tmp_path):
     assert {case.config.rays.range_bounds for case in cases_of(plan)} == {(0.5, 20.0), (0.5, 10.0)}
 
 
-@pytest.mark.parametrize("values", ["[0.01]", '["loud"]', '["loud", "soft"]'])
+@pytest.mark.parametrize("values", ["[0.01]", '["loud"]', '["fused", "soft"]'])
 def test_refused_items_are_not_also_reported_missing(refused, values):
-    said = refused(BARE + f"strategies = {values}\n").splitlines()
-    assert [line.partition(": found")[0] for line in said] == [
-        f"PLAN: strategies.{i}" for i in range(1 + values.count(","))
-    ]
+    where = f"PLAN, key 'strategies[{values.count(',')}]': found"
+    assert refused(BARE + f"strategies = {values}\n").startswith(where)
 
 
 def test_a_plan_as_written_reads_as_the_same_plan(tmp_path):
@@ -175,22 +173,20 @@ def test_given_settings_override_the_plans(tmp_path):
 
 
 WIDE = "expected degrees above 0 and up to 180, the widest beam of a back-baffled piston"
+KNOWN_FILTERS = "expected 'ekf', 'fastslam', 'iekf', 'smoother' or module:Class"
 REFUSED = [
-    ('filters = ["ukf"]',
-     "filters.0: found 'ukf', expected 'ekf', 'fastslam', 'iekf', 'smoother' or module:Class"),
-    ("filters = [3]",
-     "filters.0: found 3, expected 'ekf', 'fastslam', 'iekf', 'smoother' or module:Class"),
-    ('filters = ["ekf", "a.b:"]',
-     "filters.1: found 'a.b:', expected 'ekf', 'fastslam', 'iekf', 'smoother' or module:Class"),
+    ('filters = ["ukf"]', f"key 'filters[0]': found 'ukf', {KNOWN_FILTERS}"),
+    ("filters = [3]", f"key 'filters[0]': found 3, {KNOWN_FILTERS}"),
+    ('filters = ["ekf", "a.b:"]', f"key 'filters[1]': found 'a.b:', {KNOWN_FILTERS}"),
     ('filters = ["a:B", "c:B"]', "filters: a:B and c:B would write the same files"),
     ('filters = ["a:B", "a:B"]', "filters: found 'a:B' twice"),
-    ("iteration = 3", "iteration: no such key of a plan; did you mean itera"),
-    ('name = "../up"', "name: found '../up', expected letters, digits"),
-    ('strategies = ["loud"]', "strategies.0: found 'loud', expected 'active',"),
-    ("strategies = []", "strategies: found [], expected "),
+    ("iteration = 3", "found the unknown key 'iteration', expected one of format, "),
+    ('name = "../up"', "key 'name': found '../up', expected letters, digits"),
+    ('strategies = ["loud"]', "key 'strategies[0]': found 'loud', expected 'active',"),
+    ("strategies = []", "key 'strategies': found [], expected "),
     ('filters = ["ekf", "ekf"]', "filters: found 'ekf' twice"),
-    ("config = 3", "config: found 3, expected a table of settings"),
-    ("grid = [1]", "grid: found [1], expected a table of settings"),
+    ("config = 3", "key 'config': found 3, expected a table of settings"),
+    ("grid = [1]", "key 'grid': found [1], expected a table of settings"),
     ("[config.rays]\npowr = 1\n", "config.rays.powr: no such setting; did you mean rays.power?"),
     ("[config.sonar]", "config.sonar: no such setting"),
     ("[config]\nrays = 3\n", "config.rays: no such setting"),
@@ -207,8 +203,8 @@ REFUSED = [
     ('[grid]\n"rays.power" = [2, 2.0]\n',
      "grid.rays.power: found 2.0 twice, expected each value once"),
     ("[grid]\nseed = [1, 2]\n", "grid.seed: every iteration is another world"),
-    ("own = 3", "own: found 3, expected a table for each filter"),
-    ("[own]\nekf = 3\n", "own: found {'ekf': 3}, expected a table for each filter"),
+    ("own = 3", "key 'own': found 3, expected a table for each filter"),
+    ("[own]\nekf = 3\n", "key 'own': found {'ekf': 3}, expected a table for each filter"),
     ("[own.iekf]\nfilter.gate = 0.9\n", "own.iekf: no filter of this plan; did you mean ekf?"),
     ("[own.ekf]\nemitter.radius = 0.01\n",
      "own.ekf.emitter.radius: this setting changes what is heard; expected one of the "
@@ -270,13 +266,13 @@ REFUSED = [
 ]  # fmt: skip
 """Text of a plan after its format and number of worlds, and the message after the plan's name."""
 INCOMPLETE = [
-    ("format = 1", "no key 'iterations'; add iterations = 20"),
-    ("iterations = 3", "no key 'format'; add format = 1"),
+    ("format = 1", "found no key 'iterations', expected the keys format, name, "),
+    ("iterations = 3", "found no key 'format', expected the keys format, "),
     ("iterations = = 3", "found Invalid value (at line 1, column 14), expected TOML"),
-    ("format = 2\niterations = 3\n", "format: found 2, expected 1"),
-    ("format = 1\niterations = 0\n", "iterations: found 0, expected greater than"),
-    ("format = 1\niterations = 2.0\n", "iterations: found 2.0, expected a valid integer"),
-    ("format = 1\niterations = true\n", "iterations: found True, expected"),
+    ("format = 2\niterations = 3\n", "key 'format': found 2, expected 1"),
+    ("format = 1\niterations = 0\n", "key 'iterations': found 0, expected greater than"),
+    ("format = 1\niterations = 2.0\n", "key 'iterations': found 2.0, expected a valid integer"),
+    ("format = 1\niterations = true\n", "key 'iterations': found True, expected"),
 ]
 
 
@@ -285,7 +281,8 @@ INCOMPLETE = [
 )
 def test_a_mistake_is_named_in_a_line_with_file_key_and_expectation(refused, text, said):
     found = refused(text)
-    assert found.startswith(f"PLAN: {said}")
+    assert found.startswith(("PLAN: ", "PLAN, "))
+    assert found[6:].startswith(said)
     assert "\n" not in found
 
 
@@ -344,7 +341,7 @@ def test_how_many_worlds_the_file_names_is_remembered_and_is_no_setting(tmp_path
     assert plan_of(tmp_path, plan_text(few)) == few
     assert changed_settings(few, more) == []
     assert "planned" not in plan_settings(few)
-    with pytest.raises(InputError, match=r"small\.toml: planned: found 'many', expected a"):
+    with pytest.raises(InputError, match=r"small\.toml, key 'planned': found 'many', expected a"):
         plan_of(tmp_path, 'planned = "many"\n' + SMALL)
 
 

@@ -327,7 +327,7 @@ def test_a_study_loads_lazily_world_after_world(folder, plan, records):
 
 
 def test_a_folder_without_a_plan_is_no_study(tmp_path):
-    with pytest.raises(InputError, match=r"holds no plan\.toml; expected the folder of a study"):
+    with pytest.raises(InputError, match=r"found no plan\.toml, expected the folder of a study"):
         load_study(tmp_path)
 
 

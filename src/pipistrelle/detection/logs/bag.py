@@ -313,7 +313,7 @@ def faults_named(where: str) -> Iterator[None]:
         raise refusal(where, found, "a sound bag", _MEND) from None
 
 
-_MEND = "mend it (`ros2 bag reindex`, `mcap recover`, `rosbag reindex`), or record it anew"
+_MEND = "mend it (`ros2 bag reindex`, `mcap recover`, `rosbag reindex`), or record it again"
 
 
 def _decoder(connection: "Connection") -> Callable[[bytes], Any]:

@@ -10,15 +10,40 @@ from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from pipistrelle.config import InputError
+from pipistrelle.files import LOG, REPORT, RESULTS, SOUND, WORLD, OwnFiles
+from pipistrelle.refusals import refusal
+
 if TYPE_CHECKING:
     from pipistrelle.detection.logs.recording import Log
 
 
-_OTHERS = {
-    frozenset({".wav", ".flac", ".aif", ".aiff", ".ogg", ".mp3"}): "an audio recording, which is "
-    "no log; make a log folder of it with `pipistrelle hear` (docs/sound.md)"
+STUDY, AUDIO, UNFINISHED = "a study", "an audio recording", "results that are not complete"
+_AUDIO = {".wav", ".flac", ".aif", ".aiff", ".ogg", ".mp3"}
+"""Suffixes of sound files."""
+_MARKS = {
+    "plan.toml": STUDY,
+    "trials": STUDY,
+    "recording.toml": SOUND.title,
+    "world.toml": WORLD.title,
+    "index.html": REPORT.title,
+    "summary.json": RESULTS.title,
+    "config.toml": UNFINISHED,
 }
-"""Recordings without a reader, by the suffixes of their files."""
+"""Kinds of folders by a file that only they contain, in the order in which they are tried."""
+_SOLVE = "solve it first: `pipistrelle slam {} -o DIR`"
+_USES = {
+    STUDY: "`pipistrelle report {0}` puts it on a page; `pipistrelle run --settings "
+    "{0}/config.toml -o DIR` makes a mission of its settings",
+    RESULTS.title: "`pipistrelle view {}` plays results",
+    UNFINISHED: "run or solve it again with --overwrite",
+    REPORT.title: "open its index.html",
+    LOG.title: _SOLVE,
+    SOUND.title: "make a log of it: `pipistrelle hear {} -o LOG`",
+    AUDIO: "describe it for `pipistrelle hear`, which makes a log of it (docs/sound.md)",
+    WORLD.title: "drive through it: `pipistrelle run --world {}`",
+}
+"""What to do with a folder of each kind."""
 Robot = int | str
 """A robot of a log of several, by number or by name, as the format has it."""
 
@@ -61,12 +86,32 @@ def reader_of(folder: Path, readers: Sequence[Reader] = ()) -> Reader:
     return next((reader for reader in known if reader.recognises(folder)), LOG_FOLDER)
 
 
-def recording_of(path: Path) -> str | None:
-    """Return advice for a recording that no reader takes, such as audio; None if there is none."""
-    endings = {path.suffix.lower()}
-    if path.is_dir():
-        endings |= {file.suffix.lower() for file in path.iterdir()}
-    return next((words for known, words in _OTHERS.items() if endings & known), None)
+def kind_of(path: Path) -> str:
+    """Name the kind of a file or folder: results, a study, a log, a recording; "" if unknown.
+
+    >>> kind_of(Path("walk.wav")), kind_of(Path("/nowhere"))
+    ('an audio recording', '')
+    """
+    if path.suffix.lower() in _AUDIO:
+        return AUDIO
+    titles = (reader.title for reader in READERS if reader.recognises(path))
+    marks = (kind for name, kind in _MARKS.items() if (path / name).exists())
+    kind = OwnFiles(path, LOG).there or next(titles, "") or next(marks, "")
+    if kind == RESULTS.title and not (path / "summary.json").exists():
+        return UNFINISHED
+    if kind or not path.is_dir():
+        return kind
+    return AUDIO if any(file.suffix.lower() in _AUDIO for file in path.iterdir()) else ""
+
+
+def wrong_kind(path: Path, expected: str, file: str) -> InputError:
+    """Return the error for a path that lacks `file`: its kind, and the verb that takes it."""
+    kind, missing = kind_of(path), "a file" if path.exists() else "no such folder"
+    log = kind in (reader.title for reader in READERS)
+    fix = _SOLVE if log else _USES.get(kind, "check the path")
+    return refusal(
+        path, kind or (f"no {file}" if path.is_dir() else missing), expected, fix.format(path)
+    )
 
 
 def _imported(module: str, name: str) -> "Callable[..., Log]":

@@ -287,7 +287,7 @@ def _check_size(
     ):
         if found not in (None, expected):
             raise refusal(path, f"a header of {found} {unit}", f"{expected} by its other fields",
-                          "mend its header, or convert it anew")  # fmt: skip
+                          "mend its header, or convert it again")  # fmt: skip
 
 
 def _announced(raw: BinaryIO, magic: bytes, length: int) -> tuple[int, int, int | None] | None:
@@ -361,7 +361,7 @@ class Sound:
                 got = len(file.read(wanted, out=samples[done : done + wanted]))
             if got != wanted:
                 found = f"{place + got} samples in place of the {file.frames} that it announces"
-                raise refusal(self.paths[number], found, "a whole file", "copy it anew")
+                raise refusal(self.paths[number], found, "a whole file", "copy it again")
             done += wanted
         return samples
 
@@ -376,7 +376,7 @@ class Sound:
             place = first + row - int(self._begin[number])
             found = f"{samples[row, channel]} as sample {place} (from 0)"
             expected = f"finite numbers, up to {LARGEST_SAMPLE:g}"
-            raise refusal(where, found, expected, "cut it out, or record anew")
+            raise refusal(where, found, expected, "cut it out, or record again")
 
 
 @contextmanager
@@ -399,7 +399,7 @@ def open_sound(folder: Path, about: Description) -> Iterator[Sound]:
         if about.samples not in (None, sound.samples):
             found = f"{sound.samples} samples in {', '.join(path.name for path in paths)}"
             where = f"{folder / FILE}, key 'samples'"
-            raise refusal(where, found, f"{about.samples}", "copy the sound anew")
+            raise refusal(where, found, f"{about.samples}", "copy the sound again")
         yield sound
 
 

@@ -19,10 +19,10 @@ from jaxtyping import Float
 from pydantic import BaseModel, Field, ValidationError
 
 from pipistrelle.config import InputError, Strategy
-from pipistrelle.detection.logs.readers import READERS, Robot
+from pipistrelle.detection.logs.readers import Robot, kind_of, wrong_kind
 from pipistrelle.estimation.catalogue import short_name
-from pipistrelle.files import COMPARISON, RESULTS, SUMS, WORLD, OwnFiles, read_file
-from pipistrelle.refusals import expectation, refusal, shown
+from pipistrelle.files import RESULTS, SUMS, OwnFiles, read_file
+from pipistrelle.refusals import refusal, table_refusal
 from pipistrelle.settings import leaves
 
 SUMMARY = "summary.json"
@@ -69,51 +69,16 @@ class Summary(BaseModel):
 def read_summary(folder: Path) -> Summary:
     """Read ``summary.json`` of a result folder; raise for another kind of folder."""
     path = folder / SUMMARY
-    if not path.exists() or (folder / "plan.toml").exists():
-        raise _no_results(folder)
+    if kind_of(folder) != RESULTS.title:
+        expected = "the result folder of `pipistrelle run` or `pipistrelle slam`"
+        raise wrong_kind(folder, expected, SUMMARY)
     try:
         summary = Summary.model_validate_json(read_file(path))
     except ValidationError as refused:
-        faults = refused.errors(include_url=False)
-        if any(fault["loc"] == ("runs",) and fault["type"] == "missing" for fault in faults):
-            raise _no_results(folder) from None
-        key = ".".join(map(str, faults[0]["loc"]))
-        where = f"{path}: {key}" if key else path
-        missing = faults[0]["type"] == "missing"
-        found = "nothing" if missing else shown(faults[0]["input"])
-        expected = "a value" if missing else expectation(faults[0])
-        if faults[0]["type"] == "json_invalid":
-            found, expected = "text that is no JSON", "a mission's summary"
-        raise refusal(where, found, expected, "run or solve it anew with --overwrite") from None
+        raise table_refusal(path, refused, Summary) from None
     if not summary.runs:
-        raise refusal(f"{path}: runs", "none", "an estimate", "run or solve it anew")
+        raise refusal(f"{path}: runs", "none", "an estimate", "run or solve it again")
     return summary
-
-
-def _no_results(folder: Path) -> InputError:
-    """Return the InputError for a folder without a mission's results: its kind, and the fix."""
-    expected = "the result folder of `pipistrelle run` or `pipistrelle slam`"
-    if not folder.is_dir():
-        found = "a file" if folder.exists() else "no such folder"
-        return refusal(folder, found, expected, "check the path")
-    if any((folder / name).exists() for name in ("plan.toml", "trials")):
-        found = "a study, which keeps many worlds and the frames of none"
-        settings = f"`pipistrelle run --settings {folder / 'config.toml'} -o DIR`"
-        fix = f"`pipistrelle report` puts it on a page; {settings} makes a mission of its settings"
-        return refusal(folder, found, expected, fix)
-    there = OwnFiles(folder, RESULTS).there
-    if there in (COMPARISON.title, WORLD.title):
-        return refusal(folder, f"{there} of Pipistrelle", expected, "name the folder of a run")
-    if (folder / "index.html").exists():
-        fix = "open its index.html, or name the folder of a run"
-        return refusal(folder, "a report", expected, fix)
-    if any(reader.recognises(folder) for reader in READERS):
-        fix = f"solve it first, `pipistrelle slam {folder} -o DIR`, and name DIR"
-        return refusal(folder, "a recorded log", expected, fix)
-    if (folder / "config.toml").exists():
-        fix = "it was stopped before it was whole: run or solve it anew with --overwrite"
-        return refusal(folder, f"no {SUMMARY}", expected, fix)
-    return refusal(folder, f"no {SUMMARY}", expected, "name another folder")
 
 
 Estimate = tuple[str, str]
@@ -180,7 +145,7 @@ def results_in(folder: Path) -> OwnFiles:
     read_summary(folder)
     if SUMMARY not in own:
         found = f"a {SUMMARY} that {SUMS} does not name"
-        raise refusal(folder, found, "results as they were written", "run or solve it anew")
+        raise refusal(folder, found, "results as they were written", "run or solve it again")
     return own
 
 

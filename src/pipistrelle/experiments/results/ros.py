@@ -36,7 +36,7 @@ _COLORS = {"full": {"r": 0.0, "g": 0.6, "b": 0.5}, "partial": {"r": 0.9, "g": 0.
 _END = 2**31
 
 
-Told = tuple[str, str, float, Fields]
+Message = tuple[str, str, float, Fields]
 """Topic, type, time [s] and fields of a message for a ROS bag."""
 
 
@@ -62,8 +62,8 @@ def pose_fields(
     six = np.zeros((6, 6))
     six[np.ix_(PLANE, PLANE)] = covariance
     x, y, heading = map(float, pose)
-    told = {"position": {"x": x, "y": y}, "orientation": _turn(heading)}
-    return {"header": header(time, frame), "pose": {"pose": told, "covariance": six.ravel()}}
+    place = {"position": {"x": x, "y": y}, "orientation": _turn(heading)}
+    return {"header": header(time, frame), "pose": {"pose": place, "covariance": six.ravel()}}
 
 
 def correction_fields(
@@ -125,7 +125,7 @@ def _ellipse(xx: float, xy: float, yy: float) -> tuple[float, float, float]:
     return math.sqrt(middle + spread), math.sqrt(least), 0.5 * math.atan2(2.0 * xy, xx - yy)
 
 
-def told_of(trials: Sequence[TrialResult], frame: str = "map") -> Iterator[Told]:
+def messages_of(trials: Sequence[TrialResult], frame: str = "map") -> Iterator[Message]:
     """Yield the ROS messages of each estimate: its poses, if finite, and its final map."""
     for trial in trials:
         track, name = trial.track, re.sub(r"\W", "_", short_name(trial.filter))
@@ -139,7 +139,7 @@ def told_of(trials: Sequence[TrialResult], frame: str = "map") -> Iterator[Told]
         yield f"/{trial.strategy}/{name}/map", MAP, end, fields
 
 
-def write_bag(path: Path, messages: Sequence[Told]) -> None:
+def write_bag(path: Path, messages: Sequence[Message]) -> None:
     """Write ROS messages in order of time into a new .mcap file; map topics are latched."""
     need_rosbags(str(path))
     from rosbags.rosbag2 import StoragePlugin, Writer
@@ -151,8 +151,8 @@ def write_bag(path: Path, messages: Sequence[Told]) -> None:
         with writer:
             for topic, kind in dict.fromkeys(message[:2] for message in messages):
                 qos = [_latched()] if kind == MAP else []
-                told = {"typestore": store, "offered_qos_profiles": qos}
-                known[topic] = writer.add_connection(topic, kind, **told)
+                how = {"typestore": store, "offered_qos_profiles": qos}
+                known[topic] = writer.add_connection(topic, kind, **how)
             for topic, kind, time, fields in sorted(messages, key=lambda message: message[2]):
                 data = store.serialize_cdr(_made(store, kind, fields), kind)
                 writer.write(known[topic], _stamp(time), data)

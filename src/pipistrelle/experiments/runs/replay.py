@@ -16,7 +16,14 @@ from typing import Any
 import numpy as np
 
 from pipistrelle.config import BagConfig, Config, InputError, Strategy
-from pipistrelle.detection.logs.readers import READERS, Reader, Robot, reader_of, recording_of
+from pipistrelle.detection.logs.readers import (
+    READERS,
+    Reader,
+    Robot,
+    kind_of,
+    reader_of,
+    wrong_kind,
+)
 from pipistrelle.detection.logs.recording import Log
 from pipistrelle.detection.noise import noise_of, without_hidden
 from pipistrelle.detection.scans import (
@@ -47,7 +54,7 @@ from pipistrelle.experiments.runs.heard_world import Mission
 from pipistrelle.experiments.runs.trial import Watch, run_mission, try_trial
 from pipistrelle.experiments.runs.truth_files import TRUTHS, WithTruth, with_files_beside
 from pipistrelle.experiments.runs.validate import check_filters
-from pipistrelle.files import LOG, OwnFiles, read_file, text_of
+from pipistrelle.files import read_file, text_of
 from pipistrelle.refusals import refusal
 from pipistrelle.settings import from_file, read_toml, resolve
 from pipistrelle.version import find_version
@@ -94,26 +101,12 @@ def load(
     formats = (*readers, *READERS)
     titles = " or ".join(reader.title for reader in formats)
     reader = reader_of(folder, readers)
-    if not reader.recognises(folder) or not (folder.exists() or reader.configured):
-        _refuse_unknown(folder, titles)
+    recognised = reader.recognises(folder) and (folder.exists() or reader.configured)
+    if not recognised and (kind_of(folder) or not folder.is_dir()):
+        raise wrong_kind(folder, titles, "log.toml")
     whose = (*((bag,) if reader.configured else ()), *_whose(reader, folder, robot, formats))
     with_truth = {**TRUTHS, **truths}.get(reader.name, with_files_beside)
     return with_truth(reader.read, folder, *whose)
-
-
-def _refuse_unknown(folder: Path, titles: str) -> None:
-    """Raise if a path is missing, or holds something recognised that is no log, such as a study."""
-    if folder.exists():
-        what, _, fix = (recording_of(folder) or "").partition("; ")
-        if what:
-            raise refusal(folder, what, titles, fix)
-    if not folder.is_dir():
-        found = "a file" if folder.is_file() else "no such folder"
-        raise refusal(folder, found, titles, "check the path")
-    study = (folder / "plan.toml").is_file() and (folder / "trials").is_dir()
-    if what := "a study" if study else OwnFiles(folder, LOG).there:
-        fix = "name the log itself; `pipistrelle view` plays results, `report` is for studies"
-        raise refusal(folder, f"{what} of Pipistrelle", titles, fix)
 
 
 def as_heard_by(
@@ -315,7 +308,7 @@ def rerun(
     if summary.log is None:
         if "scenario" not in read_toml(folder / "config.toml"):
             found = "which log was solved (it is the folder of an earlier version)"
-            fix = "solve it anew, `pipistrelle slam LOG -o DIR`, and name DIR"
+            fix = "solve it again, `pipistrelle slam LOG -o DIR`, and name DIR"
             raise refusal(f"{folder / SUMMARY}: log", "nothing", found, fix)
         if log is not None:
             expected = "none, for `pipistrelle run` simulated this mission"
@@ -359,7 +352,7 @@ def _log_of(folder: Path, summary: Summary, log: Path | None) -> Path:
     path = summary.log.place if log is None else log
     where = f"{folder / SUMMARY}: log.path" if log is None else f"{folder}, option --log"
     if not path.exists():
-        found, fix = f"{path}, which is not there", "put it back, or say with --log where it is"
+        found, fix = f"{path}, which is not there", "restore it, or give its new path by --log"
         raise refusal(where, found, "the log that was solved", fix)
     then, now = summary.log.files, _sums(path)
     changed = [name for name in sorted({*then, *now}) if then.get(name) != now.get(name)]
@@ -368,7 +361,7 @@ def _log_of(folder: Path, summary: Summary, log: Path | None) -> Path:
         how = "is new" if name not in then else "is gone" if name not in now else "was changed"
         others = f", and {len(changed) - 1} more" if len(changed) > 1 else ""
         found = f"not the log that was solved ({name} {how}{others})"
-        fix = "put that back, or solve it as it is, `pipistrelle slam`, and name that folder"
+        fix = "restore the log, or solve it again, `pipistrelle slam LOG -o DIR`, and name DIR"
         raise refusal(path, found, f"it as {folder} was made of it", fix)
     return path
 

@@ -8,6 +8,7 @@ the piston with that beamwidth, so both forms describe the same study.
 """
 
 import json
+import re
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
@@ -36,9 +37,16 @@ from pipistrelle.experiments.hearing.world_folder import (
     read_world,
     with_world,
 )
-from pipistrelle.experiments.named_settings import PLANS, Case, laid, over_named, parted
+from pipistrelle.experiments.named_settings import (
+    PLANS,
+    Case,
+    laid,
+    over_named,
+    parted,
+    with_settings,
+)
 from pipistrelle.files import check_ordinary, text_of
-from pipistrelle.refusals import expectation, meant, refusal, shown
+from pipistrelle.refusals import meant, refusal, shown, table_refusal
 from pipistrelle.settings import (
     ARRAY_KEY,
     CALLERS,
@@ -118,18 +126,10 @@ def cases_of(plan: Plan) -> tuple[PlannedCase, ...]:
                 strategy=strategy,
                 filter=name,
                 values=values | {RADIUS: None} if passive else values,
-                config=own_config(plan, name, config),
+                config=with_settings(config, _dotted(plan.own.get(name, {}), f"own.{name}.")),
             )
             cases.append(case)
     return tuple(cases)
-
-
-def own_config(plan: Plan, name: str, config: Config) -> Config:
-    """Return settings with a plan's overrides for one filter applied."""
-    if name not in plan.own:
-        return config
-    own = _dotted(plan.own[name], f"own.{name}.")
-    return resolve(from_flags(config.model_dump(mode="json")) | own)
 
 
 def _dotted(values: Mapping[str, Any], prefix: str) -> Layer:
@@ -255,6 +255,11 @@ def _names_filter(found: Any) -> bool:
     return False
 
 
+def _names_folder(found: Any) -> bool:
+    """Return whether a value is a word that a folder may have as its name."""
+    return isinstance(found, str) and re.fullmatch(r"\w[\w.-]*", found) is not None
+
+
 def _is_table(found: Any, inner: type = object) -> bool:
     """Return whether an object is a dict with values of a given type only."""
     return isinstance(found, dict) and all(isinstance(each, inner) for each in found.values())
@@ -272,7 +277,7 @@ class _PlanFile(Section):
     """Keys of a plan file, validated by Pydantic; the settings in its tables are checked later."""
 
     format: Literal[1]
-    name: Annotated[str, Field(pattern=r"^\w[\w.-]*$")]
+    name: Annotated[str, _checked("letters, digits, _ . and -, as of a folder", _names_folder)]
     iterations: Annotated[int, Field(ge=1, le=MOST_WORLDS)]
     planned: int = 0
     strategies: Annotated[tuple[Strategy, ...], Field(min_length=1)] = STRATEGIES
@@ -514,7 +519,7 @@ def _as_table(plan: Plan) -> dict[str, Any]:
 
 
 def _plan_file(path: Path, table: Mapping[str, Any], iterations: int | None) -> _PlanFile:
-    """Validate the top-level keys of a plan file; raise InputError with all faults."""
+    """Validate the top-level keys of a plan file; raise at its first fault."""
     given = {"name": text_of(path.stem), **table}
     if iterations is not None:
         if isinstance(given.get("iterations"), int):
@@ -523,27 +528,11 @@ def _plan_file(path: Path, table: Mapping[str, Any], iterations: int | None) -> 
     try:
         file = _PlanFile.model_validate_json(json.dumps(given, default=str), strict=True)
     except ValidationError as refused:
-        wrong = refused.errors(include_url=False)  # also lists of only invalid items are too short
-        wrong = [error for error in wrong if error["type"] != "too_short" or error["input"] == []]
-        raise InputError("\n".join(_problem(path, error) for error in wrong)) from None
+        raise table_refusal(path, refused, _PlanFile, "format") from None
     for name in ("strategies", "filters"):
         _check_distinct(f"{path}: {name}", getattr(file, name))
     check_distinct(file.filters, f"{path}: filters")
     return file
-
-
-def _problem(path: Path, error: Any) -> str:
-    """Format a validation error of a plan file: the key, the value found, the value expected."""
-    name = ".".join(map(str, error["loc"]))
-    if error["type"] == "missing":
-        example = {"format": FORMAT, "iterations": 20}.get(name)
-        return f"{path}: no key {name!r}; add {name}" + f" = {example}" * (example is not None)
-    if error["type"] == "extra_forbidden":
-        return f"{path}: {name}: no such key of a plan; {_meant(name, _PlanFile.model_fields)}"
-    expected = expectation(error)
-    if error["type"] == "string_pattern_mismatch":
-        expected = "letters, digits, _ . and -, for it names a folder"
-    return f"{path}: {name}: found {shown(error['input'])}, expected {expected}"
 
 
 def _settings(

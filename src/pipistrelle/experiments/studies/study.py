@@ -29,6 +29,7 @@ from tempfile import TemporaryFile
 from typing import TYPE_CHECKING, Any
 
 from pipistrelle.config import InputError
+from pipistrelle.detection.logs.readers import wrong_kind
 from pipistrelle.estimation.catalogue import CATALOGUE, look_in
 from pipistrelle.experiments.hearing.scenario import moving_callers, standing_landmarks
 from pipistrelle.experiments.hearing.trajectories import true_motion
@@ -183,7 +184,7 @@ def load_study(folder: Path) -> StoredStudy:
     import polars as pl
 
     if not (folder / "plan.toml").is_file():
-        raise InputError(f"{folder}: holds no plan.toml; expected the folder of a study")
+        raise wrong_kind(folder, "the folder of a study", "plan.toml")
     plan = read_plan(folder / "plan.toml")
     worlds = sorted(done_worlds(folder))
     # The files contain their columns, also if an external estimator is not installed.
@@ -551,7 +552,7 @@ def _client(address: str, workers: int) -> Iterator[Any]:
         with client:
             yield client
         return
-    with _started_deaf(), dask_config.set(_NO_PAGES):
+    with _held_interrupt(), dask_config.set(_NO_PAGES):
         cluster = LocalCluster(
             n_workers=workers,
             threads_per_worker=1,
@@ -562,16 +563,3 @@ def _client(address: str, workers: int) -> Iterator[Any]:
         )
     with cluster, Client(cluster) as client:
         yield client
-
-
-@contextmanager
-def _started_deaf() -> Iterator[None]:
-    """Ignore Ctrl-C while the context's body runs; processes started in it inherit this."""
-    if threading.current_thread() is not threading.main_thread():
-        yield
-        return
-    before = signal.signal(signal.SIGINT, signal.SIG_IGN)
-    try:
-        yield
-    finally:
-        signal.signal(signal.SIGINT, before)

@@ -449,7 +449,7 @@ def damaged(folder: Path, table: str, iteration: int, flaw: str) -> InputError:
     return InputError(
         f"{world_file(folder, table, iteration)}: {flaw}; remove "
         f"{world_file(Path(), 'trials', iteration)} from {folder} and run the study again: its "
-        "world is done anew"
+        "world is run again"
     )
 
 
