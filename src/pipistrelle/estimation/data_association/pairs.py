@@ -10,7 +10,8 @@ clutter of the density :math:`\lambda`, which is lower for precise bearings (`ro
 
 .. math:: c = d^2 + \ln |2 \pi S| + 2 \ln (\lambda / p_D)
 
-A cost below 0 is likelier than clutter. After a long trajectory the relative position may be so
+A range without a bearing has only its own terms, and clutter of any bearing. A cost below 0 is
+likelier than clutter. After a long trajectory the relative position may be so
 uncertain that a good fit is no evidence (`Chances.vague`): such a measurement begins a new
 landmark, which may be merged later (`existence.doubles`).
 
@@ -201,7 +202,11 @@ def pair_costs(
                 continue
             if unsure > max(made.vague, BARELY * heard.bearing_std[m] * heard.way_std[m]) ** 2:
                 continue
-            if math.isnan(heard.way[m]) or caller == UNPLACED:
+            if math.isnan(heard.bearing[m]):
+                c = along + heard.way_std[m] ** 2
+                squared, size = (heard.way[m] - way) ** 2 / c, 2.0 * math.pi * c
+                density = 2.0 * math.pi * made.clutter
+            elif math.isnan(heard.way[m]) or caller == UNPLACED:
                 squared, size = nu * nu / a, 2.0 * math.pi * a
                 density = made.bearing_clutter
             else:

@@ -219,9 +219,12 @@ def _read(
         way[m] = numbers[RANGE if own else EXCESS_PATH, m]
         way_std[m] = numbers[RANGE_STD if own else EXCESS_PATH_STD, m]
         bare, within = math.isnan(way[m]), _within(way_std[m], way_limit, assumed)
-        usable[m] = _within(bearing_std[m], limit, assumed) and (bare or within)
+        aimed = not math.isnan(numbers[BEARING, m])
+        usable[m] = within and own
+        if aimed:
+            usable[m] = _within(bearing_std[m], limit, assumed) and (bare or within)
         with_way[m] = usable[m] and not bare
-        sure[m] = _within(way_std[m], birth_limit, assumed)
+        sure[m] = aimed and _within(way_std[m], birth_limit, assumed)
         if bearing_std[m] not in assumed:
             share = SURE_SHARE * limit / bearing_std[m]
             surety[m] = share if share < 1.0 else 1.0  # also for NaN

@@ -313,7 +313,7 @@ class _Work:
         for number in np.flatnonzero(self.judged & ~self.roving).tolist():
             row = self._direct(number)
             if number == OWN or (row >= 0 and where[number] < self.before.mean.size):
-                used = rows.with_way & (rows.caller == number)
+                used = rows.with_way & (rows.caller == number) & ~np.isnan(rows.bearing)
                 used[row] &= number == OWN
                 direct = np.array([rows.bearing[row], rows.bearing_std[row]])
                 heard.append((number, self._some(used), direct, int(where[number])))
@@ -544,10 +544,11 @@ class _Work:
         labels = [self._another() if label == UNLABELLED else label for label in given]
         self.label[begun] = labels
         self.new += [label for label in labels if label not in given]
-        if number == OWN and labels:
+        aimed = begun[~np.isnan(rows.bearing[begun])]
+        if number == OWN and aimed.size:
             numbers = (rows.bearing, rows.way, rows.bearing_std, rows.way_std)
-            points = tuple(column[begun] for column in numbers)
-            self.joint = with_points(self.joint, labels, points)
+            points = tuple(column[aimed] for column in numbers)
+            self.joint = with_points(self.joint, self.label[aimed].tolist(), points)
 
 
 METHODS = {"nearest": nearest, "marginal": marginal}

@@ -230,10 +230,6 @@ def drive_of(log: Log, truth: Truth) -> Drive:
 def without_unused(scan: Scan, config: Config) -> Scan:
     """Remove from a recorded scan the labels, noise and excess paths that the settings exclude."""
     known = config.association.method == KNOWN
-    if not known and (np.isnan(scan.bearing) & ~np.isnan(scan.range)).any():
-        found, expected = "a range without a bearing", "bearings, or known labels"
-        fix = "use --association.method known with the labels of the log"
-        raise refusal(f"scan at {scan.time} s", found, expected, fix)
     rows = scan if known or scan.direct.size else without_labels(scan, scan.callers)
     timing = config.listening.timing
     return without_hidden(rows, config.filter, timing=timing, known=known)
