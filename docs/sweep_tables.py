@@ -4,8 +4,8 @@ pipistrelle study sweeps -o SWEEPS
 pipistrelle study sweeps --emitter.call tone --beacon.call tone -o TONES
 python docs/sweep_tables.py SWEEPS TONES
 
-Of worlds that both studies have. `python docs/sweep_tables.py WORLDS` listens to so many of them,
-and prints how many rows sweeps give, and how many of these overlap.
+Of worlds and beams that both studies have. `python docs/sweep_tables.py WORLDS` listens to so many
+of them, and prints how many rows sweeps give, and how many of these overlap.
 """
 
 import sys
@@ -22,8 +22,6 @@ from pipistrelle.experiments.studies.plan import cases_of, find_plan, plan_of
 CENTRES = {"emitter.frequency": 47.5e3, "beacon.frequency": 25e3}
 TONES = {"emitter.call": "tone", "beacon.call": "tone"}
 CALLS = {"tones": TONES, "tones amid the bands": TONES | CENTRES, "sweeps": {}}
-BEAMS = (180, 33, 11)
-COLUMNS = [(way, beam) for way in ("active", "fused") for beam in BEAMS] + [("passive", None)]
 LABELS = {"known": "", "marginal": ", no labels"}
 
 
@@ -93,14 +91,39 @@ def associated(cell):
 
 def print_table(studies, title, cell, methods=tuple(LABELS)):
     """Print a table of both studies, all filters, with labels and without."""
-    heads = [f"{way} {beam}°" if beam else way for way, beam in COLUMNS]
+    beams = studies["sweeps"]["beamwidth_deg"].drop_nulls().round().unique().sort(descending=True)
+    columns = [(way, int(beam)) for way in ("active", "fused") for beam in beams] + [
+        ("passive", None)
+    ]
+    heads = [f"{way} {beam}°" if beam else way for way, beam in columns]
     print(f"\n| {title} | {' | '.join(heads)} |")
-    print("|---|" + "--:|" * len(COLUMNS))
+    print("|---|" + "--:|" * len(columns))
     for name, words in FILTERS.items():
         for method in methods:
             for call, trials in studies.items():
-                cells = [cell(chosen(trials, *column, name, method)) for column in COLUMNS]
+                cells = [cell(chosen(trials, *column, name, method)) for column in columns]
                 print(f"| {words}{LABELS[method]}, {call} | {' | '.join(cells)} |")
+
+
+def print_gains(studies, worlds, beam=33):
+    """Print the aligned error of fused relative to active sensing, and the trials that diverge."""
+    print(
+        f"\n| at {beam}° | fused / active, aligned | largest, fused [mm] | diverged, of {worlds} |"
+    )
+    print("|---|--:|--:|--:|")
+    for name, words in FILTERS.items():
+        for method in LABELS:
+            for call, trials in studies.items():
+                active, fused = (
+                    chosen(trials, way, beam, name, method) for way in ("active", "fused")
+                )
+                error = fused["position_rmse_aligned_m"].to_numpy()
+                off = np.log(error / active["position_rmse_aligned_m"].to_numpy())
+                print(
+                    f"| {words}{LABELS[method]}, {call} | {np.exp(off.mean()):.2f} ± "
+                    f"{np.exp(off.mean()) * off.std() / off.size**0.5:.2f} | "
+                    f"{1e3 * error.max():.0f} | {fused['diverged'].sum()} |"
+                )
 
 
 def main(*given):
@@ -116,6 +139,7 @@ def main(*given):
     print_table(studies, "position [m] (aligned [mm])", position)
     print_table(studies, "landmarks (map, aligned [mm])", landmarks)
     print_table(studies, "rows right; missed, false, twice", associated, ("marginal",))
+    print_gains(studies, len(both))
     print("\nCPU of a world's trials [s]:")
     for call, one in studies.items():
         print(f"  {call} {one['cpu_s'].sum() / len(both):.1f}")
