@@ -46,6 +46,7 @@ html_theme = "furo"
 html_title = f"Pipistrelle {version}"
 html_static_path = ["_static"]
 html_css_files = ["pages.css"]
+html_search_scorer = str(ROOT / "docs" / "search_scores.js")
 html_copy_source = False
 html_show_copyright = False
 
