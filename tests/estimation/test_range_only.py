@@ -9,8 +9,8 @@ from pipistrelle.config import Config, FilterConfig, InputError, RayConfig
 from pipistrelle.detection.scans import labelled, make_scan, with_columns, without_excess_paths
 from pipistrelle.estimation.catalogue import entry
 from pipistrelle.estimation.ekf.filter import EkfSlam, InvariantEkfSlam
-from pipistrelle.estimation.observations.losses import CAUCHY, HUBER, SQUARED, robust_loss
 from pipistrelle.estimation.observations.range import Ranges, located, refined
+from pipistrelle.estimation.observations.rows import CAUCHY, HUBER, SQUARED, robust_loss
 from pipistrelle.estimation.smoother.filter import Smoother
 from pipistrelle.estimation.smoother.preintegration import calibration_of
 from pipistrelle.evaluation.bound import path_bound, pose_bound

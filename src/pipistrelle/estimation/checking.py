@@ -32,7 +32,7 @@ from pipistrelle.detection.scans import (
 )
 from pipistrelle.estimation.beliefs import Gaussian, Landmarks
 from pipistrelle.estimation.motion import MOVED, Controls, Durations, Motion
-from pipistrelle.estimation.observations.losses import LOSSES
+from pipistrelle.estimation.observations.rows import LOSSES
 from pipistrelle.jit import Flag, Whole, kernel
 from pipistrelle.refusals import shown
 from pipistrelle.text_tables import TEXT_COLUMNS

@@ -130,7 +130,7 @@ class UpdateParams(NamedTuple):
     sharing: int
     """Update of hypotheses by a bearing: FEDERATED, AS_PRINTED (federated, other reading of the
     likelihood), EXACT (Gaussian mixture) or FITTED (federated, with ``spacing = "auto"``)."""
-    loss: int  # code of the robust loss (`losses.robust_loss`)
+    loss: int  # code of the robust loss (`rows.robust_loss`)
     rays_weigh: bool  # whether bearing-only landmarks weigh particles (`estimation.fastslam`)
 
 

@@ -26,8 +26,7 @@ from pipistrelle.estimation.motion import (
     motion_numbers,
     propagate_pose,
 )
-from pipistrelle.estimation.observations.losses import SQUARED
-from pipistrelle.estimation.observations.rows import caller_labels
+from pipistrelle.estimation.observations.rows import SQUARED, caller_labels
 from pipistrelle.estimation.smoother.elimination import (
     advance,
     correct,

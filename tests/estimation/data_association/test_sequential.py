@@ -88,7 +88,7 @@ def test_ranges_without_bearings_are_matched_with_the_map_and_begin_nothing(name
             heard = make_scan(k, np.full(far.size, UNLABELLED), nothing, range=far, range_std=0.02)
         session.hear(heard)
         truth.append(order + 1 if k else np.arange(1, 5))
-    first = {place: label for place, label in zip(truth[1], session.labels[1], strict=True)}
+    first = dict(zip(truth[1], session.labels[1], strict=True))
     found = np.concatenate(session.labels[6:])
     right = [first.get(place, UNLABELLED) for place in np.concatenate(truth[6:])]
     assert np.all((found == right) | (found == UNLABELLED))

@@ -73,14 +73,15 @@ from pipistrelle.estimation.ekf.gaussian import (
 )
 from pipistrelle.estimation.observations.bearing import observe
 from pipistrelle.estimation.observations.excess_path import excess_path_slopes
-from pipistrelle.estimation.observations.losses import SQUARED, robust_loss
 from pipistrelle.estimation.observations.range import NEAREST
 from pipistrelle.estimation.observations.rows import (
+    SQUARED,
     Columns,
     ExcessPaths,
     Row,
     Timings,
     excess_paths,
+    robust_loss,
     row_of,
     rows_with_bearing,
 )

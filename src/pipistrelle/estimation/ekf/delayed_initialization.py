@@ -57,7 +57,6 @@ from pipistrelle.estimation.observations.excess_path import (
     range_with_slopes,
     unscented_range,
 )
-from pipistrelle.estimation.observations.losses import SQUARED, robust_loss
 from pipistrelle.estimation.observations.range import (
     MIN_SPACING,
     NEAREST,
@@ -67,7 +66,7 @@ from pipistrelle.estimation.observations.range import (
     misfit,
     refined,
 )
-from pipistrelle.estimation.observations.rows import ExcessPaths, Row
+from pipistrelle.estimation.observations.rows import SQUARED, ExcessPaths, Row, robust_loss
 from pipistrelle.estimation.rays import FITTED, UpdateParams
 from pipistrelle.jit import Flag, Whole, kernel, no_alloc
 

@@ -69,8 +69,7 @@ from pipistrelle.estimation.ekf.gaussian import (
     shifted_covariance,
 )
 from pipistrelle.estimation.motion import Controls, Durations, Motion, Pose, motion_numbers
-from pipistrelle.estimation.observations.losses import LOSSES
-from pipistrelle.estimation.observations.rows import scan_columns, timings_of
+from pipistrelle.estimation.observations.rows import LOSSES, scan_columns, timings_of
 from pipistrelle.estimation.rays import update_params
 from pipistrelle.estimation.recovery import Recoverable, recovering
 from pipistrelle.jit import Whole, kernel

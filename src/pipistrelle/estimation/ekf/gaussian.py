@@ -12,7 +12,7 @@ which has no heading column in H: ``turns`` multiplies it, 0 for the
 invariant and 1 for the linear error.
 
 **Robust losses** (`inflated`): an innovation :math:`\nu` with the expected variance S has the
-factor f of `losses.robust_loss` at :math:`\nu^2 / S`, and
+factor f of `rows.robust_loss` at :math:`\nu^2 / S`, and
 
 .. math:: R' = R + S\,(f - 1)
 
@@ -61,9 +61,8 @@ from pipistrelle.estimation.motion import (
     propagate_pose,
 )
 from pipistrelle.estimation.observations.bearing import bearing_slopes, observe
-from pipistrelle.estimation.observations.losses import robust_loss
 from pipistrelle.estimation.observations.range import NEAREST, Slopes, range_slopes
-from pipistrelle.estimation.observations.rows import Row
+from pipistrelle.estimation.observations.rows import Row, robust_loss
 from pipistrelle.geometry import wrap_angle
 from pipistrelle.jit import Whole, kernel, no_alloc
 

@@ -10,7 +10,7 @@ of error covariance P place a landmark at a minimum of
           R = \operatorname{diag}(f_i \sigma_i^2) + U P U^T
 
 with the directions :math:`u_i` from the positions in U and the factors :math:`f_i` of a robust loss
-(`losses.robust_loss`). There :math:`dl = A^{-1} U^T R^{-1} (U\,dp + dd)` with the covariance
+(`rows.robust_loss`). There :math:`dl = A^{-1} U^T R^{-1} (U\,dp + dd)` with the covariance
 :math:`A^{-1} = (U^T R^{-1} U)^{-1}`. Errors that all positions share move the landmark, but do not
 change c; P is therefore of the positions relative to the newest.
 
@@ -32,7 +32,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float, Int
 
-from pipistrelle.estimation.observations.losses import robust_loss
+from pipistrelle.estimation.observations.rows import robust_loss
 from pipistrelle.jit import Whole, kernel, no_alloc
 
 NEAREST = 1e-3

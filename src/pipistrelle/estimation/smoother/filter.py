@@ -54,8 +54,8 @@ from pipistrelle.estimation.observations.bearing import MIN_CROSSING_SINE, obser
 from pipistrelle.estimation.observations.excess_path import (
     unscented_range,
 )
-from pipistrelle.estimation.observations.losses import LOSSES
 from pipistrelle.estimation.observations.range import is_certain
+from pipistrelle.estimation.observations.rows import LOSSES
 from pipistrelle.estimation.rays import gate_bounds
 from pipistrelle.estimation.recovery import recovering
 from pipistrelle.estimation.smoother.belief import SmootherBelief

@@ -33,7 +33,6 @@ from pipistrelle.detection.scans import (
 from pipistrelle.estimation.motion import SMALLEST_STD
 from pipistrelle.estimation.observations.bearing import bearing_slopes, observe
 from pipistrelle.estimation.observations.excess_path import excess_path_slopes
-from pipistrelle.estimation.observations.losses import robust_loss
 from pipistrelle.estimation.observations.range import (
     MIN_SPACING,
     NEAREST,
@@ -43,6 +42,7 @@ from pipistrelle.estimation.observations.range import (
     located,
     range_slopes,
 )
+from pipistrelle.estimation.observations.rows import robust_loss
 from pipistrelle.estimation.smoother.records import (
     CALLER,
     POSE,

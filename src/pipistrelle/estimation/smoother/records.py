@@ -281,7 +281,7 @@ class Places(NamedTuple):
 class NoiseModel(NamedTuple):
     """The smoother's robust loss, priors and noise of moving callers, and damping."""
 
-    loss: Whole  # code of the robust loss (`losses.robust_loss`)
+    loss: Whole  # code of the robust loss (`rows.robust_loss`)
     place_std: float  # std of a moving caller's initial position [m]
     speed_std: float  # std of a moving caller's initial velocity along each axis [m/s]
     walk_std: float  # std of a moving caller's velocity change after 1 s [m/s]
