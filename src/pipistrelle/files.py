@@ -18,6 +18,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from fnmatch import fnmatchcase
 from hashlib import file_digest, sha256
+from importlib import resources
 from pathlib import Path, PurePosixPath
 from tempfile import TemporaryDirectory, TemporaryFile, gettempdir
 from typing import get_args
@@ -31,6 +32,11 @@ _TURNS = {"LRE", "RLE", "LRO", "RLO", "PDF", "LRI", "RLI", "FSI", "PDI"}
 """Unicode classes of characters that embed, override or isolate a direction of writing."""
 _DESCRIPTORS = Path("/proc/self/fd")
 _PARTIAL = re.compile(r"(.+)\.[0-9a-f]{8}\.partial")
+
+
+def shipped_text(path: str) -> str:
+    """Return the text of a file of this package, such as the README of a kind of folder."""
+    return (resources.files("pipistrelle") / path).read_text(encoding="utf-8")
 
 
 def check_ordinary(path: Path) -> None:

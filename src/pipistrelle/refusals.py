@@ -15,6 +15,7 @@ from pipistrelle.config import InputError
 
 _PREFIXES = ("Value error, ", "Input should be ", "Value should ")
 _IN_WORDS = {"bool_parsing": "true or false", "bool_type": "true or false", "tuple_type": "a list"}
+_IN_WORDS |= {"dict_type": "a table"}
 """Replacements of pydantic messages in terms of Python."""
 
 

@@ -106,9 +106,9 @@ def assert_map(rows, known):
 class EstimatorContract:
     """Subclass it with a fixture `slam` that returns the filter to test."""
 
-    def heard(self, slam, *scans):
+    def heard(self, slam, *scans, first=FIRST):
         """The belief after some frames, each a drive and a scan."""
-        belief, generator = slam.update(slam.init(START), FIRST, rng()), rng()
+        belief, generator = slam.update(slam.init(START), first, rng()), rng()
         for scan in scans:
             belief, _ = slam.predict(belief, CONTROLS, DT, generator)
             belief = slam.update(belief, scan, generator)
@@ -145,7 +145,16 @@ class EstimatorContract:
         for k in range(STEPS_PER_FRAME):
             belief, pose = slam.predict(belief, CONTROLS[k : k + 1], DT[k : k + 1], generator)
             np.testing.assert_allclose(pose.mean[0], poses.mean[k], rtol=0, atol=1e-9)
+            np.testing.assert_allclose(pose.covariance[0], poses.covariance[k], rtol=0, atol=1e-12)
         np.testing.assert_allclose(belief.pose().mean, together.pose().mean, rtol=0, atol=1e-9)
+
+    def test_labels_are_only_names(self, slam):
+        first, *rest = (replace(s, landmark=1000 - s.landmark) for s in (FIRST, SECOND, THIRD))
+        here, there = self.heard(slam, SECOND, THIRD), self.heard(slam, *rest, first=first)
+        np.testing.assert_array_equal(there.pose().mean, here.pose().mean)
+        np.testing.assert_array_equal(there.pose().covariance, here.pose().covariance)
+        names = np.unique(1000 - there.landmarks().landmark)
+        np.testing.assert_array_equal(names, np.unique(here.landmarks().landmark))
 
     def test_no_controls_move_nothing(self, slam):
         before = self.heard(slam, SECOND)

@@ -237,11 +237,6 @@ def test_a_changed_file_is_refused_by_name_and_no_folder_is_left(refused, missio
     assert not Path("out").exists()
 
 
-def test_a_comparison_is_not_compared(refused, obey, missions):
-    obey("compare", "one", "two", "-o", "out", "--quiet")
-    assert refused("compare", "one", "out").startswith("out: found a comparison")
-
-
 def test_a_figure_that_cannot_be_drawn_leaves_no_folder(obey, missions, monkeypatch):
     def spoilt(*_):
         raise KeyboardInterrupt

@@ -128,17 +128,6 @@ def test_an_empty_path_is_rejected(refused, words, said):
     assert said in refused(*words)
 
 
-def test_slam_names_the_kind_of_a_result_folder(refused):
-    for title in ("results", "a report"):
-        Path("d").mkdir(exist_ok=True)
-        Path("d/summary.json").touch()
-        Path("d/SHA256SUMS").write_text(f"# Of Pipistrelle: {title}\n{'0' * 64}  summary.json\n")
-        assert f"d: found {title}, expected a log folder" in refused("slam", "d")
-    Path("s/trials").mkdir(parents=True)
-    Path("s/plan.toml").touch()
-    assert "s: found a study" in refused("slam", "s")
-
-
 def test_a_users_list_of_checksums_is_recognised_as_foreign(refused):
     Path("d").mkdir()
     Path("d/SHA256SUMS").write_text(f"{'0' * 64}  notes.txt\n")

@@ -136,7 +136,7 @@ def nearest_motion(
     >>> nearest_motion(np.ones((1, 2)), np.full((1, 2), 5.0), [STAY, np.array([4.0, 4.0, 0.0])])
     array([4., 4., 0.])
     """
-    return min(motions, key=lambda motion: gospa(moved(points, motion), true).distance)
+    return min(motions, key=lambda motion: gospa(moved(points, motion), true)[0])
 
 
 def matched(
@@ -231,37 +231,26 @@ def map_counts(
     return len(found.heard - {*true}), len(named) - len(true), len(true) - len({*true})
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Gospa:
-    """GOSPA distance between two sets of points, with its error, missed and false points."""
-
-    distance: float
-    """[m]."""
-    error: float
-    """Root of the sum of squared distances of pairs [m]."""
-    missed: int
-    false: int
-
-
 def gospa(
     points: Float[np.ndarray, "n 2"], true: Float[np.ndarray, "k 2"], cutoff: float = CUTOFF
-) -> Gospa:
+) -> tuple[float, float, int, int]:
     r"""Return the generalised optimal sub-pattern assignment metric of two sets of points.
 
     .. math:: d^2 = \min_\pi \sum_{(i, j) \in \pi} |x_i - y_j|^2
               + \tfrac{c^2}{2} (n_{missed} + n_{false})
 
-    over all sets of pairs nearer than the cutoff c (p = 2, alpha = 2).
+    over all sets of pairs nearer than the cutoff c (p = 2, alpha = 2). Returns: d [m], the root of
+    the sum of squared distances of pairs [m], and the numbers of missed and of false points.
 
     Rahmathullah, Garcia-Fernandez & Svensson, International Conference on Information Fusion
     (2017).
 
-    >>> found = gospa(np.array([[0.0, 1.0], [9.0, 9.0]]), np.zeros((1, 2)))
-    >>> round(found.distance**2, 9), found.error, found.missed, found.false
-    (3.0, 1.0, 0, 1)
+    >>> distance, *rest = gospa(np.array([[0.0, 1.0], [9.0, 9.0]]), np.zeros((1, 2)))
+    >>> round(distance**2, 9), rest
+    (3.0, [1.0, 0, 1])
     """
     _, _, pairs = pairs_of(points, true, cutoff)
     missed, false = len(true) - pairs.size, len(points) - pairs.size
     total = float(pairs.sum())
     distance = np.sqrt(total + 0.5 * cutoff**2 * (missed + false))
-    return Gospa(distance=float(distance), error=float(np.sqrt(total)), missed=missed, false=false)
+    return float(distance), float(np.sqrt(total)), missed, false

@@ -40,7 +40,7 @@ from pipistrelle.experiments.results.reading import (
 from pipistrelle.experiments.studies.plan import RADIUS, Plan, PlannedCase, cases_of, plan_settings
 from pipistrelle.experiments.studies.study import load_finished
 from pipistrelle.experiments.studies.world import cell_of
-from pipistrelle.files import OwnFiles, drawn_files, read_file, spelt, without_links
+from pipistrelle.files import OwnFiles, drawn_files, read_file, shipped_text, spelt, without_links
 from pipistrelle.geometry import wrap
 from pipistrelle.settings import known_settings, leaves
 
@@ -57,25 +57,6 @@ ROUNDING = 1e-6
 """Paths that differ by less are of the same drive [m, rad]."""
 NOT_SCORES = ("strategy", "filter", "ignored_rows", "online")
 """Other entries of an estimate in ``summary.json``."""
-README = """\
-# A comparison
-
-    {command}
-
-Pipistrelle {version}. SI units and radians; what ends in _deg is in degrees. A difference is that
-of a folder less the first, A.
-
-{folders}
-
-{notes}
-
-| file | what it holds |
-|---|---|
-| comparison.csv, comparison.parquet | {table} |
-| settings.csv | the settings that differ, a column for each folder; empty: it says nothing |
-| comparison.png, comparison.pdf | {figure} |
-| SHA256SUMS | what was written here: `--overwrite` touches nothing else (`sha256sum -c`) |
-"""
 MISSIONS = (
     "a row for each estimate, folder and score",
     "the paths, as they are and each after the rigid motion that brings it nearest to its truth "
@@ -627,7 +608,7 @@ def write_comparison(
     buffer, table = io.BytesIO(), comparison_table(compared)
     table.write_parquet(buffer)
     content, figure = MISSIONS if isinstance(compared, ComparedMissions) else STUDIES
-    text = README.format(
+    text = shipped_text("experiments/comparison_readme.md").format(
         command=command,
         version=__version__,
         folders="\n".join(f"- {x}: {_quoted(spelt(f))}" for x, f in compared.folders.items()),

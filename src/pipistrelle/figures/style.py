@@ -1,5 +1,6 @@
 """The style of all figures and pages: colours, sizes of type; figures saved, pages filled in."""
 
+import tomllib
 from collections.abc import Callable, Mapping
 from importlib.resources import files
 from io import BytesIO
@@ -7,7 +8,7 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any
 
-from pipistrelle.files import upright
+from pipistrelle.files import shipped_text, upright
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -18,54 +19,15 @@ INK = "#333333"
 """Colour of text, beacon and strategies that are not in `STRATEGY_COLOURS`."""
 TRUTH = "#8a8a8a"
 """Colour of the true path and landmarks."""
-PAGE = {
-    "paper": ("#fbfaf7", "#14171b"),
-    "card": ("#ffffff", "#1b1f24"),
-    "ink": ("#22262b", "#e8e6e1"),
-    "soft": ("#5d646d", "#a3a9b1"),
-    "line": ("#e3e0d8", "#30353c"),
-    "grid": ("#e9e7e1", "#2a2f36"),
-    "truth": (TRUTH, "#9a9fa6"),
-    "span": ("#dcd9d1", "#343a42"),
-    "accent": ("#b8384b", "#f2838f"),
-    "good": ("#1c7a4d", "#6fcf9c"),
-    "bad": ("#b3363f", "#f08b92"),
-    "wait": ("#80630f", "#e0bd5c"),
-    "good-wash": ("#e6f3ec", "#17301f"),
-    "bad-wash": ("#fae9ea", "#3a1d20"),
-    "wait-wash": ("#f8f0da", "#332a12"),
-    "active": (STRATEGY_COLOURS["active"], "#7fb0f2"),
-    "fused": (STRATEGY_COLOURS["fused"], "#f2838f"),
-    "passive": (STRATEGY_COLOURS["passive"], "#f0bd45"),
-}
-"""Colours of a page in its light and its dark scheme."""
 MAX_COLUMNS = 3
 """Most panels in a row."""
 
-STYLE = {
-    "font.family": "DejaVu Sans",
-    "font.size": 9.0,
-    "axes.edgecolor": "#9a9a9a",
-    "axes.labelcolor": INK,
-    "axes.linewidth": 0.7,
-    "axes.spines.right": False,
-    "axes.spines.top": False,
-    "grid.color": "#e4e4e4",
-    "grid.linewidth": 0.6,
-    "text.color": INK,
-    "xtick.color": INK,
-    "ytick.color": INK,
-    "xtick.labelsize": 8.0,
-    "ytick.labelsize": 8.0,
-    "xtick.major.size": 2.5,
-    "ytick.major.size": 2.5,
-    "ytick.minor.size": 0.0,
-    "legend.frameon": False,
-    "legend.fontsize": 8.5,
-    "lines.solid_capstyle": "round",
-    "pdf.fonttype": 42,
-}
+STYLE = tomllib.loads(shipped_text("figures/style.toml"))
 """Settings of matplotlib while a figure is made or saved."""
+
+
+UNDATED = {".png": "Software", ".pdf": "CreationDate", ".svg": "Date"}
+"""Entry of each kind of picture that would differ from file to file."""
 
 
 def picture(width: float, height: float) -> "Figure":
@@ -84,16 +46,6 @@ def picture(width: float, height: float) -> "Figure":
 def strategy_colour(strategy: str) -> str:
     """Return the colour of a sensing strategy, the same in every figure."""
     return STRATEGY_COLOURS.get(strategy, INK)
-
-
-def page_colours() -> str:
-    """Return the colours of an HTML page as CSS variables, for light and dark schemes."""
-    light, dark = (
-        " ".join(f"--{name}: {colours[scheme]};" for name, colours in PAGE.items())
-        for scheme in (0, 1)
-    )
-    dark = f"@media (prefers-color-scheme: dark) {{ :root {{ {dark} }} }}"
-    return f":root {{ {light} }}\n{dark}"
 
 
 def page_of(
@@ -119,7 +71,7 @@ def page_of(
     text = environment.from_string(read("page.html")).render(
         style=Markup(read("page.css")),
         script=Markup("".join(map(read, scripts))),
-        colours=Markup(page_colours()),
+        colours=Markup(shipped_text("figures/colours.css")),
         **values,
     )
     return upright(text)
@@ -137,11 +89,19 @@ def save_figure(figure: "Figure", folder: Path, name: str) -> tuple[Path, Path]:
     >>> [path.name for path in save_figure(Figure(), Path(mkdtemp()), "mission")]
     ['mission.png', 'mission.pdf']
     """
-    import matplotlib
-
     folder.mkdir(parents=True, exist_ok=True)
     png, pdf = folder / f"{name}.png", folder / f"{name}.pdf"
-    with matplotlib.rc_context(STYLE):
-        figure.savefig(png, dpi=160, metadata={"Software": None})
-        figure.savefig(pdf, metadata={"CreationDate": None})
+    for path in (png, pdf):
+        path.write_bytes(picture_bytes(figure, path.suffix))
     return png, pdf
+
+
+def picture_bytes(figure: "Figure", ending: str) -> bytes:
+    """Return a figure as a file that ends in .png, .pdf or .svg; equal figures give equal bytes."""
+    import matplotlib
+
+    file = BytesIO()
+    with matplotlib.rc_context(STYLE | {"svg.hashsalt": "figure"}):
+        dpi = 160 if ending == ".png" else "figure"
+        figure.savefig(file, format=ending[1:], dpi=dpi, metadata={UNDATED[ending]: None})
+    return file.getvalue()

@@ -24,11 +24,7 @@ from pipistrelle.report import sentences as paper
 from pipistrelle.report.study import (
     COMMON,
     LANDMARKS,
-    MAP,
-    MAP_ALIGNED,
-    NEES,
     POSITION,
-    POSITION_ALIGNED,
     Selection,
     Study,
     Way,
@@ -198,37 +194,6 @@ class Level:
     """Whether the axis is logarithmic, with means and deviations of logarithms."""
 
 
-_OWN: dict[str, dict[str, Any]] = {
-    POSITION_ALIGNED: {
-        "more": ". Each path after the rigid motion that fits it best: without the one turn of "
-        "everything that is most of the raw error"
-    },
-    MAP: {"score": COMMON, "title": "Map RMSE of the landmarks that every strategy has placed"},
-    MAP_ALIGNED: {
-        "title": "Map RMSE of each strategy's own landmarks, aligned",
-        "more": ". Each map after the rigid motion that fits it best; strategies place different "
-        "landmarks",
-    },
-    LANDMARKS: {
-        "name": "landmarks",
-        "column": "landmarks",
-        "caption": "Fully initialised landmarks at the end, mean ± σ over worlds; dashed: fully "
-        "and partially initialised, mean",
-        "beside": "landmarks_total",
-        "named": "total",
-        "worlds": False,
-    },
-    NEES: {
-        "name": "nees",
-        "column": "nees",
-        "caption": "Geometric mean over worlds, within a factor of one σ either way; a consistent "
-        "filter's is 3, and less after a start that is exact and thought uncertain",
-        "worlds": False,
-    },
-}
-"""Attributes of single charts that the table of scores lacks."""
-
-
 def levels() -> tuple[Level, ...]:
     """Return the descriptions of all charts that show a score over a variable."""
     return tuple(_level(name, score) for name, score in shown_in("levels").items())
@@ -249,7 +214,7 @@ def _level(name: str, score: Score) -> Level:
         "beside": score.bound,
         "log": score.ratio,
     }
-    return Level(**drawn | _OWN.get(name, {}))
+    return Level(**drawn | dict(score.chart))
 
 
 def level_charts(selection: Selection, only: str = "") -> list[Chart]:

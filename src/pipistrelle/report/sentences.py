@@ -17,6 +17,7 @@ Standard deviations, maxima and other statistics of all worlds are jackknifed
 """
 
 import math
+import tomllib
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from functools import partial
 from itertools import product
@@ -30,6 +31,7 @@ from pipistrelle.estimation.catalogue import PAPERS, entry
 from pipistrelle.evaluation.comparison import Relation, Statement, pooled_std, pseudovalues
 from pipistrelle.evaluation.consistency import anees_departure
 from pipistrelle.evaluation.scores import SCORES
+from pipistrelle.files import shipped_text
 from pipistrelle.report.study import (
     COMMON,
     HEADING,
@@ -78,16 +80,8 @@ class Printed(NamedTuple):
     """Fully and partially initialised landmarks."""
 
 
-TABLE_II = (
-    Printed("ekf", 180.0, full=(37.7, 2.9), total=(43.7, 2.6)),
-    Printed("ekf", 33.2, full=(31.9, 3.3), total=(40.8, 3.2)),
-    Printed("ekf", 11.4, full=(30.0, 3.3), total=(40.1, 3.2)),
-    Printed("ekf", 0.0, full=(26.6, 3.3), total=(39.5, 3.4)),
-    Printed("fastslam", 180.0, full=(39.3, 2.8), total=(43.7, 2.4)),
-    Printed("fastslam", 33.2, full=(32.6, 3.3), total=(40.7, 3.1)),
-    Printed("fastslam", 11.4, full=(30.5, 3.2), total=(40.2, 3.1)),
-    Printed("fastslam", 0.0, full=(22.1, 4.9), total=(39.4, 3.3)),
-)
+_PAPER = tomllib.loads(shipped_text("report/paper.toml"))
+TABLE_II = tuple(Printed(**row) for row in _PAPER["table_ii"])
 """Bradley & Abaid, Table II."""
 FITTED = {
     ("ekf", "total", 180.0),
@@ -471,18 +465,7 @@ _LARGEST = tuple(
     if way != ("fastslam", PASSIVE)
 )  # fmt: skip
 _OF_BOTH = {way: tuple(((name, way),) for name in FILTERS) for way in STRATEGIES}
-CLAIMS = {
-    1: "Landmarks number and vary as in Table II, within its σ.",
-    2: "EKF-SLAM is more consistent than FastSLAM 2.0; ANEES swings with the laps and rises.",
-    3: "EKF-SLAM has the lower errors of the vehicle everywhere; passive sensing has the highest "
-       "position RMSE.",
-    4: "With EKF-SLAM, fused beats active in position below about 42°, on average but not "
-       "significantly, and in heading at every beamwidth.",
-    5: "With FastSLAM 2.0, fused never beats active in position.",
-    6: "Fused tends to passive as the beam narrows.",
-    7: "In map RMSE, fused never beats active, is mostly within about one σ, and follows passive.",
-    8: "Passive sees more landmarks than active at every beamwidth, by at least one σ below 65°.",
-}  # fmt: skip
+CLAIMS = {int(number): claim for number, claim in _PAPER["claims"].items()}
 """The paper's claims by number: each is a group of sentences."""
 _TABLE: tuple[tuple[int | None, str, str, tuple[Comparisons | Part, ...]], ...] = (
     (None, "V-A", "EKF-SLAM: 8 of the 115 worlds are excluded.", (_lost("ekf"),)),

@@ -12,6 +12,7 @@ in the numbers of the log, so that units and columns do not matter: half the pri
 that the earlier scan lacks the landmark, and :math:`p_0` is uniform over the recorded numbers.
 """
 
+import tomllib
 from collections.abc import Iterator, Sequence
 from math import ceil, floor, hypot, inf, log10, pi, radians, sqrt, tau
 from pathlib import Path
@@ -28,6 +29,7 @@ from pipistrelle.estimation.data_association.watch import POSE
 from pipistrelle.estimation.motion import relative_motions
 from pipistrelle.experiments.named_settings import own_config
 from pipistrelle.experiments.runs.replay import log_motion
+from pipistrelle.files import shipped_text
 from pipistrelle.geometry import wrap
 from pipistrelle.scripting.arguments import has_excess_paths
 
@@ -47,7 +49,6 @@ MIN_EXCESS_PATH = 0.2
 UNSURE = {"bearing_std": ("bearings", "rad", WIDEST), "way_std": ("ranges", "m", inf)}
 """Settings by which an association discards rows: the measured numbers, their unit, and the largest
 standard deviation for which a larger value is advised."""
-DEGREE = pi / 180.0
 COMPARED = 32
 """Most scans, and most rows of a scan, that are compared with earlier scans."""
 LAGS = 2 ** np.arange(10)
@@ -164,6 +165,18 @@ def fit_warnings(
     questions += wide + odd["excess paths"]
     notes += [f"{found}; {question}" for found, question in questions]
     return [f"{log}: {note}" for note in (*notes, *dict.fromkeys(_unsure(trials, config)))]
+
+
+def early_warnings(recorded: "Log", truth: "Truth", log: Path) -> list[str]:
+    """Return all warnings about a log that need no solution, with a mistake in its columns."""
+    lines, odd = log_warnings(recorded, truth, log), fit_warnings(recorded, (), log, Config())
+    mistake = "" if odd else misreading(recorded)[0]
+    return [*lines, *odd, *([f"{log}: {mistake}"] if mistake else [])]
+
+
+def dead_reckoned(recorded: "Log") -> Float[np.ndarray, "t 3"]:
+    """Return the poses of the vehicle by its odometry only, from the log's initial pose."""
+    return _path(recorded, NONE.rate)[1] + [*recorded.initial_pose[:2], 0.0]
 
 
 def _units(recorded: "Log") -> str:
@@ -335,59 +348,17 @@ class Mistake(NamedTuple):
 
 
 NONE = Mistake("", "", "")
-MISTAKES = (
-    Mistake(
-        "bearings seem to be clockwise", "negated",
-        "negate the bearings (or the turns of the odometry, if these are clockwise)", turn=-1.0,
-    ),
-    Mistake(
-        "bearings seem to be in degrees", "in radians", "multiply them by pi / 180", turn=DEGREE
-    ),
-    Mistake(
-        "bearings seem to be in degrees and clockwise", "in radians and negated",
-        "multiply them by -pi / 180", turn=-DEGREE,
-    ),
-    Mistake(
-        "bearings and ranges seem to be swapped", "exchanged", "exchange the two columns",
-        swapped=True,
-    ),
-    Mistake(
-        "bearings and ranges seem to be swapped, and bearings in degrees", "exchanged, in radians",
-        "exchange the two columns, and multiply the bearings by pi / 180", turn=DEGREE,
-        swapped=True,
-    ),
-    Mistake(
-        "bearings seem to be from the rear of the vehicle", "turned by pi",
-        "add pi to them, or to the angle of sensor_pose", offset=pi,
-    ),
-    Mistake(
-        "bearings seem to be from the x axis of the map", "less the heading",
-        "subtract the vehicle's heading", from_map=True,
-    ),
-    Mistake(
-        "bearings seem to be of a compass, clockwise from the y axis", "from the heading",
-        "subtract them and the vehicle's heading from pi / 2", turn=-1.0, offset=0.5 * pi,
-        from_map=True,
-    ),
-    Mistake(
-        "bearings seem to be of a compass, in degrees from the y axis", "from the heading",
-        "subtract them and the vehicle's heading from 90 degrees, in radians", turn=-DEGREE,
-        offset=0.5 * pi, from_map=True,
-    ),
-    Mistake("ranges seem to be in millimetres", "in metres", "divide them by 1000", scale=1e-3),
-    Mistake("ranges seem to be in centimetres", "in metres", "divide them by 100", scale=1e-2),
-    Mistake("ranges seem to be in kilometres", "in metres", "multiply them by 1000", scale=1e3),
-    Mistake(
-        "the odometry seems to turn in degrees", "in radians",
-        "multiply its angles by pi / 180", rate=DEGREE,
-    ),
-)  # fmt: skip
+MISTAKES = tuple(
+    Mistake(**row) for row in tomllib.loads(shipped_text("scripting/mistakes.toml"))["mistake"]
+)
 """The mistakes that `misreading` tries."""
 
 
 _Path = tuple[Float[np.ndarray, "t 3"], Float[np.ndarray, "t 3"], Float[np.ndarray, "t-1 3 3"]]
 """Poses of sensor and vehicle by dead reckoning, and the covariance of each step's motion in the
 axes of the map."""
+_Driven = tuple[_Path, Float[np.ndarray, "3 3"]]
+"""A path, and the covariance of the sensor's motion between two steps (`_drift`)."""
 
 
 class _Rows(NamedTuple):
@@ -445,15 +416,18 @@ def _fits(recorded: "Log") -> tuple[Int[np.ndarray, " k"], Float[np.ndarray, "k 
         values = np.concatenate([getattr(scan, name) for scan in rows])
         values = values[~np.isnan(values)]
         spans.append(max(float(np.ptp(values)) if values.size else 0.0, least))
-    paths = {mistake.rate: _path(recorded, mistake.rate) for mistake in (NONE, *MISTAKES)}
+    rates = {mistake.rate for mistake in (NONE, *MISTAKES)}
+    paths = {rate: _path(recorded, rate) for rate in rates}
     scans, fits = [], []
     chosen = np.linspace(1, len(rows) - 1, COMPARED if len(rows) > 1 else 0)
     for n in np.unique(chosen.round().astype(int)):
         later = _some(rows[n], np.linspace(0, rows[n].label.size - 1, COMPARED))
         fit = np.zeros((later.label.size, 1 + len(MISTAKES)))
         for earlier in (rows[n - lag] for lag in LAGS if lag <= n):
+            drift = {rate: _drift(path, earlier.step, later.step) for rate, path in paths.items()}
             for h, mistake in enumerate((NONE, *MISTAKES)):
-                fit[:, h] += _log_ratio(earlier, later, mistake, paths[mistake.rate], spans)
+                path = paths[mistake.rate], drift[mistake.rate]
+                fit[:, h] += _log_ratio(earlier, later, mistake, path, spans)
         scans.append(np.full(len(fit), n))
         fits.append(fit)
     scan, fit = np.concatenate([np.empty(0, int), *scans]), np.concatenate(fits) if fits else []
@@ -504,6 +478,15 @@ def _path(recorded: "Log", rate: float) -> _Path:
     return *poses, axes @ noise @ axes.transpose(0, 2, 1)
 
 
+def _drift(path: _Path, begin: int, step: int) -> Float[np.ndarray, "3 3"]:
+    """Return the covariance of the sensor's motion between two steps, in the axes of the map."""
+    sensor, vehicle, noise = path
+    lever = sensor[step, :2] - vehicle[begin + 1 : step + 1, :2]
+    J = np.tile(np.eye(3), (len(lever), 1, 1))
+    J[:, 0, 2], J[:, 1, 2] = -lever[:, 1], lever[:, 0]
+    return np.tensordot(J @ noise[begin:step], J, axes=((0, 2), (0, 2)))
+
+
 def _undone(
     rows: _Rows, mistake: Mistake, heading: float
 ) -> tuple[Float[np.ndarray, " m"], Float[np.ndarray, " m"]]:
@@ -516,14 +499,14 @@ def _undone(
 
 
 def _expected(
-    earlier: _Rows, mistake: Mistake, path: _Path, step: int
+    earlier: _Rows, mistake: Mistake, path: _Driven, step: int
 ) -> tuple[Float[np.ndarray, "5 n"], Int[np.ndarray, " n"]]:
     """Predict the measurements at a later step from an earlier scan; return also their labels.
 
     The prediction is a bearing, a range, and the entries bb, rb and rr of their covariance.
     """
-    (sensor, vehicle, noise), begin = path, earlier.step
-    now, before = sensor[step], sensor[begin]
+    (sensor, *_), P = path
+    now, before = sensor[step], sensor[earlier.step]
     b, r = _undone(earlier, mistake, before[2])
     ranged = np.isfinite(b) & (r > 0.0)
     b, r, variance = b[ranged], r[ranged], earlier.variance[:, ranged]
@@ -536,10 +519,6 @@ def _expected(
     along, across = variance[1], r**2 * variance[0]
     to_range = np.column_stack((-u, np.zeros(len(u))))
     to_bearing = np.column_stack((-normal / distance[:, np.newaxis], -np.ones(len(u))))
-    lever = now[:2] - vehicle[begin + 1 : step + 1, :2]
-    J = np.tile(np.eye(3), (len(lever), 1, 1))
-    J[:, 0, 2], J[:, 1, 2] = -lever[:, 1], lever[:, 0]
-    P = np.einsum("tij,tjk,tlk->il", J, noise[begin:step], J)
 
     def moved(one: np.ndarray, other: np.ndarray) -> np.ndarray:
         return np.einsum("ni,ij,nj->n", one, P, other)
@@ -553,11 +532,11 @@ def _expected(
 
 @np.errstate(over="ignore", under="ignore")
 def _log_ratio(
-    earlier: _Rows, later: _Rows, mistake: Mistake, path: _Path, spans: Sequence[float]
+    earlier: _Rows, later: _Rows, mistake: Mistake, path: _Driven, spans: Sequence[float]
 ) -> Float[np.ndarray, " m"]:
     """Return a log-likelihood ratio per row: predicted by an earlier scan, or by chance."""
     (b, r, bb, rb, rr), label = _expected(earlier, mistake, path, later.step)
-    bearing, distance = _undone(later, mistake, path[0][later.step, 2])
+    bearing, distance = _undone(later, mistake, path[0][0][later.step, 2])
     db, dr = wrap(bearing[:, np.newaxis] - b), distance[:, np.newaxis] - r
     bb, rr = later.variance[0][:, np.newaxis] + bb, later.variance[1][:, np.newaxis] + rr
     determinant = rr * bb - rb * rb

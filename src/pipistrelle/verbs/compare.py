@@ -7,7 +7,14 @@ from typing import TYPE_CHECKING, Annotated, Any
 from cyclopts import Parameter
 
 from pipistrelle.evaluation.scores import heading, shown_in
-from pipistrelle.verbs.console import announced, command_line, listening, text_table
+from pipistrelle.verbs.console import (
+    announced,
+    command_line,
+    listening,
+    number,
+    output_to,
+    text_table,
+)
 from pipistrelle.verbs.streams import put, say
 
 
@@ -16,14 +23,9 @@ def report(
     /,
     *,
     output: Annotated[
-        Path | None,
-        Parameter(
-            name=("--output", "-o"),
-            metavar="DIR",
-            help="Where index.html, summary.json and the figures go. [default: FOLDER/report]",
-        ),
+        Path | None, output_to("DIR", "The page and figures.", "FOLDER/report")
     ] = None,
-    quiet: Annotated[bool, Parameter(negative=(), help="Print only the path of the page.")] = False,
+    quiet: Annotated[bool, Parameter(help="Print only the path of the page.")] = False,
 ) -> None:
     """Write a study's report: a page that answers its question and judges the paper's claims."""
     from pipistrelle.evaluation.comparison import INTERVALS
@@ -93,22 +95,12 @@ def compare(
     *folders: Annotated[
         Path, Parameter(help="Folders of `run` or `slam`, or of studies; two or more.")
     ],
-    output: Annotated[
-        Path | None,
-        Parameter(
-            name=("--output", "-o"),
-            metavar="DIR",
-            help="Keep all numbers and a figure there. [default: print the tables alone]",
-        ),
-    ] = None,
-    overwrite: Annotated[
-        bool, Parameter(negative=(), help="Replace an earlier comparison in DIR.")
-    ] = False,
+    output: Annotated[Path | None, output_to("DIR", "Keep all numbers and a figure there.")] = None,
+    overwrite: Annotated[bool, Parameter(help="Replace an earlier comparison in DIR.")] = False,
     drop_diverged: Annotated[
-        bool,
-        Parameter(negative=(), help="Of studies: leave out worlds in which either case diverged."),
+        bool, Parameter(help="Of studies: leave out worlds in which either case diverged.")
     ] = False,
-    quiet: Annotated[bool, Parameter(negative=(), help="Print the result folder alone.")] = False,
+    quiet: Annotated[bool, Parameter(help="Print only the result folder.")] = False,
 ) -> None:
     """Compare result folders in tables and a figure, each folder with the first."""
     from pipistrelle.config import InputError
@@ -213,7 +205,7 @@ def _mission_tables(compared: "ComparedMissions") -> Iterator[str]:
                 words = ("-" if v is None else "yes" if v else "no" for v in values)
                 rows.append([heading(score), *words, *[""] * (len(letters) - 1)])
             elif any(value is not None for value in values):
-                cells = [_number(value, score.digits) for value in values]
+                cells = [number(value, score.digits, "-") for value in values]
                 gaps = [_signed(less(value, values[0]), score.digits) for value in values[1:]]
                 rows.append([heading(score), *cells, *gaps])
         yield text_table("", heads, rows)
@@ -235,8 +227,8 @@ def _study_tables(compared: "ComparedStudies") -> Iterator[str]:
             lost = row["diverged_first"], row["diverged"]
             rows.append([
                 row["case"] + f", {row['letter']}" * several,
-                _number(row["mean_first"], digits),
-                _number(row["mean"], digits),
+                number(row["mean_first"], digits, "-"),
+                number(row["mean"], digits, "-"),
                 _signed(row["difference"], digits),
                 f"{_signed(low, digits)} to {_signed(high, digits)}" if known else "-",
                 "*" * (row["p"] < SIGNIFICANCE) + "~" * (not row["paired"]),
@@ -248,14 +240,7 @@ def _study_tables(compared: "ComparedStudies") -> Iterator[str]:
             yield text_table("", [[*heads, "diverged"]], rows)
 
 
-def _number(value: float | None, digits: int) -> str:
-    """Format a number with `digits` decimals, or fewer digits if huge; a dash if missing."""
-    if value is None or value != value:
-        return "-"
-    return f"{value:.{digits}f}" if abs(value) < 1e5 else f"{value:.3g}"
-
-
 def _signed(value: float | None, digits: int) -> str:
     """Format a difference with a plus or minus sign."""
-    text = _number(value, digits)
+    text = number(value, digits, "-")
     return text if text.startswith("-") else f"+{text}"

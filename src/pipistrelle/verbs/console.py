@@ -12,6 +12,8 @@ from textwrap import fill
 from threading import Timer
 from typing import TYPE_CHECKING, Any
 
+from cyclopts import Parameter
+
 from pipistrelle.estimation.catalogue import short_name
 from pipistrelle.evaluation.scores import heading, shown_in
 from pipistrelle.files import spelt
@@ -39,6 +41,12 @@ ALIGNED = {
 def command_line() -> str:
     """Return the command line of this process as text, with undecodable bytes escaped."""
     return spelt(shlex.join(["pipistrelle", *sys.argv[1:]]))
+
+
+def output_to(metavar: str, words: str, default: str = "") -> Parameter:
+    """Return the option ``-o`` of a verb, with its placeholder and its help text."""
+    words += f" [default: {default}]" * bool(default)
+    return Parameter(name=("--output", "-o"), metavar=metavar, help=words)
 
 
 @contextmanager
@@ -182,11 +190,11 @@ def _cells(
     """Yield title and text of each score of an estimate; the text is "" if it is missing."""
     s = trial.scores
     for name, score in shown_in("mission").items():
-        yield heading(score), _number(getattr(s, name), score.digits)
+        yield heading(score), number(getattr(s, name), score.digits)
     yield "landmarks, placed / heard", f"{s.landmarks_full} / {s.landmarks_total}"
     yield "landmarks in the world", "" if count is None else str(count)
-    yield "fully placed, particles' mean", _number(trial.track.full, 1)
-    yield "measurements per frame", _number(s.measurements_per_frame, 2)
+    yield "fully placed, particles' mean", number(trial.track.full, 1)
+    yield "measurements per frame", number(s.measurements_per_frame, 2)
     yield "rejected by the gate", str(s.gated or "")
     yield from _without_truth(trial, driven)
     for name, (value, std) in trial.track.calibration.items():
@@ -203,16 +211,16 @@ def _without_truth(trial: "TrialResult", driven: float | None) -> Iterator[tuple
     scored = trial.scores.position_rmse_m is not None
     share = None if scored or not measurements else 100.0 * trial.scores.gated / measurements
     spread = float(pose.covariance[-1, 0, 0] + pose.covariance[-1, 1, 1])
-    yield NIS_TITLE, _number(None if scored else trial.scores.nis_mean, 2)
-    yield "rejected by the gate [%]", _number(share, 2)
-    yield "final position, 1 sigma [m]", _number(None if scored else sqrt(max(spread, 0.0)), 3)
-    yield "driven, by the odometry [m]", _number(None if scored else driven, 1)
+    yield NIS_TITLE, number(None if scored else trial.scores.nis_mean, 2)
+    yield "rejected by the gate [%]", number(share, 2)
+    yield "final position, 1 sigma [m]", number(None if scored else sqrt(max(spread, 0.0)), 3)
+    yield "driven, by the odometry [m]", number(None if scored else driven, 1)
 
 
-def _number(value: float | None, digits: int) -> str:
-    """Format a number with `digits` decimals, or fewer digits if it is huge; "" for None."""
-    if value is None:
-        return ""
+def number(value: float | None, digits: int, missing: str = "") -> str:
+    """Format a number with `digits` decimals, or fewer digits if it is huge; None as `missing`."""
+    if value is None or (missing and value != value):
+        return missing
     return f"{value:.{digits}f}" if abs(value) < 1e5 else f"{value:.3g}"
 
 

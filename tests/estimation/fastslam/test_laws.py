@@ -1,7 +1,5 @@
 """What must hold of the swarm whatever it is told."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 
@@ -49,28 +47,6 @@ def test_half_a_turn_of_the_world_turns_the_swarm():
     turn = np.diag([-1, -1, 1])
     expected = turn @ here.pose().covariance @ turn
     np.testing.assert_allclose(there.pose().covariance, expected, atol=1e-9)
-
-
-def test_labels_are_only_names():
-    slam, mission = swarm_filter(), small_mission("fused", frames=20)
-    renamed = [replace(scan, landmark=1000 - scan.landmark) for scan in mission.scans]
-    *_, (belief, _) = followed(slam, mission, START, drawing())
-    *_, (other, _) = followed(slam, replace(mission, scans=renamed), START, drawing())
-    np.testing.assert_array_equal(other.landmark, 1000 - belief.landmark)
-    np.testing.assert_array_equal(all_members(other), all_members(belief))
-
-
-def test_steps_of_a_frame_are_the_steps_one_by_one():
-    slam, mission = swarm_filter(), small_mission("fused", frames=10)
-    *_, (belief, _) = followed(slam, mission, START, drawing())
-    together, poses = slam.predict(belief, mission.controls[0], mission.dt[0])
-    for k in range(4):
-        belief, pose = slam.predict(
-            belief, mission.controls[0, k : k + 1], mission.dt[0, k : k + 1]
-        )
-        np.testing.assert_array_equal(pose.mean[0], poses.mean[k])
-        np.testing.assert_array_equal(pose.covariance[0], poses.covariance[k])
-    assert_same(belief, together)
 
 
 def test_new_landmarks_are_placed_last_in_any_order():

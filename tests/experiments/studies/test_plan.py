@@ -143,12 +143,6 @@ def test_settings_may_vary_that_are_no_numbers(tmp_path):
     assert {case.config.rays.range_bounds for case in cases_of(plan)} == {(0.5, 20.0), (0.5, 10.0)}
 
 
-@pytest.mark.parametrize("values", ["[0.01]", '["loud"]', '["fused", "soft"]'])
-def test_refused_items_are_not_also_reported_missing(refused, values):
-    where = f"PLAN, key 'strategies[{values.count(',')}]': found"
-    assert refused(BARE + f"strategies = {values}\n").startswith(where)
-
-
 def test_a_plan_as_written_reads_as_the_same_plan(tmp_path):
     plan = plan_of(tmp_path, SMALL, over=from_flags({"rays": {"power": 3.0}}))
     written = plan_text(plan)
@@ -185,8 +179,8 @@ REFUSED = [
     ('strategies = ["loud"]', "key 'strategies[0]': found 'loud', expected 'active',"),
     ("strategies = []", "key 'strategies': found [], expected "),
     ('filters = ["ekf", "ekf"]', "filters: found 'ekf' twice"),
-    ("config = 3", "key 'config': found 3, expected a table of settings"),
-    ("grid = [1]", "key 'grid': found [1], expected a table of settings"),
+    ("config = 3", "key 'config': found 3, expected a table"),
+    ("grid = [1]", "key 'grid': found [1], expected a table"),
     ("[config.rays]\npowr = 1\n", "config.rays.powr: no such setting; did you mean rays.power?"),
     ("[config.sonar]", "config.sonar: no such setting"),
     ("[config]\nrays = 3\n", "config.rays: no such setting"),
@@ -203,8 +197,8 @@ REFUSED = [
     ('[grid]\n"rays.power" = [2, 2.0]\n',
      "grid.rays.power: found 2.0 twice, expected each value once"),
     ("[grid]\nseed = [1, 2]\n", "grid.seed: every iteration is another world"),
-    ("own = 3", "key 'own': found 3, expected a table for each filter"),
-    ("[own]\nekf = 3\n", "key 'own': found {'ekf': 3}, expected a table for each filter"),
+    ("own = 3", "key 'own': found 3, expected a table"),
+    ("[own]\nekf = 3\n", "key 'own.ekf': found 3, expected a table"),
     ("[own.iekf]\nfilter.gate = 0.9\n", "own.iekf: no filter of this plan; did you mean ekf?"),
     ("[own.ekf]\nemitter.radius = 0.01\n",
      "own.ekf.emitter.radius: this setting changes what is heard; expected one of the "

@@ -17,7 +17,6 @@ from collections import Counter
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from functools import cache
-from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -25,30 +24,18 @@ from jaxtyping import Bool, Float, Int
 
 from pipistrelle.config import InputError
 from pipistrelle.detection.scans import UNLABELLED
+from pipistrelle.files import shipped_text
 from pipistrelle.refusals import refusal, shown
 
 ODOMETRY = "nav_msgs/msg/Odometry"
 _PINGS = "marine_acoustic_msgs/msg/"
-DEFINITIONS = MappingProxyType(
-    {
-        "tf2_msgs/msg/TFMessage": "geometry_msgs/TransformStamped[] transforms\n",
-        f"{_PINGS}PingInfo": "float32 frequency\nfloat32 sound_speed\n"
-        "float32[] tx_beamwidths\nfloat32[] rx_beamwidths\n",
-        f"{_PINGS}DetectionFlag": "uint8 flag\n",
-        f"{_PINGS}SonarDetections": "std_msgs/Header header\nPingInfo ping_info\n"
-        "DetectionFlag[] flags\nfloat32[] two_way_travel_times\nfloat32[] tx_delays\n"
-        "float32[] intensities\nfloat32[] tx_angles\nfloat32[] rx_angles\n",
-        f"{_PINGS}SonarRanges": "std_msgs/Header header\nPingInfo ping_info\n"
-        "DetectionFlag[] flags\nfloat32[] transmit_delays\nfloat32[] intensities\n"
-        "geometry_msgs/Vector3[] beam_unit_vec\nfloat32[] ranges\n",
-        "mrpt_msgs/msg/SingleRangeBearingObservation": "float64 range\nfloat64 yaw\n"
-        "float64 pitch\nint32 id\n",
-        "mrpt_msgs/msg/ObservationRangeBearing": "std_msgs/Header header\n"
-        "geometry_msgs/Pose sensor_pose_on_robot\nfloat64 min_sensor_distance\n"
-        "float64 max_sensor_distance\nfloat64 sensor_std_range\nfloat64 sensor_std_yaw\n"
-        "float64 sensor_std_pitch\nSingleRangeBearingObservation[] sensed_data\n",
-    }
-)
+_PART = re.compile(r"^=+[ \t]*\n", re.MULTILINE)
+"""Line between the definitions in a text."""
+DEFINITIONS = {
+    head.removeprefix("MSG: "): fields
+    for part in _PART.split(shipped_text("detection/logs/definitions.msg"))
+    for head, _, fields in (part.partition("\n"),)
+}
 """Types that rosbags does not know, for bags that do not define them."""
 
 Pose = tuple[Float[np.ndarray, "3 3"], Float[np.ndarray, " 3"]]
@@ -277,7 +264,6 @@ _SHORT = {
     "duration": "builtin_interfaces/msg/Duration",
     "Header": "std_msgs/msg/Header",
 }
-_PART = re.compile(r"^=+[ \t]*\n", re.MULTILINE)
 _FIELD = re.compile(
     r"\s*(?P<type>[A-Za-z][\w/]*)(?:<=\d{1,9})?(?:\[(?:(?P<size>\d{1,9})|(?:<=\d{1,9})?)(?P<many>\])"
     r")?[ \t]+(?P<name>[A-Za-z]\w*)[ \t]*(?P<constant>=)?",

@@ -29,21 +29,13 @@ from pipistrelle.detection.logs.vehicle import (
     vehicle_of,
 )
 from pipistrelle.detection.scans import UNLABELLED, Scan
-from pipistrelle.files import LOG, OwnFiles, read_text
+from pipistrelle.files import LOG, OwnFiles, read_text, shipped_text
 from pipistrelle.refusals import refusal
 from pipistrelle.text_tables import Table, check_unique, place_of, read_table, rows_kept, table_text
 
 ROBOTS = range(1, 6)
 LANDMARKS = range(6, 21)
 _UNKNOWN_MAX = 0.05
-_README = """A recorded log of Pipistrelle. Replay it with: pipistrelle slam FOLDER
-
-log.toml: motion model, start and noise; m, s, rad; _std are standard deviations of rows without
-SHA256SUMS: what was written here; nothing else is ever overwritten
-truth.csv: time,x,y,heading; optional, for scoring only
-landmarks.csv: landmark,x,y; optional, for scoring only
-
-"""
 
 
 def read_mrclam(folder: Path, robot: int, span: tuple[float, float] = (-math.inf, math.inf)) -> Log:
@@ -214,7 +206,7 @@ def log_files(log: Log) -> dict[str, str]:
 def _readme(motion: str, driven: Iterable[str], measured: Iterable[str]) -> str:
     """Return the text of a log folder's ``README.md``, with the columns of its tables."""
     tables = ODOMETRY[motion].readme([*driven]), MEASUREMENTS.readme([*measured])
-    return _README + "\n".join(tables)
+    return shipped_text("detection/logs/readme.md") + "\n".join(tables)
 
 
 def as_logged(scan: Scan, name: str) -> np.ndarray:

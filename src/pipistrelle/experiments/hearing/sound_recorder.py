@@ -21,27 +21,12 @@ from pipistrelle.detection.sounds.calls import FILE as CALLS
 from pipistrelle.detection.sounds.sound_file import ARRAY_FILE as ARRAY
 from pipistrelle.detection.sounds.sound_file import FILE as DESCRIPTION
 from pipistrelle.experiments.hearing.scenario import Scenario, caller_labels
-from pipistrelle.files import OwnFiles, PiecesFile, make_folder, remove_empty
+from pipistrelle.files import OwnFiles, PiecesFile, make_folder, remove_empty, shipped_text
 from pipistrelle.text_tables import table_text
 
 SOUND_FILE = "recording.wav"
 HEADROOM = 4.0
 """Largest amplitude that the file can hold, in units of the loudest call's at 1 m."""
-_README = """A sound recording of Pipistrelle. Make a log of it with: pipistrelle hear FOLDER -o LOG
-
-recording.wav     the microphones' samples, a channel each; times `scale` they are amplitudes
-recording.toml    rate, scale, speed of sound, who calls at which frequency, what the log will say
-call_NAME.wav     a caller's call, where it is one of a file; recording.toml names it
-array.csv         channel,x,y, perhaps face [m], x ahead and y to the left of the vehicle; a face
-                  looks away from the middle of all; where recording.toml says one_centre, the
-                  faces' own distance from it is not part of any delay
-calls.csv         sample,time [s]: where each call of the vehicle begins; while it lasts, the
-                  microphones hear it alone
-odometry.csv      as in a log
-truth.csv         time,x,y,heading; for scoring only
-landmarks.csv     landmark,x,y; for scoring only
-SHA256SUMS        what was written here: nothing else is ever overwritten
-"""
 
 
 @dataclass(kw_only=True)
@@ -161,7 +146,7 @@ class SoundRecorder:
             SOUND_FILE: self.finish(),
             ARRAY: array_text(microphones_in(self.config)),
             CALLS: table_text({"sample": self.first[:-1], "time": time}),
-            "README.md": _README,
+            "README.md": shipped_text("experiments/hearing/sound_readme.md"),
             DESCRIPTION: tomli_w.dumps(self._description(scenario) | {"log": log}),
         }
 

@@ -23,7 +23,7 @@ from pipistrelle.estimation.catalogue import SECTIONS
 from pipistrelle.experiments.hearing.caller_paths import routes_read
 from pipistrelle.experiments.hearing.scenario import Scenario, World
 from pipistrelle.experiments.hearing.trajectories import Commands, Course, Poses, steps_of
-from pipistrelle.files import read_file, read_text
+from pipistrelle.files import read_file, read_text, shipped_text
 from pipistrelle.refusals import refusal, shown, table_refusal
 from pipistrelle.settings import (
     CALLERS,
@@ -68,16 +68,6 @@ COURSES = {
 """Kind of a course by the columns of ``path.csv``."""
 FILES = ("world.toml", LANDMARKS.file, "path.csv")
 """Files of a world, besides the routes of its callers."""
-_README = """\
-A world of Pipistrelle. Hear it with: pipistrelle run --world FOLDER
-
-world.toml: settings that belong to the world ([config]), and who calls ([[callers]])
-SHA256SUMS: what was written here; nothing else is ever overwritten
-
-Each file may be left out: what it would say is drawn, by --seed. Where the controls follow the
-poses nothing of the path is drawn; take the two columns away, and the noise on them is.
-
-"""
 
 
 class _WorldTable(Section):
@@ -202,7 +192,8 @@ def world_files(scenario: Scenario, config: Config) -> dict[str, str]:
     if (bodies := scenario.bodies) is not None:
         landmarks |= {"radius": bodies.radius, "shape": bodies.shape}
     files = {
-        "README.md": _README + "\n".join((LANDMARKS.readme([*landmarks]), path.readme())),
+        "README.md": shipped_text("experiments/hearing/world_readme.md")
+        + "\n".join((LANDMARKS.readme([*landmarks]), path.readme())),
         LANDMARKS.file: table_text(landmarks),
         path.file: table_text(dict(zip(path.columns, columns, strict=True))),
     }

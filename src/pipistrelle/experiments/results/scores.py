@@ -220,14 +220,9 @@ def with_association(
         return scores
     labels, positions = truth.landmarks
     there = positions[np.isin(labels, list(found.heard))]
-    metric = gospa(landmarks.mean[placed(landmarks)], there)
-    return replace(
-        scores,
-        gospa_m=metric.distance,
-        gospa_error_m=metric.error,
-        gospa_missed=metric.missed,
-        gospa_false=metric.false,
-    )
+    distance, error, missed, false = gospa(landmarks.mean[placed(landmarks)], there)
+    metric = {"gospa_m": distance, "gospa_error_m": error}
+    return replace(scores, **metric, gospa_missed=missed, gospa_false=false)
 
 
 @np.errstate(over="ignore", invalid="ignore")

@@ -46,6 +46,7 @@ from pipistrelle.files import (
     make_folder,
     partial_of,
     remove_empty,
+    shipped_text,
 )
 from pipistrelle.settings import to_toml
 from pipistrelle.text_tables import TEXT_COLUMNS
@@ -112,42 +113,6 @@ def _point_latest_at(folder: Path) -> None:
 if TYPE_CHECKING:
     import polars as pl
 
-README = """\
-# Results
-
-    {command}
-
-Pipistrelle {version}, seed {seed}. SI units and radians; headings are counter-clockwise from +x,
-bearings counter-clockwise from the heading. S is the sensing strategy, F the filter.
-
-| file | what it holds |
-|---|---|
-| summary.json | the scores of each estimate{log}; null: no truth, or not a finite number |
-| config.toml | every setting |
-| track_S_F.tum | estimated path, the start and every control step: time x y z qx qy qz qw |
-{online}{callers}| truth.tum | true path at the same times, where it is known |
-| map_S_F.csv | final map with covariances; a partial landmark by its heaviest hypothesis |
-| steps.parquet | estimated and true poses, standard deviations, errors, NEES |
-| landmarks.parquet | every hypothesis of every landmark, beside the true position of the landmark \
-that it stands for, true_landmark |
-| measurements.parquet | what each strategy measured; no range where it was passive; of echoes of \
-another's call the excess path, where it is known. Where filters take different measurements, \
-filter names whose they are; assigned is the label that an association gave, true_landmark the \
-true one |
-| mission.* | pictures; mission.mcap, where asked for: tracks and maps as a ROS bag |
-| worlds/ | the world that was heard, where it was one of your own |
-| view.html | the mission frame by frame, once `pipistrelle view` on this folder has made it |
-| SHA256SUMS | what was written here: `--overwrite` touches nothing else (`sha256sum -c`) |
-
-RMSE and NEES leave out the start; after an exact one the NEES begins where the covariance is
-positive definite. "aligned": path and map, each after the rigid motion without
-scale that fits it best to the truth. Map errors are those of the fully initialised landmarks
-whose true positions are known. measurements_per_frame counts the bearings before the gate, gated
-the measurements that the gate rejected, gated_of those that it judged: bearings with their ranges,
-and excess paths. ignored_rows are what was dropped from a recorded log.
-
-    evo_ape tum truth.tum track_S_F.tum --align
-"""
 
 LOG = ", and which log was solved, how it was heard, and its files' sums"
 ONLINE = """\
@@ -195,7 +160,9 @@ def write_results(
         "log": "" if log is None else LOG,
         "callers": CALLERS if any(trial.track.callers for trial in trials) else "",
     }
-    readme = README.format(command=command, version=find_version(), seed=seed, **parts)
+    readme = shipped_text("experiments/results/readme.md").format(
+        command=command, version=find_version(), seed=seed, **parts
+    )
     files: dict[str, str | bytes] = {"config.toml": to_toml(config), "README.md": readme}
     files |= _texts(trials, truth, moving)
     for name, table in tables_of(trials, truth, callers).items():

@@ -13,7 +13,6 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
 from decimal import ROUND_FLOOR, Context
-from functools import partial
 from hashlib import sha256
 from importlib.resources import files
 from itertools import product
@@ -260,17 +259,8 @@ def _names_folder(found: Any) -> bool:
     return isinstance(found, str) and re.fullmatch(r"\w[\w.-]*", found) is not None
 
 
-def _is_table(found: Any, inner: type = object) -> bool:
-    """Return whether an object is a dict with values of a given type only."""
-    return isinstance(found, dict) and all(isinstance(each, inner) for each in found.values())
-
-
 _FILTERS = ", ".join(f"'{name}'" for name in CATALOGUE) + " or module:Class"
 _Filter = Annotated[str, _checked(_FILTERS, _names_filter)]
-_Table = Annotated[dict[str, Any], _checked("a table of settings", _is_table)]
-_Tables = Annotated[
-    dict[str, Any], _checked("a table for each filter", partial(_is_table, inner=dict))
-]
 
 
 class _PlanFile(Section):
@@ -283,9 +273,9 @@ class _PlanFile(Section):
     strategies: Annotated[tuple[Strategy, ...], Field(min_length=1)] = STRATEGIES
     filters: Annotated[tuple[_Filter, ...], Field(min_length=1)] = PAPERS
     settings: Any = None
-    config: _Table = Field(default_factory=dict)
-    grid: _Table = Field(default_factory=dict)
-    own: _Tables = Field(default_factory=dict)
+    config: dict[str, Any] = Field(default_factory=dict)
+    grid: dict[str, Any] = Field(default_factory=dict)
+    own: dict[str, dict[str, Any]] = Field(default_factory=dict)
 
 
 def find_plan(word: str) -> Path:

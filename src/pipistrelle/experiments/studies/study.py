@@ -62,7 +62,7 @@ from pipistrelle.experiments.studies.world import (
     world_schemas,
     write_world,
 )
-from pipistrelle.files import read_file, whole_name, write_whole
+from pipistrelle.files import read_file, shipped_text, whole_name, write_whole
 from pipistrelle.settings import to_toml
 from pipistrelle.version import find_version
 
@@ -70,31 +70,6 @@ if TYPE_CHECKING:
     import polars as pl
 
 _FILES = ("plan.toml", "config.toml", "README.md")
-README = """\
-# A study: {name}
-
-`pipistrelle study ... -o` this folder, with the same plan, goes on where it stopped;
-`pipistrelle report` on it draws the figures. Written by Pipistrelle {version}. SI units and
-radians; what ends in _deg is in degrees.
-
-| file | what it holds |
-|---|---|
-| plan.toml | what is tried: every setting, and the grid of those that vary |
-| config.toml | the settings alone |
-| worlds/ | worlds of one's own that the plan names |
-| trials/ | one row per case: the scores, or the error of a trial that failed |
-| steps/ | errors and NEES at each frame (frame 1 is the first call; the start has no row) |
-| landmarks/ | the final map: is a landmark fully initialised, and how far off is it |
-
-In each folder one Parquet file per world (iteration). A world is done when its file of trials is
-there. A case is one combination of the grid, a strategy and a filter, numbered in plan order; a
-passive case has no radius, for the vehicle's beam is not its business. Null: nothing to score.
-Infinite or NaN: the filter diverged. A partial landmark stands where its heaviest hypothesis is.
-Two runs of one plan differ in wall_s and cpu_s alone.
-
-    import polars
-    polars.read_parquet("trials/*.parquet")
-"""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -125,7 +100,8 @@ def open_store(folder: Path, plan: Plan) -> None:
             raise InputError(f"{kept}: is the plan of another study; {fix}")
         if there is None or there.iterations < plan.iterations or there.planned < plan.planned:
             _keep_plan(folder, there, plan)
-        readme = README.format(name=plan.name, version=find_version())
+        readme = shipped_text("experiments/studies/readme.md")
+        readme = readme.format(name=plan.name, version=find_version())
         config = plan.config
         if config.scenario.world is not None:
             config, _ = kept_world(config, plan.world(config))
