@@ -31,7 +31,7 @@ from pipistrelle.figures.maps import (
     shades,
     vehicle,
 )
-from pipistrelle.figures.player.playback import (
+from pipistrelle.figures.player import (
     POSE_STDS,
     Estimate,
     Playback,

@@ -7,13 +7,14 @@ True
 """
 
 __version__: str
-__all__ = ["Config", "InputError", "Slam", "hear", "load", "run", "slam", "study"]
+__all__ = ["Config", "InputError", "Slam", "hear", "load", "look", "run", "slam", "study"]
 _ROOMS = {
     "Config": "config",
     "InputError": "config",
     "Slam": "scripting.live",
     "hear": "scripting.hearing",
     "load": "scripting.results",
+    "look": "scripting.hearing",
     "run": "scripting.results",
     "slam": "scripting.results",
     "study": "scripting.studies",

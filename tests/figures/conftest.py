@@ -4,7 +4,7 @@ import pytest
 
 from pipistrelle.config import CallerConfig, Config, ListeningConfig, ScenarioConfig
 from pipistrelle.experiments.runs.trial import run_mission
-from pipistrelle.figures.player.playback import playback
+from pipistrelle.figures.player import playback
 from pipistrelle.figures.recorder import MissionRecorder
 
 

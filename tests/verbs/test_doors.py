@@ -19,7 +19,7 @@ from reference.sounds import record
 from reference.studies import TINY
 
 LOG = Path(__file__).parents[1] / "data" / "unicycle_log"
-READ = {"--world", "--log", "LOG", "RECORDING", "FOLDER", "--folder", "FOLDERS"}
+READ = {"--world", "--log", "LOG", "PATH", "RECORDING", "FOLDER", "--folder", "FOLDERS"}
 """What names a place that is only read."""
 RUN = ("run", *SHORT, "--strategy", "fused", "-o")
 COMMANDS = {
@@ -32,6 +32,7 @@ COMMANDS = {
     "study --output": ("study", "tiny.toml", "--workers", "1", "-o", "d"),
     "report --output": ("report", "s", "-o", "d"),
     "compare --output": ("compare", "one", "two", "-o", "d"),
+    "look --output": ("look", LOG, "-o", "d/debian.png"),
     "array --output": ("array", "square", "-o", "d/debian.png"),
     "view --output": ("view", "one", "-o", "d/debian.html"),
 }
@@ -49,7 +50,7 @@ CALLS = {
 ALWAYS = ("study --output", "report --output", "study", "report")
 """Those that go on with, or replace, their own like without being asked to."""
 NOTES = ("notes.txt", "sub/deep/b.txt")
-BY_NAME = (*ALWAYS, "array --output", "view --output")
+BY_NAME = (*ALWAYS, "array --output", "look --output", "view --output")
 """Those that have no --overwrite, or are told by it which file to replace."""
 
 
@@ -104,7 +105,7 @@ def contents(folder):
 def test_each_flag_with_a_path_is_listed_as_reading_or_writing():
     found = {
         f"{verb} {argument.names[0]}"
-        for verb in ("array", "run", "hear", "slam", "view", "report", "compare", "study")
+        for verb in ("array", "run", "hear", "look", "slam", "view", "report", "compare", "study")
         for argument in app[verb].assemble_argument_collection()
         if argument.hint is Path or Path in get_args(argument.hint)
         if not READ & {*argument.names}

@@ -95,3 +95,14 @@ def test_folders_without_a_recording_are_rejected(refused):
     refused("hear", "empty", "--rays.power", "3", "-o", "log")
     assert "recording.toml" in refused("hear", "empty")
     assert not Path("log").exists()
+
+
+def test_look_draws_a_log_in_three_formats_with_equal_bytes(obey, refused, short_log):
+    for ending in ("png", "svg", "pdf"):
+        words = ("look", short_log, "-o", f"one.{ending}")
+        assert obey(*words)[1].endswith(f"\none.{ending}\n")
+        first = Path(f"one.{ending}").read_bytes()
+        assert f"one.{ending}: is there already" in refused(*words)
+        obey(*words, "--overwrite")
+        assert Path(f"one.{ending}").read_bytes() == first
+    assert "expected a name that ends in .png or .svg or .pdf" in refused(*words[:-1], "a.gif")

@@ -19,7 +19,7 @@ from pipistrelle.config import PARAMETERS, BagConfig, Config, FastSlamConfig
 from pipistrelle.settings import known_settings
 
 HEAVY = {"numpy", "pydantic", "numba", "matplotlib"}
-VERBS = ["run", "slam", "hear", "study", "view", "report", "compare", "array"]
+VERBS = ["run", "slam", "hear", "look", "study", "view", "report", "compare", "array"]
 
 
 @pytest.fixture(scope="module")

@@ -131,14 +131,14 @@ def test_a_page_is_never_written_through_a_link_or_over_a_users_partial(obey, fo
 
 
 def test_a_page_that_appeared_meanwhile_is_not_replaced(obey, folder, refused, monkeypatch):
-    from pipistrelle.figures.player import playback
+    from pipistrelle.figures import player
 
     def slow(*args):
         Path("page.html").write_text("mine")
         return page_of(*args)
 
-    page_of = playback.page
-    monkeypatch.setattr(playback, "page", slow)
+    page_of = player.page
+    monkeypatch.setattr(player, "page", slow)
     assert "page.html: could not be written (File exists)" in refused(
         "view", folder, "--quiet", "-o", "page.html"
     )

@@ -1,4 +1,4 @@
-"""The Python interface: `run`, `hear`, `slam`, `study`, `load`, and their results.
+"""The Python interface: `run`, `hear`, `look`, `slam`, `study`, `load`, and their results.
 
 The command line (`verbs`) takes its options and their help from these functions. `arguments`
 resolves settings and names, `missions` conducts missions, `log_warnings` checks logs, `live` is a

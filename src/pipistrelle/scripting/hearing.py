@@ -1,14 +1,18 @@
-"""`hear`: the echoes of a sound recording, as a log and as a figure."""
+"""`hear` and `look`: echoes of a sound recording, and the content of a log or recording."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from contextlib import nullcontext
 from dataclasses import dataclass, replace
+from math import log
 from os.path import lexists
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+from jaxtyping import Float
+
 from pipistrelle.config import Config, InputError
-from pipistrelle.detection.logs.readers import wrong_kind
+from pipistrelle.detection.logs.readers import Robot, wrong_kind
 from pipistrelle.files import (
     LOG,
     OwnFiles,
@@ -26,9 +30,12 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
     from pipistrelle.detection.logs.folder import RowsHeard
+    from pipistrelle.detection.logs.recording import Log
     from pipistrelle.detection.sounds.check import Overview
     from pipistrelle.detection.sounds.hearing import Frame
     from pipistrelle.detection.sounds.sound_file import Description
+    from pipistrelle.experiments.drives import Truth
+    from pipistrelle.figures.overview import Rows
 
 SECTIONS = ("detection", "matching")
 """Sections of settings that `hear` uses, besides ``assumed.speed_of_sound``."""
@@ -137,14 +144,12 @@ def hear(
 def hear_by(door: Door) -> Heard:
     """Detect the echoes in a recording as `hear` does, with the arguments in `door`."""
     place, config = folder_named(door.asked["recording"], "hear"), heard_settings(door.flags)
-    own = door.claimed("output", LOG)
-    if own is None:
-        parts: list[str] = []
-        with door.working() as progress:
+    own, parts = door.claimed("output", LOG), list[str]()
+    with door.working() as progress:
+        if own is None:
             heard = _heard(place, config, door, progress, parts.append)
-        heard = replace(heard, text="".join(parts))
-    else:
-        with door.working() as progress:
+            heard = replace(heard, text="".join(parts))
+        else:
             heard = _heard_into(own, place, config, door, progress)
     door.warn(*(f"{place}: {line}" for line in heard.odd))
     return heard
@@ -187,20 +192,20 @@ def _heard(
 
     about = described(folder)
     overview = Overview(names=("vehicle", *(caller.name for caller in about.callers)))
-    log = RowsHeard(folder, about.log, log_callers(about))
-    read_truth(folder, log.time)  # raises for bad truth, which is copied to the log
-    write(",".join(log.columns) + "\n")
+    rows = RowsHeard(folder, about.log, log_callers(about))
+    read_truth(folder, rows.time)  # raises for bad truth, which is copied to the log
+    write(",".join(rows.columns) + "\n")
 
-    def look(frame: "Frame") -> None:
+    def take(frame: "Frame") -> None:
         overview.look(frame)
-        write(log.text(frame.scan))
+        write(rows.text(frame.scan))
 
     def chosen(count: int) -> range:
         return frames_named(door.given("frames"), count)
 
-    odd = hear_recording(folder, about, config, chosen, look, progress)
-    log.files()  # raises for a log without rows
-    return Heard(overview=overview, log=log, text=None, odd=tuple(odd))
+    odd = hear_recording(folder, about, config, chosen, take, progress)
+    rows.files()  # raises for a log without rows
+    return Heard(overview=overview, log=rows, text=None, odd=tuple(odd))
 
 
 def described(folder: Path) -> "Description":
@@ -210,3 +215,184 @@ def described(folder: Path) -> "Description":
     if not lexists(folder / FILE):
         raise wrong_kind(folder, "the folder of a sound recording", FILE)
     return read_description(folder)
+
+
+UNITS = {"range": "m", "bearing": "rad", "excess_path": "m", "level_db": "dB"}
+"""Units of the measured quantities, by the names of their columns."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Look:
+    """Result of `look`: numbers of a log or a recording, doubts about it, and its figure."""
+
+    lines: tuple[str, ...]
+    """What it contains, a line each."""
+    odd: tuple[str, ...]
+    """Warnings, a line each."""
+    figure: "Callable[[], Figure]"
+    """Draws its content."""
+
+
+def look(
+    path: Path | str, /, *, robot: Robot | None = None, truth: str | None = None, **settings: Any
+) -> Look:
+    """Describe a log, a ROS bag or a sound recording, as `pipistrelle look` does.
+
+    Parameters
+    ----------
+    path : Path
+        A log folder, a ROS bag, a MRCLAM folder, or the folder of a sound recording.
+    robot : int or str, optional
+        The robot, by number or name, if there are several.
+    truth : str, optional
+        Topic of a ROS bag with the true pose of the vehicle; sets bag.truth.
+    **settings
+        Of the section bag; of a recording, of the sections detection and matching.
+
+    Raises
+    ------
+    InputError
+        For an error in the log or the recording, with its file and its line or key.
+    """
+    flags = from_keywords(settings, look.__kwdefaults__ or ())
+    return look_by(Door(asked={**locals()}, beneath={}, flags=flags, command="pipistrelle.look"))
+
+
+def look_by(door: Door) -> Look:
+    """Describe a log or a recording as `look` does, with the arguments in `door`."""
+    from pipistrelle.detection.sounds.sound_file import FILE
+    from pipistrelle.experiments.runs.replay import load
+
+    place, given = folder_named(door.asked["path"], "look"), door.flags | door.short()
+    if (place / FILE).exists():
+        return _recording(place, given)
+    if useless := [one.where for key, one in given.items() if key[0] != "bag"]:
+        raise InputError(f"{useless[0]}: means nothing to a log before it is solved")
+    return _log(place, *load(place, door.asked["robot"], bag=resolve(given).bag))
+
+
+def _log(place: Path, recorded: "Log", truth: "Truth") -> Look:
+    """Describe a recorded log."""
+    from pipistrelle.detection.scans import COLUMNS
+    from pipistrelle.figures.overview import draw_log
+    from pipistrelle.scripting.log_warnings import dead_reckoned, early_warnings
+
+    sizes = [scan.landmark.size for scan in recorded.scans]
+    rows = {"time": np.repeat([scan.time for scan in recorded.scans], sizes)}
+    for name in COLUMNS:
+        rows[name] = np.concatenate([getattr(scan, name) for scan in recorded.scans])
+    gaps = long_gaps(recorded)
+    return Look(
+        lines=(*recorded.notes, *_numbers(recorded, truth, rows, gaps)),
+        odd=tuple(early_warnings(recorded, truth, place)),
+        figure=lambda: draw_log(recorded, truth, dead_reckoned(recorded), rows, gaps),
+    )
+
+
+def long_gaps(recorded: "Log") -> Float[np.ndarray, "g 2"]:
+    """Return begin and end [s] of each interval without scans that chance hardly explains.
+
+    Of n intervals of random scans, the longest exceeds log(n / p) times their mean with a
+    probability of at most p (`log_warnings.CHANCE`).
+    """
+    from pipistrelle.scripting.log_warnings import CHANCE
+
+    scans = [scan.time for scan in recorded.scans]
+    edges = np.unique([recorded.time[0], *scans, recorded.time[-1]])
+    length, ends = np.diff(edges), np.column_stack((edges[:-1], edges[1:]))
+    return ends[length > length.mean() * log(length.size / CHANCE)]
+
+
+def _numbers(
+    recorded: "Log", truth: "Truth", rows: "Rows", gaps: Float[np.ndarray, "g 2"]
+) -> Iterator[str]:
+    """Yield a line for each number of a recorded log."""
+    from pipistrelle.detection.scans import UNLABELLED
+    from pipistrelle.scripting.log_warnings import distance_driven
+
+    time, count, scans = recorded.time, rows["time"].size, len(recorded.scans)
+    yield f"time         {time[-1] - time[0]:.6g} s, from {time[0]:.15g} s to {time[-1]:.15g} s"
+    steps = f"{len(time) - 1} steps of {np.median(recorded.dt):.3g} s ({recorded.motion})"
+    yield f"odometry     {steps}, {distance_driven(recorded):.4g} m"
+    yield f"rows         {count} in {scans} scans, {count / max(scans, 1):.3g} in each"
+    labels, seen = np.unique(rows["landmark"], return_counts=True)
+    known = labels != UNLABELLED
+    yield f"labels       {seen[known].sum()} rows with a label, {seen[~known].sum()} without"
+    if known.any():
+        spread = np.quantile(seen[known], (0.0, 0.25, 0.5, 0.75, 1.0))
+        few, *quarters, most = (f"{number:.0f}" for number in spread)
+        each = f"each in {few} to {most} rows (quartiles {', '.join(quarters)})"
+        yield f"landmarks    {known.sum()}, {each}"
+    if recorded.callers:
+        names = ("vehicle", *(caller.name for caller in recorded.callers))
+        calls = np.bincount(rows["caller"], minlength=len(names))
+        whose = (f"{name} {number}" for name, number in zip(names, calls, strict=True))
+        yield f"callers      rows of {', '.join(whose)}"
+    for name, unit in UNITS.items():
+        title = name.removesuffix("_db").replace("_", " ")
+        yield f"{title:<13}{_quantity(recorded, rows, name, unit)}"
+    longest = gaps[np.argsort(gaps[:, 0] - gaps[:, 1])[:3]].tolist()
+    where = ", ".join(f"{end - begin:.4g} s from {begin:.15g} s" for begin, end in longest)
+    yield f"gaps         {f'{len(gaps)} without scans, the longest {where}' if where else 'none'}"
+    known_steps = 0 if truth.path is None else np.isfinite(truth.path[:, 0]).sum()
+    placed = 0 if truth.landmarks is None else len(truth.landmarks[0])
+    yield f"truth        {known_steps} of {time.size} poses, {placed} landmarks"
+
+
+def _quantity(recorded: "Log", rows: "Rows", name: str, unit: str) -> str:
+    """Describe a measured quantity: its share of rows, its values and standard deviations."""
+    values = rows[name][~np.isnan(rows[name])]
+    if not values.size:
+        return "none"
+    share, low, high = values.size / rows[name].size, values.min(), values.max()
+    text = f"in {share:.0%} of the rows, {low:.3g} to {high:.3g} {unit}"
+    if name == "level_db":
+        return text
+    stds = rows[f"{name}_std"][~np.isnan(rows[name])]
+    stated, general = stds[~np.isnan(stds)], getattr(recorded, f"{name}_std")
+    if stated.size < stds.size and general is not None:
+        text += f", std {general:.3g} {unit}"
+    if stated.size:
+        text += f", std of {stated.size} rows {stated.min():.3g} to {stated.max():.3g} {unit}"
+    return text
+
+
+def _recording(place: Path, given: Layer) -> Look:
+    """Describe a sound recording."""
+    from pipistrelle.acoustics.call import extent_of
+    from pipistrelle.detection.sounds.check import check_recording
+    from pipistrelle.detection.sounds.hearing import GAPS, prepared
+    from pipistrelle.detection.sounds.sound_file import open_sound
+    from pipistrelle.figures.overview import draw_recording
+
+    about, config = described(place), heard_settings(given)
+    with open_sound(place, about) as sound:
+        array, _, sent, calls = prepared(place, sound, about)
+        parts = [samples[:, array.used] for samples in calls.gaps(sound, calls.spread(GAPS))]
+        first, end = int(calls.sample[0]), int(calls.sample[:2][-1] + calls.length[0])
+        begin = sound.read(first, min(end, sound.samples) - first)
+    square = np.mean([np.mean(np.square(part, dtype=float), axis=0) for part in parts], axis=0)
+    peak = np.max([np.abs(part).max(axis=0) for part in parts], axis=0)
+    with np.errstate(divide="ignore"):
+        levels = 10.0 * np.log10(square), 20.0 * np.log10(peak)
+    rms, top = (f"{level.min():.1f} to {level.max():.1f} dB" for level in levels)
+    names = "vehicle", *(caller.name for caller in about.callers)
+    bands = {n: extent_of(call, sound.rate) for n, call in zip(names, sent, strict=True)}
+    heard = (
+        f"{name} {low / 1e3:.4g}" + f" to {high / 1e3:.4g}" * (high > low) + " kHz"
+        for name, (low, high) in bands.items()
+    )
+    length, apart = sound.samples / sound.rate, np.median(calls.length) / sound.rate
+    lines = (
+        f"time         {length:.6g} s from {about.start:.15g} s, files: {len(sound.paths)}",
+        f"channels     {sound.channels} at {sound.rate:g} Hz, {array.used.size} with a microphone",
+        f"calls        {calls.sample.size} of the vehicle, {apart:.4g} s apart, "
+        f"{1e3 * about.call.duration:.4g} ms long",
+        f"callers      {', '.join(heard)}",
+        f"level        RMS {rms}, largest sample {top}, where 1 in the file is 0 dB",
+    )
+    drawn: dict[str, Any] = {"rate": sound.rate, "duration": about.call.duration, "bands": bands}
+    drawn |= {"calls": (calls.sample[:2] - first) / sound.rate}
+    loudest = begin[:, array.used[np.argmax(square)]]
+    odd = tuple(f"{place}: {fault}" for fault in check_recording(place, about, config))
+    return Look(lines=lines, odd=odd, figure=lambda: draw_recording(loudest, **drawn))

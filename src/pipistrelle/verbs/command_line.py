@@ -47,6 +47,7 @@ for parent, name, place, words in (
     (app, "run", "missions", "Simulate a drive through a random world and map it."),
     (app, "slam", "missions", "Solve a recorded log: a log folder, ROS bag or MRCLAM folder."),
     (app, "hear", "missions", "Detect the echoes in a sound recording, as a log for slam."),
+    (app, "look", "view", "Describe a log, ROS bag or sound recording before it is solved."),
     (app, "view", "view", "Play a mission in a browser, on one page that needs no network."),
     (app, "study", "study", "Run all cases of a plan in many worlds, or continue a study."),
     (app, "report", "compare", "Write a study as one page: answer, figures, claims."),

@@ -1,12 +1,12 @@
-"""`pipistrelle view` and `array`: a mission as a page, a microphone array as a picture."""
+"""`pipistrelle view`, `look` and `array`: a page of a mission, pictures of logs and arrays."""
 
-import io
 import math
 import os
 from contextlib import suppress
+from inspect import Parameter as Argument
 from pathlib import Path
 from tempfile import TemporaryFile
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 from cyclopts import Parameter
 
@@ -22,50 +22,44 @@ from pipistrelle.files import (
     write_whole,
 )
 from pipistrelle.refusals import shown
+from pipistrelle.scripting import hearing
 from pipistrelle.settings import resolve
-from pipistrelle.verbs.console import text_table
-from pipistrelle.verbs.options import NamedSettings, layers
+from pipistrelle.verbs.console import output_to, text_table
+from pipistrelle.verbs.missions import SLAM_OPTIONS
+from pipistrelle.verbs.options import NamedSettings, door_of, layers, setting_flags, switch, verb_of
 from pipistrelle.verbs.streams import put, say, warn
 
 if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
     from pipistrelle.arrays.beamforming import Pattern
     from pipistrelle.arrays.layout import Scattered
-    from pipistrelle.figures.player.playback import Playback
+    from pipistrelle.figures.player import Playback
 
 PAGE = "view.html"
 """Name of the page in a result folder."""
+PICTURES = (".png", ".svg", ".pdf")
+Picture = Annotated[Path | None, output_to("PICTURE", "A .png, .svg or .pdf file.")]
+"""The option for a picture, and the endings of its name."""
+
+
+def _own_code(kind: str, *names: str) -> Parameter:
+    """Return the option of `view` that allows code of the user to run again."""
+    words = f"Run this code, an {kind} of your own that the mission was conducted with. Code that "
+    words += "a folder names runs only if you name it here."
+    return Parameter(name=names, metavar="MODULE:CLASS", help=words)
 
 
 def view(
     folder: Annotated[Path, Parameter(help="The result folder of a run or slam.")],
     /,
     *,
-    output: Annotated[
-        Path | None,
-        Parameter(
-            name=("--output", "-o"), metavar="FILE.html", help=f"The page. [default: FOLDER/{PAGE}]"
-        ),
-    ] = None,
+    output: Annotated[Path | None, output_to("FILE.html", "The page.", f"FOLDER/{PAGE}")] = None,
     log: Annotated[
         Path | None, Parameter(metavar="DIR", help="The solved log, if it was moved.")
     ] = None,
-    estimator: Annotated[
-        tuple[str, ...],
-        Parameter(
-            name=("--filter", "--estimator"),
-            metavar="MODULE:CLASS",
-            help="Run this code, an estimator of your own that the mission was conducted with. "
-            "Code that a folder names runs only if you name it here.",
-        ),
-    ] = (),
-    association: Annotated[
-        str | None,
-        Parameter(
-            name="--association.method",
-            metavar="MODULE:CLASS",
-            help="Run this code, an association of your own that the mission was conducted with.",
-        ),
-    ] = None,
+    estimator: Annotated[tuple[str, ...], _own_code("estimator", "--filter", "--estimator")] = (),
+    association: Annotated[str | None, _own_code("association", "--association.method")] = None,
     overwrite: Annotated[bool, Parameter(help="Replace an existing FILE.")] = False,
     quiet: Annotated[bool, Parameter(help="Print only the path of the page.")] = False,
 ) -> None:
@@ -74,8 +68,8 @@ def view(
 
     read_summary(folder)
     target = folder / PAGE if output is None else output
-    check_place(target, folder, ".html", overwrite)
-    from pipistrelle.figures.player.playback import page
+    check_place(target, folder, overwrite, ".html")
+    from pipistrelle.figures.player import page
     from pipistrelle.scripting.arguments import named_filters
 
     trusted = (*(named_filters(estimator, "--filter") if estimator else ()), association or "")
@@ -90,7 +84,7 @@ def _play_again(
     """Run a mission again from its result folder; return its frames for the page."""
     from pipistrelle.experiments.machine import keep_freed_memory
     from pipistrelle.experiments.runs.replay import rerun
-    from pipistrelle.figures.player.playback import playback
+    from pipistrelle.figures.player import playback
     from pipistrelle.figures.recorder import MissionRecorder
     from pipistrelle.kernel_clock import announce
     from pipistrelle.verbs.console import progress
@@ -105,11 +99,12 @@ def _play_again(
     return playback(mission, watch.snapshots)
 
 
-def check_place(path: Path, folder: Path | None, ending: str, overwrite: bool) -> None:
+def check_place(path: Path, folder: Path | None, overwrite: bool, *endings: str) -> None:
     """Raise if a file cannot be written at a path, before its content is computed."""
-    fix = f"name another with -o FILE{ending}"
-    if path.suffix.lower() != ending:
-        raise InputError(f"-o: found {path}, expected a name that ends in {ending}")
+    fix = f"name another with -o FILE{endings[0]}"
+    if path.suffix.lower() not in endings:
+        expected = f"a name that ends in {' or '.join(endings)}"
+        raise InputError(f"-o: found {path}, expected {expected}")
     if path.is_dir():
         raise InputError(f"{path}: found a folder, expected a file; {fix}")
     if folder is not None and _is_in(path, folder):
@@ -153,6 +148,38 @@ def write_file(path: Path, folder: Path | None, data: bytes, overwrite: bool) ->
         raise InputError(f"{path}: could not be written ({error.strerror}); {fix}") from error
 
 
+def _write_picture(path: Path, figure: "Figure", overwrite: bool) -> None:
+    """Write a figure as a file of the kind that its name ends in, and print its path."""
+    from pipistrelle.figures.style import picture_bytes
+
+    write_file(path, None, picture_bytes(figure, path.suffix.lower()), overwrite)
+    put(path)
+
+
+def _look(asked: dict[str, Any]) -> None:
+    """Print the content of a log or recording for `pipistrelle look`, and draw it if asked."""
+    output, overwrite = asked["output"], asked["overwrite"]
+    if output is not None:
+        check_place(output, None, overwrite, *PICTURES)
+    found = hearing.look_by(door_of(asked))
+    put("\n".join(found.lines))
+    warn(*found.odd)
+    if output is not None:
+        _write_picture(output, found.figure(), overwrite)
+
+
+look = verb_of(
+    hearing.look,
+    _look,
+    settings=setting_flags(lambda key: key[0] == "bag" or hearing.is_heard(key)),
+    options={name: SLAM_OPTIONS[name] for name in ("robot", "truth")},
+    extra=[
+        Argument("output", Argument.KEYWORD_ONLY, default=None, annotation=Picture),
+        switch("overwrite", "Replace an existing PICTURE."),
+    ],
+)
+
+
 def array(
     file: Annotated[str, Parameter(help="The array: a file as of receiver.array, or square.")],
     /,
@@ -162,15 +189,13 @@ def array(
         Parameter(metavar="HZ", help="Frequency [Hz]. [default: that of the vehicle's call]"),
     ] = None,
     named: NamedSettings = None,
-    output: Annotated[
-        Path | None, Parameter(name=("--output", "-o"), metavar="FILE.png", help="The picture.")
-    ] = None,
-    overwrite: Annotated[bool, Parameter(help="Replace an existing FILE.png.")] = False,
+    output: Picture = None,
+    overwrite: Annotated[bool, Parameter(help="Replace an existing PICTURE.")] = False,
     quiet: Annotated[bool, Parameter(help="Print only the path of the picture.")] = False,
 ) -> None:
     """Draw a microphone array; print its aperture, beam widths and ambiguous bearings."""
     if output is not None:
-        check_place(output, None, ".png", overwrite)
+        check_place(output, None, overwrite, *PICTURES)
     from pipistrelle.arrays.beamforming import pattern_of
     from pipistrelle.arrays.layout import read_array, scattered, square_microphones
 
@@ -201,11 +226,7 @@ def array(
 
         name = file if square else Path(file).name
         asked = {"name": name, "frequency": frequency, "speed_of_sound": c}
-        picture = io.BytesIO()
-        figure = draw_array(microphones, layout, patterns, **asked)
-        figure.savefig(picture, format="png", dpi=160, metadata={"Software": None})
-        write_file(output, None, picture.getvalue(), overwrite)
-        put(output)
+        _write_picture(output, draw_array(microphones, layout, patterns, **asked), overwrite)
 
 
 def _table(layout: "Scattered", patterns: "tuple[Pattern, ...]") -> str:

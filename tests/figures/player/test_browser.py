@@ -8,8 +8,8 @@ import pytest
 
 from pipistrelle.estimation.beliefs import placed
 from pipistrelle.experiments.drives import NO_TRUTH
-from pipistrelle.figures.player.playback import Rows, playback
-from pipistrelle.figures.player.playback import page as written_page
+from pipistrelle.figures.player import Rows, playback
+from pipistrelle.figures.player import page as written_page
 from reference.pages import contrasts, shown
 
 

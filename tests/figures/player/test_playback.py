@@ -16,7 +16,7 @@ from pipistrelle.detection.scans import rows_of as rows_of_scan
 from pipistrelle.estimation.beliefs import Gaussian
 from pipistrelle.experiments.drives import NO_TRUTH
 from pipistrelle.experiments.runs.trial import run_mission
-from pipistrelle.figures.player.playback import MAX_PARTICLES, SCRIPTS, page, playback
+from pipistrelle.figures.player import MAX_PARTICLES, SCRIPTS, page, playback
 from pipistrelle.figures.recorder import MissionRecorder, callers_at, pruned, resolved
 
 BAD = "</script><script>alert('a')</script>\"'&"

@@ -8,7 +8,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from pipistrelle.figures.player.playback import playback
+from pipistrelle.figures.player import playback
 
 EXAMPLE = Path(__file__).resolve().parents[3] / "examples" / "viewers" / "rerun_mission.py"
 MISSING = "rerun-sdk is not installed: python -m pip install rerun-sdk"
