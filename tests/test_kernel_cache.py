@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 from pipistrelle import kernel_folder
-from pipistrelle.kernel_clock import COMPILING
+from pipistrelle.jit import COMPILING
 from pipistrelle.kernel_folder import sources_key
 
 PACKAGE = Path(kernel_folder.__file__).parent

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from pipistrelle.evaluation.bound import IN_ONE_WORLD
-from pipistrelle.kernel_clock import COMPILING  # noqa: F401 - said where the cache has none
+from pipistrelle.jit import COMPILING  # noqa: F401 - said where the cache has none
 
 SHORT = ("--settings", "paper", "--duration", "4", "--landmarks", "10")
 """The paper's mission in a world of eight frames."""

@@ -13,7 +13,7 @@ import polars as pl
 import pytest
 
 import pipistrelle
-from pipistrelle import files, kernel_clock
+from pipistrelle import files, jit
 from pipistrelle.acoustics.emitter import beamwidth
 from pipistrelle.config import Config
 from pipistrelle.estimation.catalogue import PAPERS
@@ -82,7 +82,7 @@ def test_compilation_is_announced(obey, undrawn, monkeypatch, words, said):
         numba.njit(lambda x: x + 1)(1.0)
         return run_mission(*given, **named)
 
-    monkeypatch.setattr(kernel_clock._CLOCK, "said", False)  # as in a new process
+    monkeypatch.setattr(jit._CLOCK, "said", False)  # as in a new process
     monkeypatch.setattr(missions, "run_mission", compiling)
     assert obey("run", *SHORT, *words)[2].count(COMPILING) == said
 

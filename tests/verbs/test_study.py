@@ -7,7 +7,7 @@ from pathlib import Path
 import numba
 import pytest
 
-from pipistrelle import kernel_clock
+from pipistrelle import jit
 from pipistrelle.__main__ import main
 from pipistrelle.experiments.runs import compiling
 from pipistrelle.experiments.studies import study, world
@@ -52,7 +52,7 @@ def failing(monkeypatch):
 
 @pytest.mark.parametrize(("words", "said"), [((), 1), (("--quiet",), 0)])
 def test_compilation_is_announced(capsys, monkeypatch, words, said):
-    monkeypatch.setattr(kernel_clock._CLOCK, "said", False)  # as in a new process
+    monkeypatch.setattr(jit._CLOCK, "said", False)  # as in a new process
     monkeypatch.setattr(compiling, "run_mission", lambda *_: numba.njit(lambda x: x + 1)(1.0))
     line = ("study", "small.toml", "--iterations", "1", "--workers", "1", "-o", "one")
     assert main([*line, *words]) == 0

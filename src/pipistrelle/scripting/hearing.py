@@ -35,7 +35,7 @@ if TYPE_CHECKING:
     from pipistrelle.detection.sounds.hearing import Frame
     from pipistrelle.detection.sounds.sound_file import Description
     from pipistrelle.experiments.drives import Truth
-    from pipistrelle.figures.overview import Rows
+    from pipistrelle.figures.sound import Rows
 
 SECTIONS = ("detection", "matching")
 """Sections of settings that `hear` uses, besides ``assumed.speed_of_sound``."""
@@ -274,7 +274,7 @@ def look_by(door: Door) -> Look:
 def _log(place: Path, recorded: "Log", truth: "Truth") -> Look:
     """Describe a recorded log."""
     from pipistrelle.detection.scans import COLUMNS
-    from pipistrelle.figures.overview import draw_log
+    from pipistrelle.figures.sound import draw_log
     from pipistrelle.scripting.log_warnings import dead_reckoned, early_warnings
 
     sizes = [scan.landmark.size for scan in recorded.scans]
@@ -363,7 +363,7 @@ def _recording(place: Path, given: Layer) -> Look:
     from pipistrelle.detection.sounds.check import check_recording
     from pipistrelle.detection.sounds.hearing import GAPS, prepared
     from pipistrelle.detection.sounds.sound_file import open_sound
-    from pipistrelle.figures.overview import draw_recording
+    from pipistrelle.figures.sound import draw_recording
 
     about, config = described(place), heard_settings(given)
     with open_sound(place, about) as sound:

@@ -12,7 +12,6 @@ in the numbers of the log, so that units and columns do not matter: half the pri
 that the earlier scan lacks the landmark, and :math:`p_0` is uniform over the recorded numbers.
 """
 
-import tomllib
 from collections.abc import Iterator, Sequence
 from math import ceil, floor, hypot, inf, log10, pi, radians, sqrt, tau
 from pathlib import Path
@@ -29,7 +28,6 @@ from pipistrelle.estimation.data_association.watch import POSE
 from pipistrelle.estimation.motion import relative_motions
 from pipistrelle.experiments.named_settings import own_config
 from pipistrelle.experiments.runs.replay import log_motion
-from pipistrelle.files import shipped_text
 from pipistrelle.geometry import wrap
 from pipistrelle.scripting.arguments import has_excess_paths
 
@@ -49,6 +47,7 @@ MIN_EXCESS_PATH = 0.2
 UNSURE = {"bearing_std": ("bearings", "rad", WIDEST), "way_std": ("ranges", "m", inf)}
 """Settings by which an association discards rows: the measured numbers, their unit, and the largest
 standard deviation for which a larger value is advised."""
+DEGREE = pi / 180.0
 COMPARED = 32
 """Most scans, and most rows of a scan, that are compared with earlier scans."""
 LAGS = 2 ** np.arange(10)
@@ -348,9 +347,53 @@ class Mistake(NamedTuple):
 
 
 NONE = Mistake("", "", "")
-MISTAKES = tuple(
-    Mistake(**row) for row in tomllib.loads(shipped_text("scripting/mistakes.toml"))["mistake"]
-)
+MISTAKES = (
+    Mistake(
+        "bearings seem to be clockwise", "negated",
+        "negate the bearings (or the turns of the odometry, if these are clockwise)", turn=-1.0,
+    ),
+    Mistake(
+        "bearings seem to be in degrees", "in radians", "multiply them by pi / 180", turn=DEGREE
+    ),
+    Mistake(
+        "bearings seem to be in degrees and clockwise", "in radians and negated",
+        "multiply them by -pi / 180", turn=-DEGREE,
+    ),
+    Mistake(
+        "bearings and ranges seem to be swapped", "exchanged", "exchange the two columns",
+        swapped=True,
+    ),
+    Mistake(
+        "bearings and ranges seem to be swapped, and bearings in degrees", "exchanged, in radians",
+        "exchange the two columns, and multiply the bearings by pi / 180", turn=DEGREE,
+        swapped=True,
+    ),
+    Mistake(
+        "bearings seem to be from the rear of the vehicle", "turned by pi",
+        "add pi to them, or to the angle of sensor_pose", offset=pi,
+    ),
+    Mistake(
+        "bearings seem to be from the x axis of the map", "less the heading",
+        "subtract the vehicle's heading", from_map=True,
+    ),
+    Mistake(
+        "bearings seem to be of a compass, clockwise from the y axis", "from the heading",
+        "subtract them and the vehicle's heading from pi / 2", turn=-1.0, offset=0.5 * pi,
+        from_map=True,
+    ),
+    Mistake(
+        "bearings seem to be of a compass, in degrees from the y axis", "from the heading",
+        "subtract them and the vehicle's heading from 90 degrees, in radians", turn=-DEGREE,
+        offset=0.5 * pi, from_map=True,
+    ),
+    Mistake("ranges seem to be in millimetres", "in metres", "divide them by 1000", scale=1e-3),
+    Mistake("ranges seem to be in centimetres", "in metres", "divide them by 100", scale=1e-2),
+    Mistake("ranges seem to be in kilometres", "in metres", "multiply them by 1000", scale=1e3),
+    Mistake(
+        "the odometry seems to turn in degrees", "in radians",
+        "multiply its angles by pi / 180", rate=DEGREE,
+    ),
+)  # fmt: skip
 """The mistakes that `misreading` tries."""
 
 

@@ -463,7 +463,7 @@ def _called(
     conduct_by: Callable[[Door], Results], asked: dict[str, Any], flags: Layer, **more: str
 ) -> Results:
     """Run a mission that was called from Python; warn of failed estimates."""
-    from pipistrelle.kernel_clock import announce
+    from pipistrelle.jit import announce
     from pipistrelle.scripting.missions import failures
 
     door = Door(

@@ -109,7 +109,7 @@ def progress(quiet: bool) -> "Iterator[Progress]":
 
 def _stopwatch() -> Callable[[str], float]:
     """Return a function that measures the time of a stage [s], without compilation."""
-    from pipistrelle.kernel_clock import wall_s
+    from pipistrelle.jit import wall_s
 
     began, latest = {}, wall_s()
 

@@ -32,7 +32,7 @@ def doctor(
         put(f"{name:<18}{state}")
     if compile_kernels:
         from pipistrelle.experiments.runs.compiling import compile_all
-        from pipistrelle.kernel_clock import announce, cpu_s
+        from pipistrelle.jit import announce, cpu_s
 
         announce(None)
         began, worked = time.thread_time(), cpu_s()

@@ -59,7 +59,7 @@ def working(quiet: bool, *kernels: Any) -> Iterator[Callable[..., None]]:
     `kernels`: the settings and the estimators of kernels to compile first, in two processes.
     """
     from pipistrelle.experiments.runs.compiling import in_two_processes
-    from pipistrelle.kernel_clock import announce
+    from pipistrelle.jit import announce
 
     tell = None if quiet else say
     announce(tell)

@@ -86,7 +86,7 @@ def _play_again(
     from pipistrelle.experiments.runs.replay import rerun
     from pipistrelle.figures.player import playback
     from pipistrelle.figures.recorder import MissionRecorder
-    from pipistrelle.kernel_clock import announce
+    from pipistrelle.jit import announce
     from pipistrelle.verbs.console import progress
 
     keep_freed_memory()

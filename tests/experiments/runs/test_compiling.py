@@ -10,7 +10,7 @@ import numba
 import pytest
 from numba.core.event import install_timer
 
-from pipistrelle import kernel_clock
+from pipistrelle import jit
 from pipistrelle.config import Config, InputError, ScenarioConfig
 from pipistrelle.estimation.catalogue import CATALOGUE
 from pipistrelle.experiments.runs import compiling, trial, validate
@@ -51,29 +51,29 @@ for name in sys.argv[1:]:
 def said(monkeypatch):
     """What is announced of the next that is compiled, as if it were this process's first."""
     lines = []
-    monkeypatch.setattr(kernel_clock._CLOCK, "said", False)
-    kernel_clock.announce(lines.append)
+    monkeypatch.setattr(jit._CLOCK, "said", False)
+    jit.announce(lines.append)
     yield lines
-    kernel_clock.announce()
+    jit.announce()
 
 
 def test_the_first_of_the_kernels_that_are_compiled_is_announced_before_and_no_other(said):
     numba.njit(lambda x: x + 1)(1.0)
-    assert said == [kernel_clock.COMPILING]
+    assert said == [jit.COMPILING]
     numba.njit(lambda x: x + 2)(1.0)
-    assert said == [kernel_clock.COMPILING]
-    kernel_clock.announce(said.append)  # by a second mission in this process
+    assert said == [jit.COMPILING]
+    jit.announce(said.append)  # by a second mission in this process
     numba.njit(lambda x: x + 3)(1.0)
-    assert said == [kernel_clock.COMPILING]
+    assert said == [jit.COMPILING]
 
 
 def test_the_announcement_may_be_silent(said, capfd):
-    kernel_clock.announce(None)
+    jit.announce(None)
     numba.njit(lambda x: x - 1)(1.0)
     assert capfd.readouterr() == ("", "")
-    kernel_clock.announce(said.append)
+    jit.announce(said.append)
     numba.njit(lambda x: x - 2)(1.0)
-    assert said == [kernel_clock.COMPILING], "who was not told was counted as told"
+    assert said == [jit.COMPILING], "who was not told was counted as told"
 
 
 def test_nothing_is_announced_while_input_is_judged(said, monkeypatch):
@@ -88,7 +88,7 @@ def test_nothing_is_announced_while_input_is_judged(said, monkeypatch):
         trial.run_mission(TINY, ("fused",))
     assert said == []
     numba.njit(lambda x: x + 5)(1.0)
-    assert said == [kernel_clock.COMPILING]
+    assert said == [jit.COMPILING]
 
 
 def test_compilation_does_not_count_as_a_filters_time(monkeypatch):
@@ -123,7 +123,7 @@ def test_an_empty_cache_costs_no_filter_time_with_timing_or_without(tmp_path):
         text=True,
         check=True,
     )
-    assert done.stderr == kernel_clock.COMPILING + "\n"
+    assert done.stderr == jit.COMPILING + "\n"
     rows = [json.loads(line) for line in done.stdout.splitlines()]
     assert [row[:2] for row in rows] == [[name, timed] for name in names for timed in (False, True)]
     for name, timed, compiled, in_filters, took in rows:
@@ -163,7 +163,7 @@ def test_a_second_process_starts_with_the_first_kernel_and_ends_with_the_work(sa
     with compiling.in_two_processes(said.append, TINY, ["ekf"]):
         assert second == []
         numba.njit(lambda x: x + 6)(1.0)
-        assert said == [kernel_clock.COMPILING]
+        assert said == [jit.COMPILING]
         (process,) = second
         assert process.poll() is None
     assert process.poll() is not None
@@ -177,7 +177,7 @@ def test_a_missing_second_process_does_not_stop_the_first(said, second, monkeypa
         monkeypatch.setattr(compiling.sys, "executable", os.devnull + "/python")
     with compiling.in_two_processes(said.append, TINY, ["ekf"]):
         assert numba.njit(lambda x: x + 7)(1.0) == 8.0
-    assert said == [kernel_clock.COMPILING]
+    assert said == [jit.COMPILING]
     assert second == []
 
 

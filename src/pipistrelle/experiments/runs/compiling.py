@@ -27,7 +27,7 @@ from pipistrelle.experiments.runs.heard_world import drive_of
 from pipistrelle.experiments.runs.trial import run_mission, try_trial
 from pipistrelle.experiments.runs.validate import checked_scenario
 from pipistrelle.geometry import wrap
-from pipistrelle.kernel_clock import announce
+from pipistrelle.jit import announce
 
 _SECOND = """
 import sys

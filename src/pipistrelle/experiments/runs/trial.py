@@ -13,7 +13,7 @@ from math import nan
 import numpy as np
 from jaxtyping import Float
 
-from pipistrelle import kernel_clock
+from pipistrelle import jit
 from pipistrelle.acoustics.emitter import beamwidth_of
 from pipistrelle.acoustics.paths import VEHICLE
 from pipistrelle.arithmetic.random_stream import stream_key
@@ -195,7 +195,7 @@ def run_trial(
         if watch:
             watch(strategy, name, scan, belief)
 
-    began = kernel_clock.wall_s()
+    began = jit.wall_s()
     parted, steps = split_at(drive, [scan.time for scan in scans])
     parted = at_sensor(parted)
     whole = run_filter(
@@ -208,7 +208,7 @@ def run_trial(
         progress=partial(progress, f"{strategy} {short_name(name)}") if progress else None,
         watch=look,
     )
-    wall_s = kernel_clock.wall_s() - began
+    wall_s = jit.wall_s() - began
     track = _named(at_vehicle(at_steps(whole, steps), drive.sensor), used, drive)
     truth, limit, found, mapped = drive.truth, estimator.nees_limit, None, None
     if association is not None and causes is not None:

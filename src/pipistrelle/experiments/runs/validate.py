@@ -19,7 +19,7 @@ from pipistrelle.estimation.data_association.sequential import association_of
 from pipistrelle.estimation.motion import Motion
 from pipistrelle.experiments.hearing.scenario import ALL_DRAWN, Scenario, World, world_of
 from pipistrelle.experiments.machine import check_length, check_recording
-from pipistrelle.kernel_clock import judging
+from pipistrelle.jit import judging
 
 
 def check_filters(

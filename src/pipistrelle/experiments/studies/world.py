@@ -23,7 +23,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from pipistrelle import kernel_clock
+from pipistrelle import jit
 from pipistrelle.acoustics.emitter import beamwidth_of
 from pipistrelle.config import Config, InputError
 from pipistrelle.estimation.beliefs import KNOWN, Track, revises_path
@@ -209,9 +209,9 @@ def _try_case(case: PlannedCase, shared: HeardWorld, iteration: int) -> TrialRec
     try:
         drive, scans = drive_of(scenario, config, iteration), shared.scans(config, strategy)
         heard, causes = shared.beams[config.emitter.radius], shared.causes(config, strategy)
-        began = kernel_clock.cpu_s()
+        began = jit.cpu_s()
         result = run_trial(replace(case, iteration=iteration), drive, scans, config, causes=causes)
-        cpu_s = kernel_clock.cpu_s() - began
+        cpu_s = jit.cpu_s() - began
         estimate = heaviest(result.mapped or result.track.landmarks)
         scores, full = result.scores, result.track.full
         clutter = sum(frame.clutter for frame in heard) / len(heard) if heard else None
