@@ -39,7 +39,7 @@ from pipistrelle.figures.player import (
     playback,
 )
 from pipistrelle.figures.recorder import MissionRecorder
-from pipistrelle.figures.style import INK, PAGE, TRUTH, strategy_colour
+from pipistrelle.figures.style import INK, TRUTH, strategy_colour
 from pipistrelle.geometry import wrap
 
 if TYPE_CHECKING:
@@ -150,7 +150,7 @@ def _blueprint(playback: Playback) -> Any:
             name=f"{estimate.strategy} {title_of(estimate.filter)}",
             origin="/",
             contents=[f"/{_name(estimate)}/**", "/truth/**"],
-            background=_rgba(PAGE["paper"][0]).tolist(),
+            background=_rgba("#fbfaf7").tolist(),
             eye_controls=_from_above(playback),
         )
         for estimate in playback.estimates

@@ -71,8 +71,7 @@ def test_noise_changes_nothing_but_the_standard_deviations():
 @pytest.mark.parametrize("stds", [(0.2, 0.15, 0.4), (1.0, 0.01, 0.03)])
 def test_the_noise_of_the_settings_is_theirs(stds):
     told = dict(zip(("range_std", "bearing_std", "excess_path_std"), stds, strict=True))
-    noise = noise_of(FilterConfig(**told))
-    assert noise == ConstantNoise(**told, instead=True)
+    assert (noise := noise_of(FilterConfig(**told))) == ConstantNoise(**told, instead=True)
     assert noise_of(FilterConfig(**told, noise="measured")) == ConstantNoise(**told)
     assert hash(noise) == hash(noise_of(FilterConfig(**told)))
 
@@ -86,11 +85,6 @@ def test_constant_noise_hides_measured_but_keeps_stated_deviations():
     assert given.range_std.tolist() == [0.2, 1.8]
     assert given.range.tolist() == [2.0, 9.0]
     assert replace(noise, instead=False).hidden(heard, stated) is stated
-
-
-def test_the_excess_path_std_is_twice_the_range_std():
-    noise = noise_of(FilterConfig())
-    assert noise.excess_path_std == 2.0 * noise.range_std
 
 
 # What the signal tells

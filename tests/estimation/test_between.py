@@ -8,7 +8,7 @@ import pytest
 from pipistrelle.detection.scans import make_scan
 from pipistrelle.estimation.beliefs import Gaussian, placed
 from pipistrelle.estimation.ekf.filter import EkfSlam, InvariantEkfSlam
-from pipistrelle.estimation.observations.excess_path import excess_path_of, landmark_range
+from pipistrelle.estimation.observations.excess_path import excess_path_of
 from pipistrelle.estimation.smoother.filter import Smoother
 from reference.missions import BICYCLE, map_with, ray_config
 
@@ -58,8 +58,3 @@ def test_landmarks_placed_near_the_callers_line_are_consistent(slam):
     assert full.sum() > 20
     assert np.mean(squared > COMMON) < 0.05
     assert np.median(squared) < 3.0, "1.4 where all is linear"
-
-
-@pytest.mark.parametrize("excess_path", [-0.03, 0.0])
-def test_no_excess_path_has_no_range(excess_path):
-    assert landmark_range(excess_path, CALLER, 0.05) == np.inf

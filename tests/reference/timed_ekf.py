@@ -112,8 +112,8 @@ class Timed:
         J = np.zeros((3, self.X.size))
         J[:2, place], J[:2, pose.start : pose.start + 2] = np.eye(2), -np.eye(2)
         J[2, pose.stop - 1] = self.turns
-        farther = FARTHER if self.robust else 1.0
-        C = np.diag([0.0, 0.0, farther**2 * self.bearing_variance, self.excess_path_variance])
+        across = self.bearing_variance * (FARTHER**2 if self.robust else 1.0)
+        C = np.diag([0.0, 0.0, across, self.excess_path_variance])
         C[:3, :3] += J @ self.P @ J.T
         way = np.array([*(z[3:5] - z[:2]), z[2] + z[5], z[6]])
 
@@ -140,8 +140,7 @@ class Timed:
         if not math.isfinite(r) or not np.isfinite(slopes(ranged, z)).all():
             return math.inf, None, None, None
         R = np.diag([self.bearing_variance, self.excess_path_variance])
-        by_state = np.zeros((2, self.X.size))
-        both = slopes(pointed, z)
+        by_state, both = np.zeros((2, self.X.size)), slopes(pointed, z)
         by_state[:, pose], by_state[:, place], noise = both[:, :3], both[:, 3:5], both[:, 5:]
         point = pointed(z)
         if self.turns == 0.0:

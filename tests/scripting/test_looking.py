@@ -63,8 +63,7 @@ def test_odometry_of_a_constant_turn_leads_along_a_circle():
 
 def test_a_log_of_few_rows_and_no_bearings_is_drawn(tmp_path):
     log = noisy_log(steps=5)
-    nothing = np.full(log.scans[0].bearing.size, np.nan)
-    scans = (with_columns(log.scans[0], bearing=nothing),)
+    scans = (with_columns(log.scans[0], bearing=np.nan),)
     write_log(tmp_path / "log", replace(log, scans=scans, bearings=None))
     found = pipistrelle.look(tmp_path / "log")
     assert line(found, "bearing") == "none"
@@ -86,8 +85,7 @@ def test_a_recording_is_described_with_its_level_and_the_faults_that_hear_finds(
     assert line(found, "calls").startswith("8 of the vehicle, 0.5 s apart")
     peak = 20.0 * np.log10(np.abs(samples).max())
     assert f"to {peak:.1f} dB, where" in line(found, "level")
-    above, *_ = found.figure().axes
-    (image,) = above.images
+    (image,) = found.figure().axes[0].images
     level = np.array(image.get_array())[::-1, 0]
     assert 0.5 * rate * level.argmax() / (level.size - 1) == pytest.approx(35e3, rel=0.02)
 

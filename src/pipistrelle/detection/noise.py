@@ -31,14 +31,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from pipistrelle.config import FilterConfig
-from pipistrelle.detection.scans import (
-    KINDS,
-    SLOPE,
-    STD_OF,
-    Scan,
-    without,
-    without_excess_paths,
-)
+from pipistrelle.detection.scans import KINDS, SLOPE, STD_OF, Scan, without, without_excess_paths
 from pipistrelle.jit import Whole, kernel, no_alloc
 
 NOISE_QUANTILE = 0.999

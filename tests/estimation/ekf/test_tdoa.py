@@ -207,17 +207,6 @@ def test_an_excess_path_between_vehicle_and_caller_places_nothing_and_moves_noth
 
 
 @pytest.mark.parametrize("kind", KINDS)
-@pytest.mark.parametrize(("stds", "members"), [(2.9, 2), (3.1, 1)])
-def test_in_line_with_the_caller_an_excess_path_that_may_be_none_places_nothing(
-    kind, stds, members
-):
-    """Else its error would place what is between the two behind the caller, and surely."""
-    slam, belief = standing(kind)
-    after = slam.update(belief, heard(0.5 * CALLER, stds * 0.05))
-    assert min(len(mapped(after, 7)[0]), 2) == members
-
-
-@pytest.mark.parametrize("kind", KINDS)
 def test_an_excess_path_of_an_unknown_caller_counts_as_a_bearing(kind):
     slam, belief = standing(kind)
     e = excess_path_of(np.zeros(2), LANDMARK, CALLER)

@@ -114,17 +114,6 @@ def test_a_caller_is_placed_at_once_by_bearing_and_the_excess_path_over_a_landma
     np.testing.assert_allclose(belief.landmarks().mean[1], CALLER, rtol=0, atol=0.02)
 
 
-@pytest.mark.parametrize("off", [-0.1, -0.03, 0.0, 0.03, 0.1])
-def test_a_landmark_between_vehicle_and_caller_is_not_placed_and_does_no_harm(off):
-    before = knowing(9, CALLER)
-    between = 0.4 * CALLER
-    row = (4, between, np.nan, excess_path_of(HERE, between, CALLER) + off)
-    belief = slam().update(before, scan(row, std=0.05))
-    assert belief.history.placed == (9,)
-    assert not placed(belief.landmarks())[1:].any()
-    np.testing.assert_array_equal(belief.pose().mean, before.pose().mean)
-
-
 def test_a_landmark_between_vehicle_and_caller_stays_in_place():
     """Slopes along the line are none there: e says how far beside it stands, at most."""
     before, between = knowing(9, CALLER), 0.4 * CALLER

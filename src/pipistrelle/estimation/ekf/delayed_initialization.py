@@ -53,10 +53,7 @@ from pipistrelle.estimation.ekf.gaussian import (
     relative_covariance,
 )
 from pipistrelle.estimation.observations.bearing import MIN_CROSSING_SINE, observe
-from pipistrelle.estimation.observations.excess_path import (
-    range_with_slopes,
-    unscented_range,
-)
+from pipistrelle.estimation.observations.excess_path import range_with_slopes, unscented_range
 from pipistrelle.estimation.observations.range import (
     MIN_SPACING,
     NEAREST,

@@ -51,9 +51,7 @@ from pipistrelle.estimation.checking import (
 )
 from pipistrelle.estimation.motion import SMALLEST_STD, Controls, Durations, Motion
 from pipistrelle.estimation.observations.bearing import MIN_CROSSING_SINE, observe
-from pipistrelle.estimation.observations.excess_path import (
-    unscented_range,
-)
+from pipistrelle.estimation.observations.excess_path import unscented_range
 from pipistrelle.estimation.observations.range import is_certain
 from pipistrelle.estimation.observations.rows import LOSSES
 from pipistrelle.estimation.rays import gate_bounds
