@@ -238,6 +238,8 @@ def measure(root: Path = ROOT) -> House:
                     first = text.splitlines()[0]
                     flagged.append(Flagged(f"{place}:{line}", first, ["leans on a neighbour"]))
                 replaced += against_glossary(f"{place}:{line}", text)
+    others = (path for path in source.rglob("*.*") if path.suffix[:3] != ".py")
+    count["lines of other files"] = sum(path.read_bytes().count(b"\n") for path in others)
     for path in sorted((root / "tests").rglob("*.py")):
         text = path.read_text(encoding="utf-8")
         count["lines of tests"] += text.count("\n")

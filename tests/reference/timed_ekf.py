@@ -139,7 +139,6 @@ class Timed:
         r = ranged(z)
         if not math.isfinite(r) or not np.isfinite(slopes(ranged, z)).all():
             return math.inf, None, None, None
-        R = np.diag([self.bearing_variance, self.excess_path_variance])
         by_state, both = np.zeros((2, self.X.size)), slopes(pointed, z)
         by_state[:, pose], by_state[:, place], noise = both[:, :3], both[:, 3:5], both[:, 5:]
         point = pointed(z)
@@ -150,7 +149,7 @@ class Timed:
             self.deviation(z, pose, place, of_caller=of_caller) / r,
             point,
             by_state,
-            noise @ R @ noise.T,
+            noise @ np.diag([self.bearing_variance, self.excess_path_variance]) @ noise.T,
         )
 
     # Update and weights
