@@ -80,6 +80,6 @@ plt.show()
 # %%
 # What is the error of the posts on the map, and are any missing or false?
 
-score = gospa(found, np.column_stack((posts.real, posts.imag)), cutoff=1.0)
-answer = score.error / np.sqrt(len(found) - score.false)
-print(f"{answer:.3f} m, {score.missed} missed, {score.false} false")
+_, error, missed, false = gospa(found, np.column_stack((posts.real, posts.imag)), cutoff=1.0)
+answer = error / np.sqrt(len(found) - false)
+print(f"{answer:.3f} m, {missed} missed, {false} false")

@@ -217,7 +217,7 @@ def test_two_excess_paths_place_a_landmark_with_the_deviation_of_information(pla
 
 def test_without_labels_all_posts_are_found_and_nothing_else(play):
     done = play("11_without_labels")
-    assert (done["score"].missed, done["score"].false) == (0, 0)
+    assert (done["missed"], done["false"]) == (0, 0)
     assert done["answer"] < 0.15, "what dead reckoning and the start's heading leave"
     rows = [row.split(",") for row in done["measured"]]
     assert {row[1] for row in rows} == {""}, "no row has a label"

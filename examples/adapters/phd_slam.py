@@ -92,9 +92,9 @@ def score(files: Path, result: Path) -> None:
     tracked = result / f"track_{mapped.stem.removeprefix('map_')}.tum"
     off = np.loadtxt(tracked)[:, 1:3] - world["Robot_Groundtruth"][:2].T
     points = np.loadtxt(mapped, delimiter=",", skiprows=1, usecols=(1, 2))
-    found = gospa(points, world["Landmark_Groundtruth"][:, 1:3], CUTOFF)
-    print(f"position {rmse(np.hypot(*off.T)):.2f} m, GOSPA {found.distance:.2f} m", end=", ")
-    print(f"{found.missed} missed, {found.false} false")
+    distance, _, missed, false = gospa(points, world["Landmark_Groundtruth"][:, 1:3], CUTOFF)
+    print(f"position {rmse(np.hypot(*off.T)):.2f} m, GOSPA {distance:.2f} m", end=", ")
+    print(f"{missed} missed, {false} false")
 
 
 if __name__ == "__main__":

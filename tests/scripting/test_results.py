@@ -288,8 +288,8 @@ def test_importing_the_package_loads_no_numpy_and_lists_its_doors():
         " dir(pipistrelle)); pipistrelle.nothing"
     )
     ran = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
-    doors = "[] ['Config', 'InputError', 'Slam', '__version__', 'hear', 'load', 'run', 'slam', "
-    assert ran.stdout.startswith(doors + "'study']")
+    doors = "[] ['Config', 'InputError', 'Slam', '__version__', 'hear', 'load', 'look', 'run', "
+    assert ran.stdout.startswith(doors + "'slam', 'study']")
     assert "module 'pipistrelle' has no attribute 'nothing'" in ran.stderr
 
 

@@ -155,7 +155,7 @@ def test_a_log_that_is_gone_is_asked_for_and_may_be_elsewhere(folders):
     Path("log").rename("moved [1] away")
     said = refused("slam")
     assert said.startswith("slam/summary.json: log.path: found ")
-    assert "which is not there, expected the log that was solved; put it back" in said
+    assert "which is not there, expected the log that was solved; restore it" in said
     assert rerun(Path("slam"), log=Path("moved [1] away")).difference == ""
     assert "option --log: found nowhere, which is not there" in refused("slam", log=Path("nowhere"))
 
@@ -174,7 +174,7 @@ def test_a_log_that_was_changed_is_refused_by_its_file(folders, gone, said):
     for name in gone:
         Path("log", name).unlink()
     found = refused("slam")
-    expected = "expected it as slam was made of it; put that back, or solve it as it is, "
+    expected = "expected it as slam was made of it; restore the log, or solve it again, "
     assert f"found not the log that was solved ({said}), {expected}" in found
 
 

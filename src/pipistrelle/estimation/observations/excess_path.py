@@ -138,7 +138,7 @@ def unscented_range(clue: Clue, spread: Spread, of_caller: Flag) -> tuple[float,
     >>> spread = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.01
     >>> r, variance = unscented_range((6.0, 0.0, np.arctan2(4.0, 3.0), 4.0), spread, False)
     >>> round(r, 3), round(variance, 4)
-    (5.0, 0.0064)
+    (5.0, 0.0061)
     >>> unscented_range((6.0, 0.0, 0.0, 0.0), spread, False)
     (nan, nan)
     """
