@@ -249,8 +249,8 @@ class ConstantNoise:
     def __call__(self, scan: Scan) -> Scan:
         """Fill a scan's missing standard deviations with the constants."""
         numbers = scan.numbers.copy()
-        for row, name in zip(STDS, STD_OF.values(), strict=True):
-            numbers[row, np.isnan(numbers[row])] = getattr(self, name)
+        stds = numbers[STDS[0] : STDS[-1] + 1]
+        np.copyto(stds, [[getattr(self, name)] for name in STD_OF.values()], where=np.isnan(stds))
         return replace(scan, numbers=numbers)
 
     def hidden(self, heard: Scan, stated: Scan) -> Scan:
