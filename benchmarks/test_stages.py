@@ -103,7 +103,8 @@ def test_precise_bearings(benchmark, name):
     """Time a drive of 300 scans with bearings of 0.003 rad; store its aligned error."""
     drive, scans = turn_and_drive(1)
     config = Config(
-        filter=FilterConfig(gate=0.999), rays=RayConfig(range_bounds=(0.1, 10.0), spacing="auto")
+        filter=FilterConfig(gate=0.999),
+        rays=RayConfig(range_bounds=(0.1, 10.0), precise_bearings="auto"),
     )
     case = Case(strategy="passive", filter=name)
     found = benchmark.pedantic(run_trial, (case, drive, scans, config), rounds=3, warmup_rounds=1)

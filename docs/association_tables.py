@@ -29,7 +29,7 @@ LOST_M, LOST_TIMES = 0.25, 5.0
 def planned(grid, **config):
     """Return the study `association` with excess paths, another grid and settings more."""
     table = tomllib.loads(find_plan("association").read_text(encoding="utf-8"))
-    table["config"] |= {"listening.timing": True, **config}
+    table["config"] |= {"listening.excess_paths": True, **config}
     return table | {"filters": ["iekf"], "grid": grid}
 
 
@@ -51,7 +51,7 @@ def chosen(trials, strategy, radius, name, method, timing):
         (pl.col("strategy") == strategy)
         & (pl.col("filter") == name)
         & (pl.col("association.method") == method)
-        & (pl.col("listening.timing").cast(pl.Float64) == timing)
+        & (pl.col("listening.excess_paths").cast(pl.Float64) == timing)
     )
     if strategy != "passive":
         cell = cell.filter(pl.col("emitter.radius") == radius)
@@ -83,7 +83,7 @@ def score_cell(known, unlabelled):
 def print_table(trials, cell):
     """Print a table of all methods that are there, and filters."""
     there = {*trials["association.method"].unique()}
-    timings = trials["listening.timing"].cast(pl.Float64).unique().sort(descending=True)
+    timings = trials["listening.excess_paths"].cast(pl.Float64).unique().sort(descending=True)
     print("\n| | " + " | ".join(name for name, *_ in COLUMNS) + " |")
     print("|---|" + "--:|" * len(COLUMNS))
     for timing in timings:
@@ -108,7 +108,7 @@ def main(*studies):
     print("worlds:", dict(sorted(worlds.iter_rows())))
     print_table(trials, error_cell)
     print_table(trials, score_cell)
-    with_timing = trials.filter(pl.col("listening.timing").cast(pl.Float64) == 1.0)
+    with_timing = trials.filter(pl.col("listening.excess_paths").cast(pl.Float64) == 1.0)
     cpu = with_timing.group_by("filter", "association.method").agg(pl.col("cpu_s").median())
     print("\nCPU of a trial, median [s]:")
     for name, method, seconds in cpu.sort("filter", "association.method").iter_rows():

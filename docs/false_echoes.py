@@ -42,7 +42,7 @@ def settings(way, frames):
 
 def kind_of(caller, delay, bearing, arrivals, faintest_db):
     """Tell in which way a row is false, by the arrivals that are heard at its time."""
-    pulse = Config().emitter.pulse
+    pulse = Config().emitter.call_duration
     late = np.abs(arrivals.delay - delay)
     level = arrivals.level_db + 20.0 * np.log10(np.maximum(1.0 - late / pulse, 1e-9))
     here = (arrivals.caller == caller) & (level > faintest_db)

@@ -51,7 +51,7 @@ def print_rows(worlds):
                 rows = frame.rows
                 own, others = own + sum(rows.caller == 0), others + sum(rows.caller > 0)
                 speed = config.medium.sound_speed
-                near += overlapping(rows, config.emitter.pulse, speed).sum()
+                near += overlapping(rows, config.emitter.call_duration, speed).sum()
                 false += frame.clutter
             frames += len(heard)
         cells = own / frames, others / frames, seen / worlds, near / (own + others), false / frames

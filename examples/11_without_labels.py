@@ -54,8 +54,8 @@ bearing_std = 0.02
 range_bounds = [0.5, 12.0]
 
 [association]
-detection = 0.9
-clutter = 0.06""",
+detection_rate = 0.9
+clutter_rate = 0.06""",
     "odometry.csv": "\n".join(["time,velocity,angular_rate", *told]),
     "measurements.csv": "\n".join(["time,landmark,bearing,range", *measured]),
 }

@@ -146,9 +146,8 @@ def test_a_row_is_worse_by_its_ratio_not_by_its_time():
     busy = [row("frame_alone_ms", 1.0, "", ratio=0.2), row("worker_mb", 200.0, "")]
     slow = [row("frame_alone_ms", 0.5, "", ratio=0.4), row("worker_mb", 300.0, "")]
     assert grown(busy, before, 1.25) == []
-    assert dict(grown(slow, before, 1.25)) == pytest.approx(
-        {"frame_alone_ms": 2.0, "worker_mb": 1.5}
-    )
+    expected = pytest.approx({"frame_alone_ms": 2.0, "worker_mb": 1.5})
+    assert dict(grown(slow, before, 1.25)) == expected
     assert grown(before, slow, 1.25) == []
 
 

@@ -17,11 +17,13 @@ from pipistrelle.experiments.studies.plan import cases_of, plan_text, read_plan
 from pipistrelle.settings import (
     CALLERS,
     OWN,
+    RENAMED,
     SETTINGS,
     from_environment,
     from_file,
     from_flags,
     from_keywords,
+    from_table,
     from_text,
     known_settings,
     resolve,
@@ -62,45 +64,53 @@ def test_every_setting_of_the_configuration_is_known_and_documented():
 @pytest.mark.parametrize(
     ("file", "environment", "flags", "ratio"),
     [
-        ("", {}, {}, RayConfig().ratio),
-        ("rays.ratio = 0.2", {}, {}, 0.2),
-        ("rays.ratio = 0.2", {"PIPISTRELLE_RAYS__RATIO": "0.3"}, {}, 0.3),
-        ("rays.ratio = 0.2", {"PIPISTRELLE_RAYS__RATIO": "0.3"}, {"rays": {"ratio": 0.4}}, 0.4),
-        ("rays.ratio = 0.2", {}, {"rays": {"ratio": 0.4}}, 0.4),
-        ("", {"PIPISTRELLE_RAYS__RATIO": "0.3"}, {"rays": {"ratio": 0.4}}, 0.4),
+        ("", {}, {}, RayConfig().merge),
+        ("rays.merge = 0.2", {}, {}, 0.2),
+        ("rays.merge = 0.2", {"PIPISTRELLE_RAYS__MERGE": "0.3"}, {}, 0.3),
+        ("rays.merge = 0.2", {"PIPISTRELLE_RAYS__MERGE": "0.3"}, {"rays": {"merge": 0.4}}, 0.4),
+        ("rays.merge = 0.2", {}, {"rays": {"merge": 0.4}}, 0.4),
+        ("", {"PIPISTRELLE_RAYS__MERGE": "0.3"}, {"rays": {"merge": 0.4}}, 0.4),
     ],
 )
 def test_flags_override_environment_file_and_defaults(tmp_path, file, environment, flags, ratio):
     layer = from_file(written(tmp_path, file)) | from_environment(environment) | from_flags(flags)
-    assert resolve(layer).rays.ratio == ratio
+    assert resolve(layer).rays.merge == ratio
+
+
+def test_an_old_name_of_a_setting_is_read_and_announced():
+    for old, new in RENAMED.items():
+        with pytest.warns(FutureWarning, match=f"{old} is now called {new};"):
+            assert from_table({old: 1}, "") == {tuple(new.split(".")): (1, old)}
+    with pytest.raises(InputError, match="are one setting"), pytest.warns():
+        from_table({"rays": {"exponent": 1, "power": 2}}, "")
 
 
 def test_layers_keep_settings_that_they_do_not_name(tmp_path):
-    file = from_file(written(tmp_path, "[rays]\nratio = 0.4\nweights = 'aggregated'\n"))
-    environment = from_environment({"PIPISTRELLE_RAYS__POWER": "3"})
+    file = from_file(written(tmp_path, "[rays]\nrelative_std = 0.4\nweights = 'aggregated'\n"))
+    environment = from_environment({"PIPISTRELLE_RAYS__EXPONENT": "3"})
     flags = from_flags({"air": {"relative_humidity": 0.3}, "seed": 9})
     assert resolve(file | environment | flags) == Config(
         seed=9,
         air=AirConfig(relative_humidity=0.3),
-        rays=RayConfig(ratio=0.4, weights="aggregated", power=3.0),
+        rays=RayConfig(relative_std=0.4, weights="aggregated", exponent=3.0),
     )
 
 
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("rays.powr = 3", "rays.powr: no such setting; did you mean rays.power?"),
-        ("power = 3", "power: no such setting; did you mean rays.power?"),
-        ("[rays.powr]\nx = 3", "rays.powr.x: no such setting; did you mean rays.power?"),
+        ("rays.powr = 3", "rays.powr: no such setting; did you mean rays.exponent?"),
+        ("power = 3", "power: no such setting; did you mean rays.exponent?"),
+        ("[rays.powr]\nx = 3", "rays.powr.x: no such setting; did you mean rays.exponent?"),
         ("qqq = 3", "qqq: no such setting; see `pipistrelle config show`"),
         ("[qqq]", "qqq: no such setting; see `pipistrelle config show`"),
         ("rays = 3", "rays: found 3, expected a section of settings"),
-        ("rays.power = -3", "rays.power: found -3, expected greater than 0"),
-        ("rays.power = nan", "rays.power: found nan, expected a finite number"),
-        ("rays.power = inf", "rays.power: found inf, expected a finite number"),
-        ("rays.power = '3'", "rays.power: found '3', expected a valid number"),
-        ("rays.power = true", "rays.power: found True, expected a valid number"),
-        ("rays.power.x = 3", "rays.power: found {'x': 3}, expected a valid number"),
+        ("rays.exponent = -3", "rays.exponent: found -3, expected greater than 0"),
+        ("rays.exponent = nan", "rays.exponent: found nan, expected a finite number"),
+        ("rays.exponent = inf", "rays.exponent: found inf, expected a finite number"),
+        ("rays.exponent = '3'", "rays.exponent: found '3', expected a valid number"),
+        ("rays.exponent = true", "rays.exponent: found True, expected a valid number"),
+        ("rays.exponent.x = 3", "rays.exponent: found {'x': 3}, expected a valid number"),
         ("scenario.steps = 3.0", "scenario.steps: found 3.0, expected a valid integer"),
         ("target.shape = 'cube'", "target.shape: found 'cube', expected 'cylinder' or 'sphere'"),
         ("detection.leakage_db = 12345",
@@ -148,7 +158,7 @@ def test_layers_keep_settings_that_they_do_not_name(tmp_path):
         ("[[callers]]\nroute = [[0, 1, 2]]",
          "callers.1.route: found [[0, 1, 2]], expected a CSV file of time,x,y, or two such rows"),
         ("[[callers]]\n" * 8, "callers: found 8 callers, expected at most 7 besides the vehicle"),
-        ("rays.power = 2\nrays.range_bounds = [3, 2]",
+        ("rays.exponent = 2\nrays.range_bounds = [3, 2]",
          "rays.range_bounds: range_bounds must rise, found [3.0, 2.0]"),
     ],
 )  # fmt: skip
@@ -157,11 +167,11 @@ def test_an_invalid_file_is_reported_by_key_value_and_expectation(tmp_path, text
 
 
 def test_all_invalid_values_are_reported_together(tmp_path):
-    assert len(refusal(tmp_path, "rays.power = 0\nair.pressure_kpa = 'high'").splitlines()) == 2
+    assert len(refusal(tmp_path, "rays.exponent = 0\nair.pressure_kpa = 'high'").splitlines()) == 2
 
 
 def test_a_file_with_invalid_toml_is_reported_by_line(tmp_path):
-    assert "(at line 2," in refusal(tmp_path, "seed = 3\nrays.power 3\n")
+    assert "(at line 2," in refusal(tmp_path, "seed = 3\nrays.exponent 3\n")
     path = tmp_path / "mission.toml"
     path.write_bytes(b"seed = 3 # \xff")
     with pytest.raises(InputError, match="byte 11, which is no UTF-8"):
@@ -179,7 +189,7 @@ def test_a_path_without_utf8_is_reported_by_its_setting():
 
 @pytest.mark.parametrize(("text", "value"), [("2", 2.0), (".5", 0.5), ("1e-3", 1e-3), (" 4 ", 4.0)])
 def test_the_environment_accepts_usual_spellings_of_numbers(text, value):
-    assert resolve(from_environment({"PIPISTRELLE_RAYS__POWER": text})).rays.power == value
+    assert resolve(from_environment({"PIPISTRELLE_RAYS__EXPONENT": text})).rays.exponent == value
 
 
 def test_text_and_lists_in_the_environment_are_spelled_as_in_files():
@@ -187,7 +197,7 @@ def test_text_and_lists_in_the_environment_are_spelled_as_in_files():
         from_environment(
             {
                 "PIPISTRELLE_RAYS__WEIGHTS": "aggregated",
-                "PIPISTRELLE_RAYS__RANGED": '"moved"',
+                "PIPISTRELLE_RAYS__MERGE": "0.5",
                 "PIPISTRELLE_RAYS__RANGE_BOUNDS": "[1, 15.5]",
                 "PIPISTRELLE_SEED": "11",
                 "PIPISTRELLE_DATA": "/somewhere",
@@ -195,19 +205,19 @@ def test_text_and_lists_in_the_environment_are_spelled_as_in_files():
             }
         )
     )
-    assert config.rays == RayConfig(weights="aggregated", ranged="moved", range_bounds=(1, 15.5))
+    assert config.rays == RayConfig(weights="aggregated", merge=0.5, range_bounds=(1, 15.5))
     assert config.seed == 11
 
 
 @pytest.mark.parametrize(
     ("name", "text", "message"),
     [
-        ("PIPISTRELLE_RAYS__POWER", "x", "found 'x', expected a valid number"),
-        ("PIPISTRELLE_RAYS__POWER", "nan", "found nan, expected a finite number"),
+        ("PIPISTRELLE_RAYS__EXPONENT", "x", "found 'x', expected a valid number"),
+        ("PIPISTRELLE_RAYS__EXPONENT", "nan", "found nan, expected a finite number"),
         ("PIPISTRELLE_SEED", "", "found '', expected a valid integer"),
         ("PIPISTRELLE_SEED", "3\nrays = 4", r"found '3\nrays = 4', expected a valid integer"),
         ("PIPISTRELLE_RAYS", "3", "found 3, expected a section of settings"),
-        ("PIPISTRELLE_RAYS__POWR", "3", "no such setting; did you mean PIPISTRELLE_RAYS__POWER?"),
+        ("PIPISTRELLE_RAYS__MERG", "3", "no such setting; did you mean PIPISTRELLE_RAYS__MERGE?"),
     ],
 )
 def test_an_invalid_environment_is_reported_by_its_variable(name, text, message):

@@ -64,7 +64,7 @@ def test_an_entry_contains_meaning_default_values_flag_and_variable():
         (("air", "temperature_c"), "> −50, < 60"),
         (("air", "spreading"), "`paper` or `bistatic`"),
         (("scenario", "world"), "a folder"),
-        (("listening", "timing"), "`true` or `false`"),
+        (("listening", "excess_paths"), "`true` or `false`"),
         (("receiver", "elements"), "whole, 2 to 64"),
         (("detection", "peak_db"), "−300 to 0"),
         (("detection", "false_alarm"), "≥ 1e-100, < 0.1"),
@@ -109,6 +109,6 @@ def test_a_single_unit_follows_the_default():
 
 
 def test_the_spellings_at_the_top_of_the_page_work():
-    assert resolve(from_environment({"PIPISTRELLE_RAYS__POWER": "3"})).rays.power == 3.0
-    assert resolve(from_flags({"rays": {"power": 3.0}})).rays.power == 3.0
-    assert Config().rays.power == 2.0
+    assert resolve(from_environment({"PIPISTRELLE_RAYS__EXPONENT": "3"})).rays.exponent == 3.0
+    assert resolve(from_flags({"rays": {"exponent": 3.0}})).rays.exponent == 3.0
+    assert Config().rays.exponent == 2.0

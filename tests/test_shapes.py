@@ -44,7 +44,7 @@ def test_a_mission_that_times_callers_keeps_to_its_annotations(name):
         scenario=ScenarioConfig(steps=24, landmarks=12, radius=12.0),
         callers=(CallerConfig(), CallerConfig(frequency=25e3, course="circle", radius=9.0)),
         filter=FilterConfig(noise="measured", robust="huber", gate=0.999),
-        listening=ListeningConfig(timing=True),
+        listening=ListeningConfig(excess_paths=True),
     )
     trials = run_mission(config, STRATEGIES, (name,)).trials
     assert any(trial.track.callers for trial in trials) == (name != "fastslam")

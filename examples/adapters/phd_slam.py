@@ -64,8 +64,8 @@ def log(files: Path, folder: Path, seed: Path | None = None) -> None:
         range_bounds=(0.5, FARTHEST + 10.0),
         ignored_rows={},
         association={
-            "detection": DETECTION,
-            "clutter": CLUTTER / (FARTHEST * pi),
+            "detection_rate": DETECTION,
+            "clutter_rate": CLUTTER / (FARTHEST * pi),
         },
     )
     write_log(folder, drive)

@@ -62,8 +62,8 @@ def log(files: Path, folder: Path) -> None:
         bearing_std=sqrt(40.0 * 0.000025),
         range_bounds=(NEAREST, FARTHEST),
         association={
-            "detection": 0.9,
-            "clutter": 3.0 / (FARTHEST * VIEW),
+            "detection_rate": 0.9,
+            "clutter_rate": 3.0 / (FARTHEST * VIEW),
         },
     )
     write_log(folder, drive)

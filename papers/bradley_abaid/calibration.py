@@ -7,11 +7,11 @@ mean of Table II, in this order:
 
     beacon.level_db     landmarks seen, passive                   39.5
     emitter.level_db    landmarks seen, fused at 180 degrees      43.7
-    rays.prune (tau)    fully initialised, EKF-SLAM, passive      26.6
+    rays.prune_threshold (tau)    fully initialised, EKF-SLAM, passive      26.6
 
 the vehicle's level no higher than leaves active sensing at 180 degrees with 36.5 landmarks (our
 choice: the paper sees more of them passively at every beamwidth); and
-``rays.power`` (n) by a rule that looks at no result: one count cannot settle two numbers; the
+``rays.exponent`` (n) by a rule that looks at no result: one count cannot settle two numbers; the
 paper's n says by how much likelier members count for more, so n > 1; of the whole numbers above 1
 the least is taken for which some tau reaches the count. The other n are listed with the tau that
 each would need.
@@ -197,7 +197,7 @@ def rays_tried(config: Config, world: int) -> list[tuple[int, float, bool]]:
     case, drive, rows = Case(strategy="passive", filter="ekf"), drive_of(scenario, config), []
     for power in POWERS:
         for prune in PRUNES:
-            settings = changed(config, {"rays.power": power, "rays.prune": prune})
+            settings = changed(config, {"rays.exponent": power, "rays.prune_threshold": prune})
             scores = run_trial(case, drive, scans, settings).scores
             rows.append((scores.landmarks_full, scores.nees_mean, scores.diverged))
     return rows
@@ -246,8 +246,8 @@ def summary(
         "fitted": {
             "emitter.level_db": config.emitter.level_db,
             "beacon.level_db": config.beacon.level_db,
-            "rays.power": chosen["power"],
-            "rays.prune": chosen["prune"],
+            "rays.exponent": chosen["power"],
+            "rays.prune_threshold": chosen["prune"],
         },
         "fitted_to": {name: means.pop(name) for name in ("fused 180", "passive")}
         | {

@@ -69,7 +69,7 @@ def tried(level: float, run: Run) -> pl.DataFrame:
     """Map all worlds with bearings so noisy."""
     config = settings()
     tau = fit_tau(config, run, partial(noisy, level=level))
-    fitted = changed(config, {"rays.prune": tau})
+    fitted = changed(config, {"rays.prune_threshold": tau})
     found = run(partial(trials_in, fitted, level))
     return pl.DataFrame([trial | {"tau": tau} for trials in found for trial in trials])
 

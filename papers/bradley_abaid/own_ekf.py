@@ -1,7 +1,7 @@
 """EKF-SLAM with rays in plain NumPy, from the paper's equations, so that details can be changed.
 
 With no detail changed it is `pipistrelle.estimation.ekf` (a test compares them). It reads a range
-for a ray as ``rays.ranged = "bearing"`` does: unused until bearings have placed the landmark.
+for a ray as ``rays.range_update = "bearing"`` does: unused until bearings have placed the landmark.
 """
 
 import math
@@ -126,7 +126,7 @@ class OwnEkf:
             logs[i] = _log_normal(nu, S[0])[0]
         if self.carried:
             logs += _log_normal(np.zeros(len(members)), self.c[members] + 1.0)
-        share = np.exp(self.config.rays.power * (logs - logs.max()))
+        share = np.exp(self.config.rays.exponent * (logs - logs.max()))
         share /= share.sum()
         return logs, np.where(share >= SMALLEST_SHARE, share, 0.0)
 
@@ -176,7 +176,7 @@ class OwnEkf:
         self.c[members] /= 1.0 + share * self.c[members]
         if self.normalised:
             weight -= _log_sum(weight)
-        keep = weight >= math.log(self.config.rays.prune / len(members))
+        keep = weight >= math.log(self.config.rays.prune_threshold / len(members))
         keep[weight.argmax()] = True
         if self.normalised:
             weight -= _log_sum(weight[keep])

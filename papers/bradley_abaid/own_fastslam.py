@@ -492,8 +492,8 @@ class OwnFastSlam:
         ranges, stds = ray_members(self.config.rays)
         filtering, h = self.config.filter, len(ranges)
         self.numbers = Numbers(
-            filtering.range_std**2, filtering.bearing_std**2, self.config.rays.power,
-            self.config.rays.prune, ranges, stds,
+            filtering.range_std**2, filtering.bearing_std**2, self.config.rays.exponent,
+            self.config.rays.prune_threshold, ranges, stds,
         )  # fmt: skip
         self.state = State(
             np.tile(mean, (p, 1)), np.tile(covariance, (p, 1, 1)), np.zeros((p, n), np.int64),

@@ -74,7 +74,7 @@ def hear(
             scenario,
             bodies=Bodies(radius=np.full(n, target.radius), shape=np.full(n, target.shape)),
         )
-    beam = partial(grown, off_axis=config.emitter.off_axis, growth=how.growth)
+    beam = partial(grown, off_axis=config.emitter.directivity_law, growth=how.growth)
     find = partial(found, degrees=how.degrees, late=how.offset / config.assumed_sound_speed)
     with met_moving(scenario) if how.moving else nullcontext():
         heard = listening.listen(
@@ -191,9 +191,12 @@ def fit_again(name: str, base: Config, run: Run, oracle: Oracle, placed: Any) ->
                               aim["fused"], vehicle, 2)  # fmt: skip
     config = at(vehicle, beacon)
     full = float(np.mean(run(placed("", base))))
-    tau = tau_for(full, lambda tau: run(placed(name, changed(config, {"rays.prune": tau}))))
+    tau = tau_for(
+        full, lambda tau: run(placed(name, changed(config, {"rays.prune_threshold": tau})))
+    )
     return dict(how.change) | {
-        "emitter.level_db": vehicle / 10, "beacon.level_db": beacon / 10, "rays.prune": tau,
+        "emitter.level_db": vehicle / 10, "beacon.level_db": beacon / 10,
+        "rays.prune_threshold": tau,
     }  # fmt: skip
 
 

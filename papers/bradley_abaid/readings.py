@@ -92,8 +92,8 @@ SNAPSHOTS: dict[str, Change] = {
     "run, 8 dB": {"detection.snapshots": "runs", "detection.peak_db": -8.0},
 }
 OFF_AXIS: dict[str, Change] = {
-    "20 log p": {"emitter.off_axis": "pressure"},
-    "10 log p": {"emitter.off_axis": "power"},
+    "20 log p": {"emitter.directivity_law": "pressure"},
+    "10 log p": {"emitter.directivity_law": "power"},
 }
 LIKELIHOOD: dict[str, Change] = {
     "density": {"rays.likelihood": "normal"},
@@ -103,8 +103,8 @@ WEIGHTS: dict[str, Change] = {
     "marginal": {"fastslam.weights": "marginal"},
     "sampled": {"fastslam.weights": "sampled"},
 }
-RANGED: dict[str, Change] = {name: {"rays.ranged": name} for name in ("anew", "bearing")}
-ALL_RANGED: dict[str, Change] = {name: {"rays.ranged": name} for name in RANGE_READINGS}
+RANGED: dict[str, Change] = {name: {"rays.range_update": name} for name in ("anew", "bearing")}
+ALL_RANGED: dict[str, Change] = {name: {"rays.range_update": name} for name in RANGE_READINGS}
 RESAMPLED: dict[str, Change] = {
     name: {"fastslam.resampled_rays": name} for name in ("kept", "restart")
 }
@@ -160,7 +160,7 @@ def main() -> None:
     readings = all_readings(trials)
     values = drawn(list(readings.values()))
     table = misfits(readings, values, {key: fits["/".join(key[:3])] for key in readings})
-    write_table(table, published(OUTPUT, chosen), "rays.prune")
+    write_table(table, published(OUTPUT, chosen), "rays.prune_threshold")
     tied = table.filter("tied").sort("departures", "misfit")
     print("chosen by the rule, of", tied.height, "tied:", tied.select(*FACTORS).row(0))
     with pl.Config(tbl_rows=-1, tbl_cols=-1, tbl_width_chars=200, float_precision=2):
@@ -248,7 +248,7 @@ def fitted(path: Path, run: Run) -> dict[str, Change]:
         }  # fmt: skip
         for name, change in zip(names, LIKELIHOOD.values(), strict=True):
             tau = fit_tau(changed(config, change), run)
-            fits[name] = {**levels, "rays.prune": tau}
+            fits[name] = {**levels, "rays.prune_threshold": tau}
             print(name, fits[name], flush=True)
         write_whole(path, json.dumps(fits, indent=1).encode())
     return fits
@@ -265,7 +265,7 @@ def fit_tau(
 
     @cache
     def placed(i: int) -> float:
-        pruned = changed(config, {"rays.prune": PRUNES[i]})
+        pruned = changed(config, {"rays.prune_threshold": PRUNES[i]})
         return fmean(run(partial(placed_passively, pruned, change, oracle)))
 
     low, high = 0, len(PRUNES) - 1

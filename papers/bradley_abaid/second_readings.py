@@ -116,10 +116,11 @@ ORACLES: dict[str, Oracle] = {"cause": label_by_cause, "nearest": label_by_beari
 CAP = {"capped": MOST_ACTIVE, "uncapped": math.inf}
 FRONT_END: dict[str, Change] = {
     "paper": {
-        "detection.snapshots": "runs", "detection.peak_db": 0.0, "emitter.off_axis": "power",
+        "detection.snapshots": "runs", "detection.peak_db": 0.0, "emitter.directivity_law": "power",
     },
     "physics": {
-        "detection.snapshots": "maxima", "detection.peak_db": -8.0, "emitter.off_axis": "pressure",
+        "detection.snapshots": "maxima", "detection.peak_db": -8.0,
+        "emitter.directivity_law": "pressure",
     },
 }  # fmt: skip
 RANGED = ("bearing", "anew", "moved")
@@ -137,7 +138,7 @@ FACTORS = {
 }  # fmt: skip
 WAYS: dict[str, dict[str, Change]] = {
     "layout": LAYOUT, "labels": LABELS, "front_end": FRONT_END,
-    "ranged": {name: {"rays.ranged": name} for name in RANGED}, "weighed": WEIGHED,
+    "ranged": {name: {"rays.range_update": name} for name in RANGED}, "weighed": WEIGHED,
 }  # fmt: skip
 """Settings of the levels of factors that a plan has."""
 DEFAULTS = {name: next(iter(levels)) for name, levels in FACTORS.items()}
@@ -181,7 +182,7 @@ def main() -> None:
         unknown = ("above_best", "above_best_error", "tied")
         few = few.with_columns(*(pl.lit(None).alias(name) for name in unknown), worlds=FIRST)
         table = pl.concat([table, few], how="vertical_relaxed")
-    write_table(table, published(OUTPUT, chosen), "rays.prune")
+    write_table(table, published(OUTPUT, chosen), "rays.prune_threshold")
     tied = table.filter("tied").sort("departures", "misfit")
     print("chosen by the rule, of", tied.height, "tied:", tied.select(*FACTORS).row(0))
     with pl.Config(tbl_rows=40, tbl_cols=-1, tbl_width_chars=200, float_precision=2):
@@ -219,7 +220,7 @@ def fitted(path: Path, run: Run) -> dict[str, Change]:
             )  # fmt: skip
         fits[name] = {
             "emitter.level_db": config.emitter.level_db, "beacon.level_db": config.beacon.level_db,
-            "rays.prune": fit_tau(config, run, oracle=oracle),
+            "rays.prune_threshold": fit_tau(config, run, oracle=oracle),
         }  # fmt: skip
         print(name, fits[name], flush=True)
         write_whole(path, json.dumps(fits, indent=1).encode())

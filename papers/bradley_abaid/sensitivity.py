@@ -45,11 +45,11 @@ EARS: dict[str, dict[str, Any]] = {
 }
 FILTER: dict[str, dict[str, Any]] = {
     "as frozen": {},
-    "tau / 100": {"rays.prune": 1e-7},
-    "tau x 100": {"rays.prune": 1e-3},
-    "n = 1": {"rays.power": 1.0},
-    "n = 3": {"rays.power": 3.0},
-    "n = 8": {"rays.power": 8.0},
+    "tau / 100": {"rays.prune_threshold": 1e-7},
+    "tau x 100": {"rays.prune_threshold": 1e-3},
+    "n = 1": {"rays.exponent": 1.0},
+    "n = 3": {"rays.exponent": 3.0},
+    "n = 8": {"rays.exponent": 8.0},
     "aggregated weights": {"rays.weights": "aggregated"},
     "R: 0.05 rad": {"filter.bearing_std": 0.05},
     "R: 0.3 rad": {"filter.bearing_std": 0.3},

@@ -107,8 +107,8 @@ FASTSLAM = {
 }
 """Details of `own_fastslam`."""
 SETTINGS: dict[str, Change] = {
-    "a range places the landmark anew": {"rays.ranged": "anew"},
-    "a range moves the heaviest, with the others": {"rays.ranged": "moved"},
+    "a range places the landmark anew": {"rays.range_update": "anew"},
+    "a range moves the heaviest, with the others": {"rays.range_update": "moved"},
     "rays restart at resampling": {"fastslam.resampled_rays": "restart"},
 }
 """Settings of the package, for both filters."""
@@ -187,12 +187,16 @@ def _fitted(path: Path, chosen: argparse.Namespace, name: str, run: Run) -> Base
             return json.loads(chosen.fits.read_text())[name]
         if name == "/".join(DEFAULTS[factor] for factor in FACTORS_HEARD):
             plan = read_plan(find_plan("paper")).config
-            levels = plan.emitter.level_db, plan.beacon.level_db, plan.rays.prune
+            levels = plan.emitter.level_db, plan.beacon.level_db, plan.rays.prune_threshold
         else:
             found = fit_levels(config, run, oracle=oracle, most_active=CAP[chosen.cap])
             tau = fit_tau(found, run, oracle=oracle)
             levels = found.emitter.level_db, found.beacon.level_db, tau
-        return dict(zip(("emitter.level_db", "beacon.level_db", "rays.prune"), levels, strict=True))
+        return dict(
+            zip(
+                ("emitter.level_db", "beacon.level_db", "rays.prune_threshold"), levels, strict=True
+            )
+        )
 
     config = changed(config, once(BASE, of_base))
 
@@ -208,14 +212,16 @@ def _fitted(path: Path, chosen: argparse.Namespace, name: str, run: Run) -> Base
     def tau() -> Change:
         aim = float(np.mean(run(placed("", config))))
         return {
-            "rays.prune": tau_for(
+            "rays.prune_threshold": tau_for(
                 aim,
-                lambda tau: run(placed("", changed(config, {"rays.prune": tau}), **EKF[FITTED])),
+                lambda tau: run(
+                    placed("", changed(config, {"rays.prune_threshold": tau}), **EKF[FITTED])
+                ),
             )
         }
 
     again |= {name: dict(how.change) for name, how in HEARD.items() if not how.fitted}
-    return Base(config, oracle, {FITTED: once(FITTED, tau)["rays.prune"]}, again)
+    return Base(config, oracle, {FITTED: once(FITTED, tau)["rays.prune_threshold"]}, again)
 
 
 def _placed_passively(
@@ -299,7 +305,7 @@ def _own(slam: str, name: str, base: Base, world: int) -> Iterator[dict[str, Any
     """Map a world by a filter of these scripts, with a detail changed."""
     config, rows = base.config, dict[str, list[Any]]()
     if name in base.taus:
-        config = changed(config, {"rays.prune": base.taus[name]})
+        config = changed(config, {"rays.prune_threshold": base.taus[name]})
     active = _concerns_active(slam, name)
     for drive, way, beam, scans in _cases_of("", base, world, config, active=active):
         rng = np.random.default_rng(stream_key(config.seed, world, slam))

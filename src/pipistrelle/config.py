@@ -244,10 +244,10 @@ class EmitterConfig(CallConfig):
     """Radius of the piston [m]; 8.8 mm give a half-power beamwidth of 33 degrees."""
     level_db: Level = 49.7
     """Source level of the vehicle's call on the axis at 1 m [dB]; unreported, fitted."""
-    off_axis: Literal["pressure", "power"] = "pressure"
+    directivity_law: Literal["pressure", "power"] = "pressure"
     """Loss off the axis [dB]: `pressure`, 20 log10 p with the piston's pressure p, or `power`, 10
     log10 p."""
-    pulse: Positive = 2.8e-3
+    call_duration: Positive = 2.8e-3
     """Length of the calls of vehicle and callers [s]; unreported."""
 
 
@@ -484,13 +484,13 @@ class AssociationConfig(Section):
     """Method of association: "known", the labels of the scans (the paper's); "nearest", the
     likeliest assignment of a scan; "marginal", the pairs that are probable over all assignments; or
     module:Class, an association of your own."""
-    detection: Probability = 0.8
+    detection_rate: Probability = 0.8
     """Assumed probability of detecting a landmark within the sensor's reach."""
-    clutter: Positive = 0.06
+    clutter_rate: Positive = 0.06
     """Assumed number of clutter measurements in a scan, per radian and metre."""
-    bearing_std: Positive = 0.05
+    max_angle_std: Positive = 0.05
     """Largest standard deviation of a bearing; less precise measurements are discarded [rad]."""
-    way_std: Positive = 0.35
+    max_range_std: Positive = 0.35
     """Largest standard deviation of a range or an excess path; less precise ones are discarded
     [m]."""
 
@@ -498,7 +498,7 @@ class AssociationConfig(Section):
 class ListeningConfig(Section):
     """Choice of the measured quantities that estimators use."""
 
-    timing: bool = False
+    excess_paths: bool = False
     """Use of excess paths: the delay of a caller's echo after its direct call."""
 
 
@@ -623,16 +623,16 @@ def _check_rising(near: float, far: float) -> None:
 class RayConfig(Section):
     """Bearing-only landmarks, each a ray of Gaussians (Table I; pruning and power unreported)."""
 
-    ratio: Annotated[float, Field(gt=0, lt=1)] = 0.3
+    relative_std: Annotated[float, Field(gt=0, lt=1)] = 0.3
     """Standard deviation of a ray's member along the ray, as a share of its range (alpha)."""
-    density: Annotated[float, Field(ge=1.001, le=10)] = 3.0
+    range_ratio: Annotated[float, Field(ge=1.001, le=10)] = 3.0
     """Ratio of the ranges of two successive members of a ray (beta); large ratios leave gaps."""
     range_bounds: tuple[Positive, Positive] = (0.5, 20.0)
     """Nearest and farthest range of a ray's members [m]."""
-    prune: Annotated[float, Field(ge=0, lt=1)] = 1e-5
+    prune_threshold: Annotated[float, Field(ge=0, lt=1)] = 1e-5
     """Threshold of pruning (tau): a ray's member is removed if its aggregated likelihood is below
     tau over the number of members."""
-    power: Positive = 2.0
+    exponent: Positive = 2.0
     """Exponent of the weights by which a ray's members share a bearing (n)."""
     weights: Literal["instantaneous", "aggregated"] = "instantaneous"
     """Weights by which a ray's members share a bearing: `instantaneous`, its likelihoods (the
@@ -640,27 +640,25 @@ class RayConfig(Section):
     likelihood: Literal["normal", "printed"] = "normal"
     """Likelihood of a bearing for a ray's member: `normal`, the density, or `printed`, with
     1/sqrt(2 pi S) inside the exponent, as Eq. (19) reads."""
-    spacing: Literal["paper", "auto"] = "paper"
-    """Rays of precise bearings: `paper`, members as given by ratio and density, or `auto`, delayed
-    initialization of bearings too precise for such members (EKFs only)."""
+    precise_bearings: Literal["paper", "auto"] = "paper"
+    """Rays of precise bearings: `paper`, members by relative_std and range_ratio, or `auto`,
+    delayed initialization of bearings too precise for such members (EKFs only)."""
     merge: Annotated[float, Field(ge=0, le=10)] = 0.0
     """Distance in standard deviations below which neighbours of a ray are merged; 0: never."""
-    ranged: Literal["anew", "bearing", "moved"] = "anew"
+    range_update: Literal["anew", "bearing", "moved"] = "anew"
     """Update of a ray by a range: `anew` initialises the landmark at range and bearing, `bearing`
     ignores the range, `moved` moves the heaviest member to it."""
 
     @model_validator(mode="after")
     def _ordered(self) -> "RayConfig":
         _check_rising(*self.range_bounds)
-        if self.spacing == "auto" and self.likelihood == "printed":
-            raise ValueError(
-                'spacing "auto" needs likelihood "normal", found "printed"; '
-                'give spacing "paper", too'
-            )
-        if self.spacing == "auto" and self.ranged not in ("anew", "bearing"):
-            raise ValueError(
-                f'spacing "auto" needs ranged "anew" or "bearing", found "{self.ranged}"'
-            )
+        needs = 'precise_bearings "auto" needs'
+        if self.precise_bearings == "auto" and self.likelihood == "printed":
+            found = 'likelihood "normal", found "printed"; give precise_bearings "paper", too'
+            raise ValueError(f"{needs} {found}")
+        if self.precise_bearings == "auto" and self.range_update not in ("anew", "bearing"):
+            found = f'range_update "anew" or "bearing", found "{self.range_update}"'
+            raise ValueError(f"{needs} {found}")
         return self
 
 

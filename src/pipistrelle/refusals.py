@@ -118,10 +118,10 @@ def meant(name: str, known: Iterable[str]) -> str | None:
 
     Dots separate the parts of the `name`.
 
-    >>> meant("ray.powr", ["rays.power", "air.pressure_kpa"])
-    'rays.power'
-    >>> meant("filter.prune", ["rays.prune", "seed"])
-    'rays.prune'
+    >>> meant("ray.merg", ["rays.merge", "air.pressure_kpa"])
+    'rays.merge'
+    >>> meant("filter.merge", ["rays.merge", "seed"])
+    'rays.merge'
     """
     known = list(known)
     close = get_close_matches(name, known, n=1)

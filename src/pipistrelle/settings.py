@@ -6,12 +6,13 @@ wrote the value:
 
     config = resolve(from_file(path) | from_environment(os.environ) | from_flags(flags))
 
-The spelling of one setting is ``power`` under ``[rays]`` in a file, ``PIPISTRELLE_RAYS__POWER``
-in the environment and ``--rays.power`` as a flag.
+The spelling of one setting is ``merge`` under ``[rays]`` in a file, ``PIPISTRELLE_RAYS__MERGE`` in
+the environment and ``--rays.merge`` as a flag.
 """
 
 import json
 import tomllib
+import warnings
 from collections.abc import Callable, Container, Iterable, Iterator, Mapping
 from contextlib import suppress
 from functools import cache
@@ -76,7 +77,19 @@ world, an array and calls, which are relative to the file of settings."""
 SETTINGS: Key = ("settings",)
 OWN: Key = ("own",)
 """Keys of the preset (`experiments.named_settings`) and of settings for one estimator:
-``[own.iekf] rays.power`` in a file is ``("own", "iekf", "rays", "power")`` in a layer."""
+``[own.iekf] rays.exponent`` in a file is ``("own", "iekf", "rays", "exponent")`` in a layer."""
+
+RENAMED = {
+    "emitter.off_axis": "emitter.directivity_law", "emitter.pulse": "emitter.call_duration",
+    "association.detection": "association.detection_rate",
+    "association.clutter": "association.clutter_rate",
+    "association.bearing_std": "association.max_angle_std",
+    "association.way_std": "association.max_range_std", "rays.ranged": "rays.range_update",
+    "listening.timing": "listening.excess_paths", "rays.spacing": "rays.precise_bearings",
+    "rays.ratio": "rays.relative_std", "rays.density": "rays.range_ratio",
+    "rays.prune": "rays.prune_threshold", "rays.power": "rays.exponent",
+}  # fmt: skip
+"""New names of settings, by the names that older files, results and scripts contain."""
 
 
 def derived(config: Config) -> dict[Key, Any]:
@@ -120,13 +133,16 @@ def beside(path: Path, callers: Any) -> Any:
     return [*map(placed, callers)]
 
 
-def from_table(values: Mapping[str, Any], where: str, above: str = "") -> Layer:
+def from_table(
+    values: Mapping[str, Any], where: str, above: str = "", others: Iterable[str] = ()
+) -> Layer:
     """Convert a nested table of settings to a layer: values and their places by key.
 
-    `where`: name of the file in messages; `above`: prefix of a setting's name in the file.
+    `where`: name of the file in messages; `above`: prefix of a setting's name in the file;
+    `others`: further names in the table, for suggestions.
     """
     given = leaves(values, known_settings())
-    return _layer(given, lambda key: above + ".".join(key), where)
+    return _layer(given, lambda key: above + ".".join(key), where, others)
 
 
 def from_environment(environment: Mapping[str, str]) -> Layer:
@@ -150,21 +166,21 @@ def from_keywords(values: Mapping[str, Any], others: Iterable[str] = ()) -> Laye
 
     `others`: further keywords of the call, for suggestions.
 
-    >>> from_keywords({"rays__power": 8.0, "air": {"temperature_c": 5.0}})["rays", "power"]
-    Given(value=8.0, where='rays__power')
-    >>> from_keywords({"rays__powr": 8.0})
+    >>> from_keywords({"rays__merge": 8.0, "air": {"temperature_c": 5.0}})["rays", "merge"]
+    Given(value=8.0, where='rays__merge')
+    >>> from_keywords({"rays__merg": 8.0})
     Traceback (most recent call last):
-    pipistrelle.config.InputError: rays__powr: no such setting; did you mean rays__power?
+    pipistrelle.config.InputError: rays__merg: no such setting; did you mean rays__merge?
     """
     given = leaves(spread(values, "__"), known_settings())
     return _layer(given, "__".join, others=others)
 
 
 def spread(table: Mapping[str, Any], parts: str) -> dict[str, Any]:
-    """Split names such as `rays__power` at a separator, and nest the values in tables.
+    """Split names such as `rays__merge` at a separator, and nest the values in tables.
 
-    >>> spread({"seed": 3, "rays.power": 8.0, "rays": {"prune": 0.1}}, ".")
-    {'seed': 3, 'rays': {'power': 8.0, 'prune': 0.1}}
+    >>> spread({"seed": 3, "rays.merge": 2.0, "rays": {"weights": "aggregated"}}, ".")
+    {'seed': 3, 'rays': {'merge': 2.0, 'weights': 'aggregated'}}
     """
     nested: dict[str, Any] = {}
     for name, value in table.items():
@@ -306,9 +322,15 @@ def _layer(
     others: Iterable[str] = (),
 ) -> Layer:
     """Build a layer of settings with each value's place; raise for unknown names."""
-    layer = {}
-    for key, value in given:
-        where = prefix + spell(key)
+    layer, problems = dict[Key, Given](), list[str]()
+    for old, value in given:
+        where = prefix + spell(old)
+        key = tuple(RENAMED[name].split(".")) if (name := ".".join(old)) in RENAMED else old
+        if key != old:
+            text = f"{where} is now called {spell(key)}; the old name is still read"
+            warnings.warn(text, FutureWarning, stacklevel=2)
+        if key in layer:
+            raise InputError(f"{layer[key].where} and {where} are one setting; give one of them")
         if key == OWN and value is not None:
             layer |= _own_layer(value, where)
         elif key in known_settings():
@@ -317,29 +339,32 @@ def _layer(
             if value != {}:
                 near = f"; did you mean {where}s?" if f"{where}s" in others else ""
                 expected = f"expected a section of settings{near}"
-                raise InputError(f"{where}: found {shown(value)}, {expected}")
+                problems.append(f"{where}: found {shown(value)}, {expected}")
         else:
             names = {".".join(known): spell(known) for known in known_settings()}
+            names |= {name: spell(tuple(new.split("."))) for name, new in RENAMED.items()}
+            same = [word for name, word in names.items() if name.split(".")[1:] == [*key]]
             names |= {name: name for name in others}
             near = meant(".".join(key), names)
-            same = [spell(known) for known in known_settings() if key == known[1:]]
             fit = " or ".join(same) or (names[near] if near else "")
             fix = f"did you mean {fit}?" if fit else "see `pipistrelle config show`"
-            raise InputError(f"{where}: no such setting; {fix}")
+            problems.append(f"{where}: no such setting; {fix}")
+    if problems:
+        raise InputError("\n".join(problems))
     return layer
 
 
 def _own_layer(tables: Any, where: str) -> Layer:
     """Build the layer of settings that apply to single estimators, a table for each."""
     if not isinstance(tables, Mapping):
-        expected = "a table for each estimator, as {iekf = {rays.power = 8.0}}"
+        expected = "a table for each estimator, as {iekf = {rays.exponent = 8.0}}"
         raise InputError(f"{where}: found {shown(tables)}, expected {expected}")
     layer: Layer = {}
     for name, table in tables.items():
         if not isinstance(table, Mapping):
             found = f"found {shown(table)}, expected a table of settings"
             raise InputError(f"{where}.{name}: {found}")
-        given = from_table(table, "", f"{where}.{name}.")
+        given = from_table(spread(table, "."), f"{where}.{name}.")
         layer |= {(*OWN, name, *key): one for key, one in given.items()}
     return layer
 

@@ -189,9 +189,8 @@ def test_absorption_in_seawater_matches_table_iv_of_francois_and_garrison(
 def test_absorption_of_water_agrees_with_mb_system(frequency, other, printed):
     # What `mbabsorption` prints, by its own tests (github.com/dwcaress/MB-System): dB/km.
     water = SEA | {"temperature_c": 10.0} | other
-    assert 1e3 * float(water_absorption_db_per_m(frequency, **water)) == pytest.approx(
-        printed, abs=1e-6
-    )
+    expected = pytest.approx(printed, abs=1e-6)
+    assert 1e3 * float(water_absorption_db_per_m(frequency, **water)) == expected
 
 
 @pytest.mark.parametrize(

@@ -46,7 +46,7 @@ def heard(snr_db, count, false_alarm=1e-6):
         add_echo_blocks(sums, sounds(delay, ANGLE, snr_db, 0), FACE, SETTLED)
         found = detect(filtered(sums), finder, **LAGS)
         near = np.flatnonzero(
-            (found.caller == 0) & (np.abs(found.delay - delay) < CONFIG.emitter.pulse / 2)
+            (found.caller == 0) & (np.abs(found.delay - delay) < CONFIG.emitter.call_duration / 2)
         )
         if near.size:
             best = near[found.power[near].argmax()]
@@ -115,6 +115,5 @@ def test_the_block_sums_range_error_over_delays_across_a_block(snr_db, centimetr
 def test_range_is_unbiased_but_for_half_a_sample():
     # A call is heard from the first sample after its arrival on: 2.5 us late on average.
     late = heard(10.0, 4000)[:, 1]
-    assert late.mean() == pytest.approx(
-        0.5 / SETTLED.rate, abs=SIGMAS * late.std() / np.sqrt(late.size)
-    )
+    expected = pytest.approx(0.5 / SETTLED.rate, abs=SIGMAS * late.std() / np.sqrt(late.size))
+    assert late.mean() == expected

@@ -78,7 +78,7 @@ def test_a_call_received_at_a_higher_frequency_is_shorter(shift, source):
     heard = one(4e-3, bearing=0.0, shift=shift, source=source)
     samples = record_samples(28, heard, SQUARE, SETTLED, None)
     count = np.count_nonzero(samples[:, 0, 0])
-    called = CONFIG.emitter.pulse * SETTLED.tones[source] / heard.frequency[0]  # T f / f'
+    called = CONFIG.emitter.call_duration * SETTLED.tones[source] / heard.frequency[0]  # T f / f'
     assert count == pytest.approx(called * SETTLED.rate, abs=1.0)
 
 
@@ -180,8 +180,8 @@ def test_a_blocks_noise_does_not_depend_on_how_many_are_drawn(short, more):
         ({}, (40, 14)),
         ({"receiver": {"sample_rate": 250e3}}, (50, 14)),
         ({"emitter": {"frequency": 36e3}}, (40, 14)),
-        ({"emitter": {"pulse": 2.9e-3}}, (58, 10)),
-        ({"emitter": {"pulse": 1e-3}, "receiver": {"elements": 5, "sample_rate": 125e3}}, (25, 5)),
+        ({"emitter": {"call_duration": 2.9e-3}}, (58, 10)),
+        ({"emitter": {"call_duration": 1e-3}, "receiver": {"sample_rate": 125e3}}, (25, 5)),
         ({"receiver": {"sample_rate": 192e3}}, (49, 11)),
         ({"receiver": {"sample_rate": 1e6}, "beacon": {"frequency": 31234.5}}, (200, 14)),
     ],
@@ -191,7 +191,7 @@ def test_blocks_hold_a_whole_call_whatever_tone_and_rate(settings, blocks):
     settled = sampling(config, callers_of(config, np.zeros(2)))
     assert (settled.block, settled.pulse) == blocks
     assert not settled.banded
-    assert settled.pulse * settled.interval >= config.emitter.pulse - 1e-12
+    assert settled.pulse * settled.interval >= config.emitter.call_duration - 1e-12
     arrival = one(3.217e-3)
     fast, dense = both(arrival, 20, square_of_four(config.receiver), settled)
     assert np.abs(fast - dense).max() <= 1e-10 * settled.block

@@ -111,7 +111,7 @@ def config_of(method, **sections):
     """Return the settings of a mission of 20 frames with timing, and an association."""
     return Config(
         scenario=ScenarioConfig(steps=160),
-        listening=ListeningConfig(timing=True),
+        listening=ListeningConfig(excess_paths=True),
         filter=FilterConfig(noise="measured"),
         association=AssociationConfig(method=method),
         **sections,
@@ -141,7 +141,7 @@ def test_excess_paths_without_labels_reach_the_filter_with_their_caller(written)
 
 def test_an_association_of_a_class_maps_a_mission_a_study_and_its_log(written, undrawn):
     method = ("--association.method", f"{written(JOINT)}:Joint")
-    timed = ("--listening.timing", "true", "--filter.noise", "measured")
+    timed = ("--listening.excess-paths", "true", "--filter.noise", "measured")
     words = ("run", *SHORT, *timed)
     assert main([*words, "-o", "known", "--save-log", "log"]) == 0
     assert main([*words, *method, "-o", "own"]) == 0
@@ -232,7 +232,7 @@ def test_callers_that_move_are_refused_with_an_association_of_a_filter_that_foll
     method = f"{written(JOINT)}:Joint"
     Path("boat.toml").write_text(
         '[[callers]]\nname = "boat"\nfrequency = 25e3\ncourse = "circle"\n'
-        f'[association]\nmethod = "{method}"\n[listening]\ntiming = true\n'
+        f'[association]\nmethod = "{method}"\n[listening]\nexcess_paths = true\n'
     )
     asked = ["run", "--scenario.steps", "40", "--config", "boat.toml", "-o", "one"]
     assert main([*asked, "--filter", "fastslam"]) == 2

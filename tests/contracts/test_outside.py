@@ -213,7 +213,7 @@ class Mine:
 
 
 def test_the_fields_of_an_estimator_receive_settings_by_name(written):
-    config = Config(filter=FilterConfig(gate=0.9), rays=RayConfig(power=5.0, density=2.0))
+    config = Config(filter=FilterConfig(gate=0.9), rays=RayConfig(exponent=5.0, range_ratio=2.0))
     slam = entry(f"{written(GREEDY)}:Mine").build(config, BICYCLE)
     assert (slam.gate, slam.rays, slam.config, slam.own) == (0.9, config.rays, config, 3)
     assert slam.motion is BICYCLE

@@ -25,7 +25,7 @@ from pipistrelle.experiments.hearing.oracle import label_detections
 from pipistrelle.experiments.hearing.scenario import caller_labels, world_of
 from reference.echoes import BEACON, CONFIG, OWN, SAMPLED, SETTLED, C, found_in, matched_of, sounds
 
-CALL = CONFIG.emitter.pulse
+CALL = CONFIG.emitter.call_duration
 
 
 def detected(*heard, key=1, blocks=200):

@@ -78,9 +78,8 @@ def test_a_row_without_deviation_makes_the_merged_mean_plain():
 )
 def test_invalid_labels_are_refused(label):
     scan = scan_of((UNLABELLED, 5.0, 0.3), (UNLABELLED, NAN, 1.0), (UNLABELLED, NAN, 2.0))
-    with pytest.raises(
-        InputError, match=r"association at 0\.0 s: found labels .* expected 3 whole"
-    ):
+    message = r"association at 0\.0 s: found labels .* expected 3 whole"
+    with pytest.raises(InputError, match=message):
         labelled(scan, label)
     assert labelled(scan, [4, UNLABELLED, 4]).landmark.tolist() == [4]
 
@@ -95,10 +94,8 @@ def test_the_first_range_is_kept_and_excess_paths_are_not_merged():
     assert merged.landmark.tolist() == [4, 4]
     assert (merged.range[0], merged.range_std[0], merged.bearing[0]) == (5.0, 0.2, 0.1)
     assert np.isnan([merged.range[1], merged.bearing[1]]).all()
-    assert (merged.excess_path.tolist(), merged.excess_path_std.tolist()) == (
-        [7.0, 6.0],
-        [0.5, 0.6],
-    )
+    assert merged.excess_path.tolist() == [7.0, 6.0]
+    assert merged.excess_path_std.tolist() == [0.5, 0.6]
     assert merged.caller.tolist() == [1, 2]
     assert labelled(merged, merged.landmark) is merged
 

@@ -50,7 +50,7 @@ def test_a_gate_that_is_left_open_is_the_estimators(name, robust):
 
 @pytest.mark.parametrize("name", CATALOGUE)
 def test_the_rays_of_the_settings_are_the_filters(name):
-    config = Config(rays=RayConfig(range_bounds=(1.0, 9.0), ratio=0.2, density=2.0))
+    config = Config(rays=RayConfig(range_bounds=(1.0, 9.0), relative_std=0.2, range_ratio=2.0))
     slam = entry(name).build(config, BICYCLE)
     sure = Gaussian(mean=START.mean, covariance=1e-12 * np.eye(3))
     belief = slam.update(slam.init(sure), scan_of((1, np.nan, 0.3)), RNG(1))

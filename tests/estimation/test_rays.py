@@ -9,8 +9,8 @@ from reference.ekf_slam import ray_ranges
 
 configs = st.builds(
     RayConfig,
-    ratio=st.floats(0.05, 0.5),
-    density=st.floats(1.2, 5),
+    relative_std=st.floats(0.05, 0.5),
+    range_ratio=st.floats(1.2, 5),
     range_bounds=st.tuples(st.floats(0.1, 5), st.floats(6, 100)),
 )
 logs = st.lists(st.floats(-1e4, 1e3), min_size=1, max_size=8).map(np.array)
@@ -46,8 +46,8 @@ def test_ray_reaches_from_the_nearest_to_the_farthest_range_with_no_member_to_sp
     assert ranges[0] - stds[0] == pytest.approx(near, rel=1e-12)
     assert reached[-1] >= far
     assert len(ranges) == 1 or (ranges + stds)[-2] < far * (1 + 1e-12)
-    np.testing.assert_allclose(stds / ranges, rays.ratio, rtol=1e-12)
-    np.testing.assert_allclose(ranges[1:] / ranges[:-1], rays.density, rtol=1e-12)
+    np.testing.assert_allclose(stds / ranges, rays.relative_std, rtol=1e-12)
+    np.testing.assert_allclose(ranges[1:] / ranges[:-1], rays.range_ratio, rtol=1e-12)
 
 
 @given(configs)

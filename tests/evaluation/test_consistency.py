@@ -64,9 +64,8 @@ def test_nees_does_not_change_its_arguments():
 
 
 def test_nees_of_independent_errors_is_their_sum_of_squared_ratios():
-    assert nees(np.array([[0.3, 0.4, 0.1]]), np.diag([0.09, 0.04, 0.01])[None]) == pytest.approx(
-        [1.0 + 4.0 + 1.0], rel=1e-12
-    )
+    expected = pytest.approx([1.0 + 4.0 + 1.0], rel=1e-12)
+    assert nees(np.array([[0.3, 0.4, 0.1]]), np.diag([0.09, 0.04, 0.01])[None]) == expected
 
 
 @pytest.mark.parametrize(

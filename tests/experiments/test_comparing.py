@@ -354,7 +354,7 @@ def test_other_worlds_are_not_paired_and_a_note_explains_it(tmp_path, config, ot
 
 
 def test_sound_and_estimators_may_differ_in_the_same_worlds():
-    other = Config(rays=RayConfig(power=3.0), beacon={"level_db": 50.0})
+    other = Config(rays=RayConfig(exponent=3.0), beacon={"level_db": 50.0})
     assert draw_of(Config()) == draw_of(other)
 
 
@@ -427,16 +427,16 @@ def test_cases_of_a_grid_are_matched_by_their_values_and_passive_by_no_beam(tmp_
 
 
 def test_a_value_that_only_one_study_varies_is_matched_with_the_settings_of_the_other(tmp_path):
-    grid = {"rays.power": (1.5, 2.0)}
+    grid = {"rays.exponent": (1.5, 2.0)}
     one = study_folder(tmp_path / "one", plan(grid=grid), numbers(1.0, 1))
     two = study_folder(tmp_path / "two", plan(), numbers(0.5, 2))
     compared = compare_studies([one, two])
-    assert {row["rays.power"] for row in compared.rows} == {2.0}
+    assert {row["rays.exponent"] for row in compared.rows} == {2.0}
     assert [case["case"] for case in cases_of_score(compared)] == [
-        "active ekf, rays.power 2.0",
-        "fused ekf, rays.power 2.0",
+        "active ekf, rays.exponent 2.0",
+        "fused ekf, rays.exponent 2.0",
     ]
-    assert compared.settings["grid.rays.power"] == ("[1.5, 2.0]", None)
+    assert compared.settings["grid.rays.exponent"] == ("[1.5, 2.0]", None)
 
 
 def test_a_filter_of_a_single_study_is_named(tmp_path):
@@ -451,9 +451,9 @@ def test_a_filter_of_a_single_study_is_named(tmp_path):
 
 
 def test_studies_without_a_common_case_are_refused_with_their_cases(tmp_path):
-    one = study_folder(tmp_path / "one", plan(grid={"rays.power": (1.5, 3.0)}), numbers(1.0, 1))
+    one = study_folder(tmp_path / "one", plan(grid={"rays.exponent": (1.5, 3.0)}), numbers(1.0, 1))
     two = study_folder(tmp_path / "two", plan(), numbers(0.5, 2))
-    with pytest.raises(InputError, match=r"no case .* tries active, fused by ekf at rays.power"):
+    with pytest.raises(InputError, match=r"no case .* tries active, fused by ekf at rays.exponent"):
         compare_studies([one, two])
 
 

@@ -57,10 +57,9 @@ def test_active_landmarks_need_one_member_each(monkeypatch):
 
 def test_a_refusal_of_dense_rays_names_their_members(monkeypatch):
     monkeypatch.setattr(machine, "installed", lambda: 4.0 * GB)
-    with pytest.raises(
-        InputError, match=r"51 landmarks of \d,\d{3} members each \(rays\.density\) may need"
-    ):
-        check_memory(["ekf"], 51, Config(rays=RayConfig(density=1.001)), passive=True)
+    message = r"51 landmarks of \d,\d{3} members each \(rays\.range_ratio\) may need"
+    with pytest.raises(InputError, match=message):
+        check_memory(["ekf"], 51, Config(rays=RayConfig(range_ratio=1.001)), passive=True)
     with pytest.raises(InputError, match="20000 landmarks may need"):
         check_memory(["ekf"], 20_000, Config(), passive=False)
 

@@ -100,16 +100,17 @@ def test_the_paper_settings_keep_the_former_default_mission_to_the_bit():
 
 
 def test_flags_override_the_environment_over_files_over_named_settings(monkeypatch):
-    Path("mine.toml").write_text("rays.power = 3.0\nrays.prune = 1e-4\nfilter.robust = 'none'\n")
+    text = "rays.exponent = 3.0\nrays.prune_threshold = 1e-4\nfilter.robust = 'none'\n"
+    Path("mine.toml").write_text(text)
     words = ("--settings", "mine.toml", "--settings", "best", "--filter", "iekf")
-    monkeypatch.setenv("PIPISTRELLE_RAYS__PRUNE", "1e-3")
+    monkeypatch.setenv("PIPISTRELLE_RAYS__PRUNE_THRESHOLD", "1e-3")
     ran("one", *words, "--filter.noise", "constant")
     kept = settings_kept("one")
-    assert kept["rays"]["spacing"] == "auto", "named, of the estimator alone"
-    assert kept["listening"]["timing"] is True, "named, of all"
+    assert kept["rays"]["precise_bearings"] == "auto", "named, of the estimator alone"
+    assert kept["listening"]["excess_paths"] is True, "named, of all"
     assert kept["filter"]["robust"] == "none", "the file, over the estimator's own"
-    assert kept["rays"]["power"] == 3.0
-    assert kept["rays"]["prune"] == 1e-3
+    assert kept["rays"]["exponent"] == 3.0
+    assert kept["rays"]["prune_threshold"] == 1e-3
     assert kept["filter"]["noise"] == "constant", "the flag, over the estimator's own"
 
 
@@ -142,12 +143,12 @@ def test_estimators_in_one_run_keep_their_separate_settings(capsys):
 
 
 def test_a_file_may_contain_settings_of_one_estimator():
-    Path("mine.toml").write_text("rays.power = 4.0\n[own.ekf]\nrays.power = 5.0\n")
+    Path("mine.toml").write_text("rays.exponent = 4.0\n[own.ekf]\nrays.exponent = 5.0\n")
     for name, power in (("ekf", 5.0), ("iekf", 4.0)):
         ran(name, "--settings", "mine.toml", "--filter", name)
-        assert settings_kept(name)["rays"]["power"] == power
-    ran("flag", "--settings", "mine.toml", "--filter", "ekf", "--rays.power", "6")
-    assert settings_kept("flag")["rays"]["power"] == 6.0
+        assert settings_kept(name)["rays"]["exponent"] == power
+    ran("flag", "--settings", "mine.toml", "--filter", "ekf", "--rays.exponent", "6")
+    assert settings_kept("flag")["rays"]["exponent"] == 6.0
 
 
 @pytest.mark.parametrize(
@@ -155,14 +156,14 @@ def test_a_file_may_contain_settings_of_one_estimator():
     [
         ("", "odd.toml: found no setting, expected settings"),
         ("# only a remark\n", "odd.toml: found no setting, expected settings"),
-        ("rays.power = nan", "odd.toml: rays.power: found nan, expected a finite number"),
+        ("rays.exponent = nan", "odd.toml: rays.exponent: found nan, expected a finite number"),
         ("own = 3", "odd.toml: own: found 3, expected a table for each estimator"),
         ("own.iekf = 3", "odd.toml: own.iekf: found 3, expected a table of settings"),
         ("own.iekf.rays.powr = 3", "own.iekf.rays.powr: no such setting; did you mean"),
-        ("own.iekf.rays.power = nan", "own.iekf.rays.power: found nan, expected a finite"),
-        ("own.ikef.rays.power = 3", "own.ikef.rays.power: found 'ikef', expected one of"),
+        ("own.iekf.rays.exponent = nan", "own.iekf.rays.exponent: found nan, expected a finite"),
+        ("own.ikef.rays.exponent = 3", "own.ikef.rays.exponent: found 'ikef', expected one of"),
         ("own.iekf.air.pressure_kpa = 3", "own.iekf.air.pressure_kpa: changes what is heard"),
-        ("own.iekf.own.ekf.rays.power = 3", "own.iekf.own.ekf.rays.power: changes what is heard"),
+        ("own.iekf.own.ekf.rays.merge = 3", "own.iekf.own.ekf.rays.merge: changes what is heard"),
         ("settings = 'bset'", "odd.toml: settings: found 'bset', expected best, paper, physics;"),
         ("settings = nan", "odd.toml: settings: found nan, expected best"),
         ("settings = ['best']", "odd.toml: settings: found ['best'], expected best"),
@@ -247,15 +248,15 @@ PLAN = {"format": 1, "name": "mine", "iterations": 1, "settings": "best"}
 
 def test_a_plan_overrides_the_settings_that_it_names():
     grid = {"filter.robust": ["none", "huber"]}
-    own = {"iekf": {"rays.spacing": "paper"}}
-    plan = plan_of(PLAN | {"filters": ["ekf", "iekf"], "config": {"rays.power": 4.0}, "grid": grid,
-                           "own": own})  # fmt: skip
+    own = {"iekf": {"rays.precise_bearings": "paper"}}
+    plan = plan_of(PLAN | {"filters": ["ekf", "iekf"], "config": {"rays.exponent": 4.0},
+                           "grid": grid, "own": own})  # fmt: skip
     cases = {(case.filter, case.values["filter.robust"]): case.config for case in cases_of(plan)}
     config = cases["iekf", "none"]
     assert config.settings == "best"
     assert (config.filter.noise, cases["ekf", "none"].filter.noise) == ("measured", "constant")
-    assert config.rays.power == 4.0, "the plan's, over the name's"
-    assert config.rays.spacing == "paper", "the plan's for the estimator, over the name's"
+    assert config.rays.exponent == 4.0, "the plan's, over the name's"
+    assert config.rays.precise_bearings == "paper", "the plan's for the estimator, over the name's"
     assert config.filter.robust == "none", "the grid's, over the name's for the estimator"
     over = plan_of(PLAN | {"filters": ["iekf"]}, over=from_flags({"filter": {"noise": "constant"}}))
     assert cases_of(over)[0].config.filter.noise == "constant"
@@ -266,7 +267,8 @@ def test_a_plan_overrides_the_settings_that_it_names():
 
 
 def test_a_plan_is_written_with_the_name_and_reads_back_the_same(tmp_path):
-    plan = plan_of(PLAN | {"filters": ["ekf", "iekf", "fastslam"], "grid": {"rays.power": [2.0]}})
+    filters = ["ekf", "iekf", "fastslam"]
+    plan = plan_of(PLAN | {"filters": filters, "grid": {"rays.exponent": [2.0]}})
     path = tmp_path / "plan.toml"
     path.write_text(plan_text(plan))
     assert tomllib.loads(path.read_text())["settings"] == "best"

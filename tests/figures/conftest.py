@@ -53,7 +53,7 @@ def timed():
     config = Config(
         seed=7,
         scenario=ScenarioConfig(steps=160, landmarks=8),
-        listening=ListeningConfig(timing=True),
+        listening=ListeningConfig(excess_paths=True),
         callers=callers,
     )
     watch = MissionRecorder()

@@ -98,7 +98,7 @@ def test_points_that_are_not_filled_are_open():
 
 
 def test_a_legend_of_long_names_takes_more_rows_and_stays_within_the_figure(tmp_path):
-    names = [f"rays.power = {k}, air.spreading = bistatic, and more" for k in range(4)]
+    names = [f"rays.exponent = {k}, air.spreading = bistatic, and more" for k in range(4)]
     figure = draw_chart(chart_of(panel_of(*(fused(name=name, strength=0.5) for name in names))))
     save_figure(figure, tmp_path, "c")
     (legend_drawn,) = figure.legends

@@ -31,7 +31,7 @@ CONFIGS: tuple[dict[str, Any], ...] = (
     {},
     {"filter": {"gate": 0.99}},
     {"filter": {"robust": "huber"}},
-    {"rays": {"spacing": "paper"}},
+    {"rays": {"precise_bearings": "paper"}},
     {"fastslam": {"particles": 20, "mixture": "exact"}},
 )
 

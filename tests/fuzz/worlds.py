@@ -12,7 +12,7 @@ from reference.command_line import SHORT
 
 CALLERS = "[{name='bee',frequency=25000.0,course='circle'},{name='post',frequency=45000.0}]"
 WAYPOINTS = b"x,y\n-3,0\n3,0\n3,3\n"
-RUN = ("run", "--quiet", "--strategy", "fused", "--listening.timing", "true")
+RUN = ("run", "--quiet", "--strategy", "fused", "--listening.excess-paths", "true")
 LIMIT = 30.0
 
 

@@ -73,7 +73,7 @@ def test_the_fitted_power_is_the_least_that_reaches_the_papers_count(found):
         nearest = min(counts, key=lambda count: abs(count - PAPER["ekf", 0].full[0]))
         assert row["prune"] == grid[counts.index(nearest)]
     least = min(row["power"] for row in found["rays_tried"] if row["power"] > 1)
-    assert found["fitted"]["rays.power"] == least
+    assert found["fitted"]["rays.exponent"] == least
 
 
 @pytest.mark.slow

@@ -18,7 +18,7 @@ RADIUS = 0.0088
 SETTINGS = Config(
     scenario=ScenarioConfig(steps=120),
     fastslam=FastSlamConfig(particles=25),
-    rays=RayConfig(ranged="bearing", prune=1e-3),
+    rays=RayConfig(range_update="bearing", prune_threshold=1e-3),
 )
 WORLD = world_of(SETTINGS)
 DRIVE = drive_of(WORLD, SETTINGS)

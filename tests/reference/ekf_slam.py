@@ -103,7 +103,7 @@ def poses(_, pose, control, dt):
 
 def ray_ranges(rays):
     """Ranges of the hypotheses of a new ray, Eq. (17)."""
-    alpha, beta, (near, far) = rays.ratio, rays.density, rays.range_bounds
+    alpha, beta, (near, far) = rays.relative_std, rays.range_ratio, rays.range_bounds
     count = 1 + math.ceil(math.log((1 - alpha) / (1 + alpha) * far / near, beta))
     ranges = [near / (1 - alpha)]
     while len(ranges) < count:
@@ -277,8 +277,8 @@ class SlowEkfSlam:
     @property
     def precise(self):
         """Return whether bearings are too precise for the width of the rays' hypotheses."""
-        linear_to = self.rays.ratio**2 / 2
-        return self.rays.spacing == "auto" and math.sqrt(self.bearing_variance) < linear_to
+        linear_to = self.rays.relative_std**2 / 2
+        return self.rays.precise_bearings == "auto" and math.sqrt(self.bearing_variance) < linear_to
 
     def curvature(self, block):
         """Mean and variance of the bearing's second-order term: tr(M P) / 2, tr(M P M P) / 2."""
@@ -368,7 +368,7 @@ class SlowEkfSlam:
             self.measure_full(label, distance, bearing)
         elif math.isnan(distance) and self.aggregated[self.members(label)[0]] == WAITS:
             self.cross(label, bearing)
-        elif math.isnan(distance) or self.rays.ranged == "bearing":
+        elif math.isnan(distance) or self.rays.range_update == "bearing":
             self.measure_ray(label, bearing)
         else:
             self.measure_ranged_ray(label, distance, bearing)
@@ -415,7 +415,7 @@ class SlowEkfSlam:
 
     def shares(self, members, log_likelihood):
         """Return each hypothesis's share of a measurement; 0 for skipped hypotheses."""
-        n = self.rays.power
+        n = self.rays.exponent
         if self.rays.weights == "instantaneous":
             shares = normalised([n * value for value in log_likelihood])
             return [share if share > LEAST_SHARE else 0 for share in shares]
@@ -425,7 +425,7 @@ class SlowEkfSlam:
     def prune(self, label):
         members = self.members(label)
         heaviest = max(members, key=self.aggregated.__getitem__)
-        least = self.rays.prune / len(members)
+        least = self.rays.prune_threshold / len(members)
         self.drop([b for b in members if self.aggregated[b] < least and b != heaviest])
         left = self.members(label)
         total = sum(self.aggregated[block] for block in left)
@@ -458,7 +458,7 @@ class SlowEkfSlam:
 
     def measure_ranged_ray(self, label, distance, bearing):
         """Update a ray with a range, by each interpretation of the paper's sentence."""
-        members, ranged = self.members(label), self.rays.ranged
+        members, ranged = self.members(label), self.rays.range_update
         heaviest = max(members, key=self.aggregated.__getitem__)
         if ranged == "anew":
             self.place_again(label, distance, bearing)
@@ -553,7 +553,7 @@ class SlowEkfSlam:
         by_bearing = {}
         for j, s in enumerate(ranges):
             m, G, Gz = self.point(s, bearing)
-            R = np.diag([(self.rays.ratio * s) ** 2, self.bearing_variance])
+            R = np.diag([(self.rays.relative_std * s) ** 2, self.bearing_variance])
             block = ("member", label, j)
             self.insert(position + j, block, m, G, Gz @ R @ Gz.T)
             self.aggregated[block] = 1 / len(ranges)

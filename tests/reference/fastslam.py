@@ -249,7 +249,7 @@ class SlowFastSlam:
 
     def by_bearing(self, distance):
         """Return whether a ray uses only a measurement's bearing."""
-        return math.isnan(distance) or self.rays.ranged in ("bearing", "moved")
+        return math.isnan(distance) or self.rays.range_update in ("bearing", "moved")
 
     def refine(self, p, members, distance, bearing):
         if self.settings.weights == "marginal":
@@ -289,11 +289,11 @@ class SlowFastSlam:
             least = LEAST_SHARE
         else:
             logs, least = [logarithm(w) for w in self.aggregated(members, logs)], LEAST_AGGREGATED
-        shares = normalised([self.rays.power * log for log in logs])
+        shares = normalised([self.rays.exponent * log for log in logs])
         return [share if share >= least else 0 for share in shares]
 
     def prune(self, members):
-        least = self.rays.prune / len(members)
+        least = self.rays.prune_threshold / len(members)
         best = members[heaviest(members)]
         left = [member for member in members if member.weight >= least or member is best]
         total = sum(member.weight for member in left)
@@ -321,7 +321,7 @@ class SlowFastSlam:
             return [self.corrected(pose, members[0], distance, bearing)]
         if math.isnan(distance):
             return self.correct_ray(pose, members, bearing)
-        ranged, best = self.rays.ranged, members[heaviest(members)]
+        ranged, best = self.rays.range_update, members[heaviest(members)]
         offset = best.mean - pose[:2]
         at = pose[:2] + distance * offset / np.linalg.norm(offset)
         if ranged == "anew":
@@ -364,7 +364,7 @@ class SlowFastSlam:
 
     def ray(self, pose, bearing):
         ranges = ray_ranges(self.rays)
-        members = [self.placed(pose, s, bearing, (self.rays.ratio * s) ** 2) for s in ranges]
+        members = [self.placed(pose, s, bearing, (self.rays.relative_std * s) ** 2) for s in ranges]
         for member in members:
             member.weight = 1 / len(ranges)
         return members

@@ -18,7 +18,7 @@ CHORUS = (
     "[{}, {frequency = 25e3}, {name = 'boat', frequency = 20e3, course = 'circle', radius = 10}]"
 )
 """Three callers: the beacon, one more at rest, and one that moves."""
-TIMED = ("--callers", CHORUS, "--listening.timing", "true", "--strategy", "fused")
+TIMED = ("--callers", CHORUS, "--listening.excess-paths", "true", "--strategy", "fused")
 PATIENCE = 600.0
 """Longest time to wait for another worker [s]; kernels may have to be compiled."""
 

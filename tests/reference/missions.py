@@ -135,18 +135,18 @@ def map_with(label=(), mean=None, covariance=None, weight=None):
 
 def ray_config(**changes):
     """Return the rays of Table I, with fixed tau and n even while defaults are being fitted."""
-    return RayConfig(**({"prune": 1e-3, "power": 1.0} | changes))
+    return RayConfig(**({"prune_threshold": 1e-3, "exponent": 1.0} | changes))
 
 
 ANY_RAYS = st.builds(
     RayConfig,
-    ratio=st.floats(0.1, 0.5),
-    density=st.floats(1.5, 4),
+    relative_std=st.floats(0.1, 0.5),
+    range_ratio=st.floats(1.5, 4),
     range_bounds=st.tuples(st.floats(0.2, 2), st.floats(3, 40)),
-    prune=st.floats(0, 0.3),
-    power=st.floats(0.5, 8),
+    prune_threshold=st.floats(0, 0.3),
+    exponent=st.floats(0.5, 8),
     weights=st.sampled_from(["instantaneous", "aggregated"]),
-    ranged=st.sampled_from([*RANGED]),
+    range_update=st.sampled_from([*RANGED]),
     likelihood=st.sampled_from(["normal", "printed"]),
     merge=st.sampled_from([0.0, 0.5, 2.0]),
 )

@@ -12,7 +12,7 @@ from reference.pictures import without_picture
 
 FEW = ("--receiver.elements", "4", "--landmarks", "20", "--duration", "4", "--seed", "7")
 """A drive of eight frames among few landmarks, for sixteen microphones."""
-UNLABELLED = ("--association.method", "marginal", "--listening.timing", "true")
+UNLABELLED = ("--association.method", "marginal", "--listening.excess-paths", "true")
 
 
 def record(folder, *words, drive=FEW):

@@ -40,11 +40,8 @@ def timed(mission, callers, rng, *, std=0.05, off=None, share=1.0, least=0.0, di
 def _timed(scan, vehicle, landmarks, callers, rng, std, off, kept):
     """Add to a scan the excess paths over its landmarks, for each caller in it."""
     share, least, direct = kept
-    numbers, landmark, caller = (
-        [scan.numbers.copy()],
-        [scan.landmark],
-        [np.zeros_like(scan.landmark)],
-    )
+    numbers, landmark = [scan.numbers.copy()], [scan.landmark]
+    caller = [np.zeros_like(scan.landmark)]
     first = numbers[0]
     for k, label in enumerate(callers, start=1):
         if direct and label not in scan.landmark:

@@ -222,7 +222,7 @@ def test_over_words_means_are_shifted_points_with_bars_and_the_bound_is_a_dash(t
 
 
 def test_each_of_two_variables_has_charts_with_every_combination(tmp_path):
-    grid = '"rays.power" = [1, 3]\n"beacon.level_db" = [36.8, 48.8]'
+    grid = '"rays.exponent" = [1, 3]\n"beacon.level_db" = [36.8, 48.8]'
     study, charts = charts_of(tmp_path, grid, effect=by_level(0.3))
     for name, variable in (("rays_power", 0), ("beacon_level_db", 1)):
         chart = charts[f"position_rmse_by_{name}"]
@@ -356,7 +356,7 @@ def test_without_variables_strategies_and_filters_have_the_charts():
 
 
 def test_the_gain_is_charted_along_each_variable_a_line_for_each_combination_of_the_rest(tmp_path):
-    grid = '"rays.power" = [1, 3]\n"beacon.level_db" = [36.8, 48.8]'
+    grid = '"rays.exponent" = [1, 3]\n"beacon.level_db" = [36.8, 48.8]'
     write_planted(tmp_path / "s", grid, ways='filters = ["ekf"]\n')
     study = read_study(tmp_path / "s")
     selection = select(study, "none")
@@ -401,7 +401,7 @@ def facets(tmp_path, grid, ways=PAIR):
 
 
 def test_few_combinations_of_the_rest_have_a_panel_each(tmp_path):
-    grid = '"rays.power" = [1, 3]\n"beacon.level_db" = [36.8, 42.8, 48.8]'
+    grid = '"rays.exponent" = [1, 3]\n"beacon.level_db" = [36.8, 42.8, 48.8]'
     _, (power, level) = facets(tmp_path, grid)
     assert [title for title, _ in power[0]] == [
         f"beacon.level_db = {word}" for word in ("36.8", "42.8", "48.8")

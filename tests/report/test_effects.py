@@ -26,7 +26,7 @@ from report.invented import changed, invent, narrowed, only, with_third
 from report.planted import LEVELS, by_level, write_planted
 
 BOTH = 'strategies = ["fused", "passive"]\nfilters = ["ekf"]\n'
-TWO = LEVELS + '\n"rays.power" = [1.0, 3.0]'
+TWO = LEVELS + '\n"rays.exponent" = [1.0, 3.0]'
 
 
 def study_of(tmp_path, *args, **given):
@@ -125,12 +125,12 @@ def test_the_beam_does_nothing_to_passive_sensing_and_is_not_compared_in_it():
 
 def test_other_variables_are_averaged_in_each_world_and_judged_at_each_combination(tmp_path):
     def effect(case):
-        more = {1.0: 0.1, 3.0: 0.5}[case.values["rays.power"]]
+        more = {1.0: 0.1, 3.0: 0.5}[case.values["rays.exponent"]]
         return {"position_rmse_m": more * (case.values["beacon.level_db"] > 40.0)}
 
     study = study_of(tmp_path, TWO, effect=effect, spread=0.01)
     (end,) = position(effects_of(select(study, "none")), factor="beacon.level_db", end=True)
-    assert end.pairing.names == ("rays.power = 1", "rays.power = 3")
+    assert end.pairing.names == ("rays.exponent = 1", "rays.exponent = 3")
     assert [f.mean for f in end.apart] == pytest.approx([0.1, 0.5], abs=0.01)
     table = study.trials["ekf", "fused"].scores["position_rmse_m"]
     by_hand = 0.5 * (table[:, 4] - table[:, 0] + table[:, 5] - table[:, 1])
@@ -222,7 +222,7 @@ def test_the_record_is_plain_json_with_ratios_as_ratios(tmp_path):
     assert set(nees["by_exclusion"]) == set(RULES)
     assert (nees["unit"], nees["variable"], nees["from"]) == ("ratio", "beacon.level_db", "36.8")
     assert (nees["averaged_over"], [one["at"] for one in nees["apart"]]) == (
-        2, ["rays.power = 1", "rays.power = 3"],
+        2, ["rays.exponent = 1", "rays.exponent = 3"],
     )  # fmt: skip
     assert found["shown"]
     assert found["alone"][0] < found["mean"] < found["alone"][1]
@@ -630,7 +630,7 @@ def test_each_variable_has_a_sentence_averaged_over_all_cases(planted):
         return by_level({"active": -0.5, "fused": -0.1}[case.strategy])(case)
 
     ways = 'strategies = ["active", "fused"]\nfilters = ["ekf"]\n'
-    level, power = planted(LEVELS + '\n"rays.power" = [1.0, 3.0]', ways=ways, effect=effect)
+    level, power = planted(LEVELS + '\n"rays.exponent" = [1.0, 3.0]', ways=ways, effect=effect)
     assert re.match(r"beacon\.level_db from 36\.8 to 48\.8 lowers the .* averaged over 4", level)
     assert re.match(r"rays\.power from 1 to 3 shows no effect on .* averaged over 6", power)
 

@@ -130,12 +130,12 @@ KINDS = {
         "What does rays.range_bounds change?",
     ),
     "two variables": (
-        '"rays.power" = [1, 3]\n' + LEVELS, TWO_FILTERS,
-        "What do rays.power and beacon.level_db change?",
+        '"rays.exponent" = [1, 3]\n' + LEVELS, TWO_FILTERS,
+        "What do rays.exponent and beacon.level_db change?",
     ),
     "three variables": (
-        'beamwidth = [180, 11]\n"rays.power" = [1, 3]\n"air.spreading" = ["paper", "bistatic"]',
-        ONE_FILTER, "What do the beamwidth, rays.power and air.spreading change?",
+        'beamwidth = [180, 11]\n"rays.exponent" = [1, 3]\n"air.spreading" = ["paper", "bistatic"]',
+        ONE_FILTER, "What do the beamwidth, rays.exponent and air.spreading change?",
     ),
     "radius and tone": (
         '"emitter.radius" = [0.0025, 0.025]\n"emitter.frequency" = [35e3, 40e3]', ONE_FILTER,
@@ -144,7 +144,7 @@ KINDS = {
     "other worlds": (
         '"scenario.landmarks" = [12, 20]', FUSED_EKF, "What does scenario.landmarks change?",
     ),
-    "a value alone": ('"rays.power" = [3.0]', ONE_FILTER, "How do active, fused and passive"),
+    "a value alone": ('"rays.exponent" = [3.0]', ONE_FILTER, "How do active, fused and passive"),
     "no grid": ("", ONE_FILTER, "How do active, fused and passive sensing compare?"),
     "two filters": ("", TWO_FILTERS, "How do EKF and invariant EKF compare?"),
     "a filter from outside": (
@@ -225,7 +225,7 @@ def assert_the_papers_question_is_asked_and_its_claims_come_after_its_figures(pa
 @pytest.mark.parametrize("variable", [False, pytest.param(True, marks=pytest.mark.slow)])
 def test_without_the_papers_cases_its_claims_are_not_judged(tmp_path, variable):
     if variable:
-        write_store(tmp_path / "s", invent(3), grid='"rays.power" = [1.0, 3.0]\n')
+        write_store(tmp_path / "s", invent(3), grid='"rays.exponent" = [1.0, 3.0]\n')
         assert main(["report", str(tmp_path / "s"), "-o", str(tmp_path / "r"), "--quiet"]) == 0
     else:
         ekf = only(invent(3), [("ekf", way) for way in ("active", "fused", "passive")])
@@ -249,11 +249,11 @@ def test_sentences_given_to_the_report_are_judged_whatever_a_study_holds(tmp_pat
 
 
 def test_every_case_is_listed_with_its_numbers(reported):
-    page = reported('"rays.power" = [1, 3]\n' + LEVELS, ways=BOTH, worlds=5)
+    page = reported('"rays.exponent" = [1, 3]\n' + LEVELS, ways=BOTH, worlds=5)
     cases = page.summary["cases"]
     assert len(cases) == 2 * 3 * 2
     assert {case["at"] for case in cases} == {
-        f"rays.power = {power}, beacon.level_db = {level}"
+        f"rays.exponent = {power}, beacon.level_db = {level}"
         for power in (1, 3) for level in (36.8, 42.8, 48.8)
     }  # fmt: skip
     assert all(case["n"] == 5 and case["diverged"] == 0.0 for case in cases)
@@ -331,7 +331,7 @@ def test_a_gain_has_its_row_and_its_line(reported):
         return by_level({"active": -0.5, "fused": -0.1}[case.strategy])(case)
 
     ways = 'strategies = ["active", "fused"]\nfilters = ["ekf"]\n'
-    page = reported(f'{LEVELS}\n"rays.power" = [1.0, 3.0]', ways=ways, effect=effect)
+    page = reported(f'{LEVELS}\n"rays.exponent" = [1.0, 3.0]', ways=ways, effect=effect)
     (found,) = page.effects(
         measure="gain_position_rmse_m", variable="beacon.level_db", to="48.8", strategy="fused"
     )

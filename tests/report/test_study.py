@@ -259,7 +259,7 @@ def test_further_settings_are_further_variables_and_every_combination_has_its_nu
 
 def test_words_and_lists_keep_the_plans_order_and_single_values_are_no_variable(tmp_path):
     grid = (
-        '"rays.range_bounds" = [[2.0, 40.0], [0.5, 20.0]]\n"rays.power" = [3.0]\n'
+        '"rays.range_bounds" = [[2.0, 40.0], [0.5, 20.0]]\n"rays.exponent" = [3.0]\n'
         '"rays.weights" = ["instantaneous", "aggregated"]'
     )
     write_planted(tmp_path / "s", grid, worlds=1)
@@ -268,7 +268,7 @@ def test_words_and_lists_keep_the_plans_order_and_single_values_are_no_variable(
     assert bounds.words == ("[2, 40]", "[0.5, 20]")
     assert weights.words == ("instantaneous", "aggregated")
     assert (bounds.numbers, weights.numbers) == (None, None)
-    assert {config.rays.power for config in read.configs} == {3.0}
+    assert {config.rays.exponent for config in read.configs} == {3.0}
     assert read.configs[1].rays.weights == "aggregated"
     assert read.configs[1].rays.range_bounds == (2.0, 40.0)
 
@@ -286,10 +286,10 @@ def test_a_radius_is_no_beamwidth_where_the_tone_varies_too_or_all_beams_are_as_
 def test_combinations_know_whether_they_meet_the_same_landmarks(tmp_path):
     write_planted(tmp_path / "level", LEVELS, worlds=1)
     assert read_study(tmp_path / "level").drawing.tolist() == [0, 0, 0]
-    grid = '"scenario.landmarks" = [12, 20]\n"rays.power" = [1, 2]'
+    grid = '"scenario.landmarks" = [12, 20]\n"rays.exponent" = [1, 2]'
     write_planted(tmp_path / "count", grid, worlds=1)
     assert read_study(tmp_path / "count").drawing.tolist() == [0, 0, 1, 1]
-    crowded = '"scenario.radius" = [3.0, 25.0]\n"rays.power" = [1, 2]'
+    crowded = '"scenario.radius" = [3.0, 25.0]\n"rays.exponent" = [1, 2]'
     write_planted(tmp_path / "crowded", crowded, worlds=1)
     first, again, other, _ = read_study(tmp_path / "crowded").drawing
     assert first == again != other, "a world that cannot be drawn is one of its own"

@@ -23,7 +23,7 @@ from pipistrelle.settings import from_flags
 from report.invented import RADII, diverging, invent, only, with_third
 from report.planted import by_level, write_planted
 
-TWO = '"beacon.level_db" = [36.8, 48.8]\n"rays.power" = [1.0, 3.0]'
+TWO = '"beacon.level_db" = [36.8, 48.8]\n"rays.exponent" = [1.0, 3.0]'
 
 
 @pytest.fixture
@@ -42,11 +42,11 @@ def rows(tmp_path):
 @pytest.mark.parametrize("second", [1.0, -1.0])
 def test_each_of_few_combinations_has_a_row_and_one_with_the_opposite_is_marked(rows, second):
     def effect(case):
-        sign = {1.0: 1.0, 3.0: second}[case.values["rays.power"]]
+        sign = {1.0: 1.0, 3.0: second}[case.values["rays.exponent"]]
         return {"position_rmse_m": sign * 0.5 * (case.values["beacon.level_db"] > 40.0)}
 
     mean, *apart = rows(TWO, effect=effect)
-    assert [row["label"] for row in apart] == ["at rays.power = 1", "at rays.power = 3"]
+    assert [row["label"] for row in apart] == ["at rays.exponent = 1", "at rays.exponent = 3"]
     assert [row["cells"][0]["text"][:4] for row in apart] == [
         "+0.5" if second > 0 else row["cells"][0]["text"][:4] for row in apart
     ]

@@ -154,7 +154,7 @@ def test_words_are_upright_or_slanted_and_long_words_are_shortened_in_the_middle
 
 
 def test_ticks_that_would_run_into_each_other_are_left_out_and_read_out_still():
-    axis = axis_of(setting_variable("rays.prune", [k * 1.25e-5 for k in range(1, 21)]))
+    axis = axis_of(setting_variable("rays.prune_threshold", [k * 1.25e-5 for k in range(1, 21)]))
     assert 2 <= len(axis.ticks) < 20
     assert axis.ticks[0][0] == 1.25e-5
     assert len(axis.named) == 20

@@ -38,7 +38,7 @@ ONE = {"landmark": [7, 8], "bearing": [0.1, 0.9], "range": [2.0, 3.0]}
 def logs(tmp_path_factory):
     """Return a log of a mission, and one whose rows have no labels."""
     folder = tmp_path_factory.mktemp("logs")
-    settings = ["--listening.timing", "true", "--filter.noise", "measured"]
+    settings = ["--listening.excess-paths", "true", "--filter.noise", "measured"]
     run = ["run", "--duration", "20", "--strategy", "fused", "--quiet", *settings]
     assert main([*run, "--save-log", str(folder / "known"), "-o", str(folder / "a")]) == 0
     bare = shutil.copytree(folder / "known", folder / "bare")
@@ -290,7 +290,7 @@ def test_a_vehicle_that_is_none_is_refused(vehicle, words):
 def test_settings_of_slam_are_accepted_and_others_rejected():
     assert Slam(ROBOT, filter="smoother", filter__window=50, seed=3).time == 0.0
     for options, words in (
-        ({"rays__powr": 2.0}, "did you mean rays__power"),
+        ({"rays__powr": 2.0}, "did you mean rays__exponent"),
         ({"filter__range_std": 1.0}, "the log decides this"),
         ({"filter": "both"}, "one estimator"),
         ({"filter": "ikef"}, "did you mean 'iekf'"),

@@ -131,10 +131,10 @@ def test_missing_measurements_are_reported_only_for_empty_scans(rows):
     ("left_out", "parts"),
     [
         ({"bearing_std": [0.0866] * 3}, ("3 rows of active", "0.087 rad, is above", "-std 0.09 ")),
-        ({"bearing_std": [0.06, 0.3]}, ("0.06 to 0.3 rad", "--association.bearing-std 0.3 takes")),
-        ({"bearing_std": [0.06, 1.4]}, ("0.06 to 1.4 rad", "bearing-std 0.06 takes 1 of them")),
-        ({"bearing_std": [1.4]}, ("1 rows", "association.bearing_std, 0.05 rad")),
-        ({"way_std": [0.4, 12.1]}, ("of their ranges, 0.4 to 12 m", "--association.way-std 20 ")),
+        ({"bearing_std": [0.06, 0.3]}, ("0.06 to 0.3 rad", "--association.max-angle-std 0.3 ")),
+        ({"bearing_std": [0.06, 1.4]}, ("0.06 to 1.4 rad", "angle-std 0.06 takes 1 of them")),
+        ({"bearing_std": [1.4]}, ("1 rows", "association.max_angle_std, 0.05 rad")),
+        ({"way_std": [0.4, 12.1]}, ("of their ranges, 0.4 to 12 m", "on.max-range-std 20 ")),
     ],
 )
 def test_discarded_rows_are_reported_with_a_sufficient_limit(left_out, parts):

@@ -92,5 +92,5 @@ def test_a_recording_is_described_with_its_level_and_the_faults_that_hear_finds(
 def test_results_and_settings_of_a_solution_are_refused(short_run, short_log):
     with pytest.raises(InputError, match="found results, expected a log folder or"):
         pipistrelle.look(short_run)
-    with pytest.raises(InputError, match="rays__power: means nothing to a log before"):
-        pipistrelle.look(short_log, rays__power=3.0)
+    with pytest.raises(InputError, match="rays__exponent: means nothing to a log before"):
+        pipistrelle.look(short_log, rays__exponent=3.0)

@@ -68,14 +68,14 @@ def test_nothing_is_written_unless_a_folder_is_named(done, tmp_path):
 @pytest.mark.parametrize(
     "asked",
     [
-        {"rays__power": 8.0, "seed": 3},
-        {"rays": {"power": 8.0}, "seed": 3},
-        {"rays": {"power": 8.0, "prune": 1e-5}, "seed": 3},
+        {"rays__exponent": 8.0, "seed": 3},
+        {"rays": {"exponent": 8.0}, "seed": 3},
+        {"rays": {"exponent": 8.0, "prune_threshold": 1e-5}, "seed": 3},
     ],
 )
 def test_settings_are_keywords_or_sections(asked):
     found = pipistrelle.run(**SHORT, strategies="fused", **asked)
-    same = pipistrelle.run({"rays.power": 8.0, "seed": 3}, **SHORT, strategies="fused")
+    same = pipistrelle.run({"rays.exponent": 8.0, "seed": 3}, **SHORT, strategies="fused")
     assert found.tracks.equals(same.tracks)
 
 
@@ -92,17 +92,17 @@ def test_settings_to_start_from_may_be_settings_a_table_or_a_file(done):
 @pytest.mark.parametrize(
     ("words", "asked", "said"),
     [
-        ((), {"rays__powr": 8.0}, "rays__powr: no such setting; did you mean rays__power?"),
+        ((), {"rays__powr": 8.0}, "rays__powr: no such setting; did you mean rays__exponent?"),
         (
             (),
             {"bearing_std": 8.0},
-            "did you mean association__bearing_std or filter__bearing_std or bag__bearing",
+            "did you mean filter__bearing_std or bag__bearing_std or association__max_angle_std",
         ),
-        ((), {"rays__power": -1.0}, "rays__power: found -1.0, expected greater than 0"),
+        ((), {"rays__exponent": -1.0}, "rays__exponent: found -1.0, expected greater than 0"),
         ((), {"seed": 1.5}, "seed: found 1.5, expected a valid integer"),
         ((), {"rays": 3}, "rays: found 3, expected a section of settings"),
-        ((), {"rays": {"power": 2.0}, "rays__power__x": 2}, "found power as a value too"),
-        (({"ray.power": 3.0},), {}, "config: ray.power: no such setting; did you mean rays.power?"),
+        ((), {"rays": {"exponent": 2.0}, "rays__exponent__x": 2}, "found exponent as a value too"),
+        (({"ray.merge": 3.0},), {}, "config: ray.merge: no such setting; did you mean rays.merge?"),
         (("nowhere.toml",), {}, "nowhere.toml: found no such file"),
         ((7,), {}, "config: found 7, expected a Config, a mapping, a name or the path"),
         ((), {"landmarks": [[1, 2], [3, 4]]}, "and name it by world="),
@@ -141,16 +141,15 @@ def test_a_folder_that_is_not_empty_is_refused_in_pythons_words(done, tmp_path):
         assert "--" not in str(refused.value)
     assert (tmp_path / "mine.txt").read_text() == "kept"
     place = done.save(tmp_path / "ours")
-    with pytest.raises(
-        InputError, match=r"save\(DIR\), or add overwrite=True to replace the results"
-    ):
+    message = r"save\(DIR\), or add overwrite=True to replace the results"
+    with pytest.raises(InputError, match=message):
         done.save(place)
 
 
 @pytest.mark.usefixtures("undrawn")
 def test_a_log_is_solved_as_by_the_command_line(capsys):
-    found = pipistrelle.slam(LOG, strategies="all", beamwidth=90.0, rays__power=4.0)
-    words = ("--strategy", "all", "--beamwidth", "90", "--rays.power", "4.0", "-o", "one")
+    found = pipistrelle.slam(LOG, strategies="all", beamwidth=90.0, rays__exponent=4.0)
+    words = ("--strategy", "all", "--beamwidth", "90", "--rays.exponent", "4.0", "-o", "one")
     assert main(["slam", str(LOG), *words]) == 0
     capsys.readouterr()
     assert found.tracks.equals(pl.read_parquet("one/steps.parquet"))
@@ -335,7 +334,7 @@ def test_loaded_results_are_saved_with_equal_files(kind, tmp_path):
     if kind == "a log":
         pipistrelle.slam(LOG, beamwidth=90.0, output="one")
     elif kind == "a caller that moves":
-        timed = {"listening": {"timing": True}, "callers": CALLERS}
+        timed = {"listening": {"excess_paths": True}, "callers": CALLERS}
         pipistrelle.run(**SHORT, strategies="fused", **timed, output="one")
     else:
         Path("posts").mkdir()

@@ -80,7 +80,7 @@ def test_runs_and_their_log_are_compared_from_the_command_line(obey, undrawn):
     assert (status, said) == (0, "")
     assert "The drives are not the same" not in printed
     assert "Settings of air, assumed, bag, beacon" in printed
-    assert "rays.spacing" in printed
+    assert "rays.precise_bearings" in printed
     assert printed.splitlines()[6].split() == ["ekf", "iekf"]
 
 

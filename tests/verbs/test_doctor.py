@@ -52,5 +52,6 @@ def test_doctor_compiles_the_kernels_of_all_estimators_if_asked(obey, monkeypatc
     status, printed, said = obey("doctor", "--compile")
     assert (status, said) == (0, "")
     assert "compiled or loaded" in printed.splitlines()[-1]
-    methods = {(c.association.method, c.listening.timing) for c in asked if isinstance(c, Config)}
+    configs = [config for config in asked if isinstance(config, Config)]
+    methods = {(c.association.method, c.listening.excess_paths) for c in configs}
     assert methods == {*product(("known", *METHODS), (False, True))}

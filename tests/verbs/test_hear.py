@@ -92,7 +92,7 @@ def test_folders_without_a_recording_are_rejected(refused):
     kinds = {"file": "found a file", "gone": "no such folder", "empty": "recording.toml"}
     for place, words in (kinds | {"link": "no such folder"}).items():
         assert words in refused("hear", place, "-o", "log")
-    refused("hear", "empty", "--rays.power", "3", "-o", "log")
+    refused("hear", "empty", "--rays.exponent", "3", "-o", "log")
     assert "recording.toml" in refused("hear", "empty")
     assert not Path("log").exists()
 

@@ -15,7 +15,7 @@ import pytest
 import pipistrelle
 from pipistrelle.__main__ import main
 from pipistrelle.acoustics.emitter import beamwidth
-from pipistrelle.config import PARAMETERS, BagConfig, Config, FastSlamConfig
+from pipistrelle.config import PARAMETERS, BagConfig, Config, FastSlamConfig, RayConfig
 from pipistrelle.settings import known_settings
 
 HEAVY = {"numpy", "pydantic", "numba", "matplotlib"}
@@ -79,7 +79,7 @@ def test_help_lists_at_most_twenty_two_options_without_empty_defaults(printed, v
     flags = re.findall(r"^│ (--[a-z-]+)", text, re.M)
     assert 0 < len(flags) <= 22
     assert not re.search(r"--empty-|default: (none|no|False|\(\))\]", text)
-    assert "--rays.power" not in text.partition("╯\n\n")[0]
+    assert "--rays.exponent" not in text.partition("╯\n\n")[0]
 
 
 @pytest.mark.parametrize("verb", ["run", "slam", "hear"])
@@ -95,13 +95,12 @@ def test_parameters_of_python_are_options_with_the_same_words(printed, verb):
 
 def test_help_all_of_slam_omits_settings_that_a_log_decides(printed):
     found = set(re.findall(r"--[a-z]+\.[a-z-]+", printed("slam", "--help-all")))
-    rays = ("ratio", "density", "prune", "power", "weights", "likelihood", "spacing")
-    rays = (*rays, "merge", "ranged")
+    rays = {name.replace("_", "-") for name in RayConfig.model_fields} - {"range-bounds"}
     swarm = (name.replace("_", "-") for name in FastSlamConfig.model_fields)
     assert found == {
-        "--listening.timing",
-        *(f"--association.{name}" for name in ("method", "detection", "clutter", "bearing-std")),
-        "--association.way-std",
+        "--listening.excess-paths",
+        *(f"--association.{name}" for name in ("method", "detection-rate", "clutter-rate")),
+        *(f"--association.max-{name}-std" for name in ("angle", "range")),
         *(f"--filter.{name}" for name in ("noise", "excess-path-std", "robust")),
         *(f"--filter.{name}" for name in ("calibrate", "window")),
         *(f"--prior.{name.replace('_', '-')}-std" for name in PARAMETERS),

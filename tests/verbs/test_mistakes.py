@@ -10,10 +10,10 @@ import pytest
     [
         ("rn", 'Unknown command "rn". Did you mean "run"?'),
         ("run --bemwidth 3", "Unknown option: --bemwidth. Did you mean --beamwidth?"),
-        ("run --rays.powr 3", "Unknown option: --rays.powr. Did you mean --rays.power?"),
-        ("run --rays.power x", '--rays.power: unable to convert "x" into float'),
-        ("run --rays.power nan", "--rays.power: found nan, expected a finite number"),
-        ("run --rays.power", "--rays.power requires an argument"),
+        ("run --rays.powr 3", "Unknown option: --rays.powr. Did you mean --rays.exponent?"),
+        ("run --rays.exponent x", '--rays.exponent: unable to convert "x" into float'),
+        ("run --rays.exponent nan", "--rays.exponent: found nan, expected a finite number"),
+        ("run --rays.exponent", "--rays.exponent requires an argument"),
         ("run --landmarks 2.5", "--landmarks: found '2.5', expected a whole number"),
         ("run --scenario.steps 9.5", "--scenario.steps: found '9.5', expected a whole number"),
         ("run --landmarks -1", "--landmarks: found -1, expected greater than or equal to 0"),
@@ -55,7 +55,7 @@ import pytest
         ("run --beamwidth nan", "found nan degrees, expected above 0 and up to 180"),
         ("run --landmarks 3 --scenario.landmarks 3",
          "--landmarks and --scenario.landmarks are one setting; give one of them"),
-        ("run --timing true", "Unknown option: --timing. Did you mean --listening.timing?"),
+        ("run --timing true", "Unknown option: --timing. Did you mean --listening.excess-paths?"),
         ("slam x --robust huber", "Unknown option: --robust. Did you mean --filter.robust?"),
         ("run --assumed 3", "--assumed: is a section of settings; name one of it, as --assumed."),
         ("run --config none.toml", "none.toml: found no such file"),
@@ -79,7 +79,7 @@ import pytest
         ("run --scenario.beacon-distance 1e9", "scenario.beacon_distance: a recording of 1.17e+07"),
         ("run --scenario.radius 1e9", "scenario.radius: a recording of 1.1"),
         ("run --scenario.start 1e9 0 0", "scenario.start: a recording of 1.17e+07 s may need"),
-        ("run --emitter.pulse 1e6", "emitter.pulse: a recording of 1e+06 s may need"),
+        ("run --emitter.call-duration 1e6", "emitter.call_duration: a recording of 1e+06 s"),
         ("run --scenario.speed 400", "scenario.speed: the vehicle reaches 400 m/s, expected less"),
         ("run --motion.speed-std 400", "motion.speed_std: the vehicle reaches"),
         ("view", "FOLDER requires an argument"),
@@ -138,11 +138,11 @@ def test_a_users_list_of_checksums_is_recognised_as_foreign(refused):
 def test_mistakes_in_a_file_or_the_environment_are_located(refused, monkeypatch):
     Path("mission.toml").write_text("[rays]\npowr = 3\n")
     found = refused("run", "--config", "mission.toml")
-    assert found == "mission.toml: rays.powr: no such setting; did you mean rays.power?"
+    assert found == "mission.toml: rays.powr: no such setting; did you mean rays.exponent?"
     Path("mission.toml").write_text("[rays]\npower 3\n")
     assert ", expected TOML; correct the line" in refused("run", "--config", "mission.toml")
-    monkeypatch.setenv("PIPISTRELLE_RAYS__POWER", "0")
-    assert refused("run") == "PIPISTRELLE_RAYS__POWER: found 0, expected greater than 0"
+    monkeypatch.setenv("PIPISTRELLE_RAYS__EXPONENT", "0")
+    assert refused("run") == "PIPISTRELLE_RAYS__EXPONENT: found 0, expected greater than 0"
 
 
 @pytest.mark.parametrize(

@@ -179,7 +179,7 @@ def test_a_quiet_run_prints_only_its_folder(obey, undrawn):
 
 def test_the_settings_of_a_run_are_a_file_that_repeats_it(obey, undrawn):
     words = ("--strategy", "fused", "--quiet")
-    obey("run", *SHORT, "--seed", "5", "--rays.power", "3", *words, "-o", "one")
+    obey("run", *SHORT, "--seed", "5", "--rays.exponent", "3", *words, "-o", "one")
     obey("run", "--config", "one/config.toml", *words, "-o", "two")
     assert summary("one")["config_hash"] == summary("two")["config_hash"]
     np.testing.assert_array_equal(track("one", "fused_ekf"), track("two", "fused_ekf"))
@@ -243,7 +243,7 @@ def test_a_failing_estimator_loses_only_its_estimate(obey, undrawn, monkeypatch)
 def test_measurements_do_not_depend_on_the_filter(obey, undrawn):
     boat = '[{name="boat",frequency=25000.0,course="circle"}]'
     words = ("--duration", "4", "--landmarks", "8", "--particles", "20", "--strategy", "fused")
-    words += ("--listening.timing", "true", "--callers", boat, "--quiet")
+    words += ("--listening.excess-paths", "true", "--callers", boat, "--quiet")
     for name in ("ekf", "both"):
         own = [word for word in words if name == "both" or word not in ("--particles", "20")]
         obey("run", *own, "--filter", name, "--save-log", f"log_{name}", "-o", name)
@@ -253,7 +253,7 @@ def test_measurements_do_not_depend_on_the_filter(obey, undrawn):
     assert one.equals(two)
     boats = one.filter(landmark=9)
     assert boats.height >= 4, "it is heard itself"
-    told = {"listening__timing": True, "callers": from_text(boat)}
+    told = {"listening__excess_paths": True, "callers": from_text(boat)}
     told |= {"duration": 4, "landmarks": 8, "fastslam__particles": 20}
     other = pipistrelle.run(strategies="fused", filters=["fastslam", "ekf"], **told)
     assert other.measurements.equals(one)
@@ -377,11 +377,11 @@ def settings(obey):
 
 
 def test_settings_as_shown_are_a_file_of_the_same_settings(settings, obey):
-    config = settings("--rays.power", "3", "--scenario.start", "1", "-2", "0.5", "--seed", "9")
-    assert config.rays.power == 3.0
+    config = settings("--rays.exponent", "3", "--scenario.start", "1", "-2", "0.5", "--seed", "9")
+    assert config.rays.exponent == 3.0
     assert config.scenario.start == (1.0, -2.0, 0.5)
-    Path("mission.toml").write_text(obey("config", "show", "--rays.power", "3")[1])
-    assert settings("--config", "mission.toml") == settings("--rays.power", "3")
+    Path("mission.toml").write_text(obey("config", "show", "--rays.exponent", "3")[1])
+    assert settings("--config", "mission.toml") == settings("--rays.exponent", "3")
 
 
 def test_short_options_set_their_settings(settings):

@@ -58,10 +58,10 @@ def test_a_run_and_its_log_give_one_track(obey, strategy, estimator, undrawn):
 @pytest.mark.parametrize("noise", ["constant", "measured"])
 def test_a_log_keeps_excess_paths_and_their_callers_bit_for_bit(obey, noise, undrawn):
     told = ("--filter.noise", noise, "--filter.gate", "0.99")
-    words = ("--callers", CHORUS, "--listening.timing", "true", "--strategy", "fused")
+    words = ("--callers", CHORUS, "--listening.excess-paths", "true", "--strategy", "fused")
     obey("run", *SHORT, *words, *told, "--save-log", "log", "-o", "one")
-    settings = {"filter__noise": noise, "filter__gate": 0.99, "rays__spacing": "paper"}
-    timing = {"callers": from_text(CHORUS), "listening__timing": True}
+    settings = {"filter__noise": noise, "filter__gate": 0.99, "rays__precise_bearings": "paper"}
+    timing = {"callers": from_text(CHORUS), "listening__excess_paths": True}
     ran = pipistrelle.run(
         strategies="fused", settings="paper", duration=4, landmarks=10, **settings, **timing
     )  # the same again: its scans are in no file
@@ -81,23 +81,23 @@ def test_a_log_keeps_excess_paths_and_their_callers_bit_for_bit(obey, noise, und
 
 
 def test_slam_uses_excess_paths_of_a_log_by_default(obey, timed, undrawn):
-    for more, timing in (((), True), (("--listening.timing", "false"), False)):
+    for more, timing in (((), True), (("--listening.excess-paths", "false"), False)):
         obey("slam", "log", *more, "--quiet", "-o", "two", "--overwrite")
         heard = pl.read_parquet("two/measurements.parquet")
         assert (heard["excess_path_m"].null_count() < heard.height) == timing
         config = tomllib.loads(Path("two/config.toml").read_text())
-        assert config["listening"]["timing"] is timing
+        assert config["listening"]["excess_paths"] is timing
     obey("slam", str(DATA / "unicycle_log"), "--quiet", "-o", "two", "--overwrite")
-    assert tomllib.loads(Path("two/config.toml").read_text())["listening"]["timing"] is False
+    assert tomllib.loads(Path("two/config.toml").read_text())["listening"]["excess_paths"] is False
 
 
 def test_a_caller_that_moves_is_followed_in_a_log_without_an_excess_path(obey, undrawn):
     ahead = "[{waypoints = [[5, -6], [5, -5]]}]"
-    words = ("--callers", ahead, "--listening.timing", "true", "--strategy", "active")
+    words = ("--callers", ahead, "--listening.excess-paths", "true", "--strategy", "active")
     asked = ("--filter", "smoother", "--filter.gate", "0.99", "--save-log", "log", "-o", "one")
     obey("run", *SHORT, *words, *asked)
     assert obey("slam", "log", "--filter.gate", "0.99", "--quiet", "-o", "two")[2] == ""
-    assert tomllib.loads(Path("two/config.toml").read_text())["listening"]["timing"] is True
+    assert tomllib.loads(Path("two/config.toml").read_text())["listening"]["excess_paths"] is True
     ran, solved = track("one", "active_smoother"), track("two", "fused_smoother")
     np.testing.assert_allclose(solved, ran, rtol=0, atol=1e-9)
     assert Path("two/caller_beacon_fused_smoother.tum").is_file()
@@ -215,12 +215,13 @@ def test_slam_fits_the_rays_to_the_bearings_unless_asked_otherwise(obey, log, un
     def spacing(*words):
         shutil.rmtree("two", ignore_errors=True)
         assert obey("slam", log, "--quiet", "-o", "two", *words)[0] == 0
-        return tomllib.loads(Path("two/config.toml").read_text())["rays"]["spacing"]
+        return tomllib.loads(Path("two/config.toml").read_text())["rays"]["precise_bearings"]
 
     assert spacing() == "auto"
-    assert spacing("--rays.spacing", "paper") == "paper"
+    assert spacing("--rays.precise-bearings", "paper") == "paper"
     assert spacing("--rays.likelihood", "printed") == "paper"
-    status, _, said = obey("slam", log, "--rays.likelihood", "printed", "--rays.spacing", "auto")
+    printed = "--rays.likelihood", "printed", "--rays.precise-bearings", "auto"
+    status, _, said = obey("slam", log, *printed)
     assert (status, "needs likelihood" in said) == (2, True)
 
 
@@ -242,7 +243,7 @@ def test_a_log_is_refused_that_may_need_more_memory_than_there_is_for_its_rays(
     bytes_of = [24.0 * (3 + 2 * there * members) ** 2 for members in (1, 4)]
     monkeypatch.setattr("pipistrelle.experiments.machine.installed", lambda: np.mean(bytes_of))
     said = refused("slam", log, "--filter", "ekf", "-o", "two")
-    assert said.startswith(f"ekf: {there} landmarks of 4 members each (rays.density) may need")
+    assert said.startswith(f"ekf: {there} landmarks of 4 members each (rays.range_ratio) may need")
     assert not Path("two").exists()
 
 
@@ -521,13 +522,13 @@ def test_a_bag_of_two_sonars_maps_landmarks_however_wide_their_cones_are(obey, u
     assert np.median(far) < 0.6
     assert "unsure_bearing" not in run["ignored_rows"]
     assert "sensing are left out" not in said
-    _, _, said = obey(*words, "two", "--association.bearing-std", "0.04")
+    _, _, said = obey(*words, "two", "--association.max-angle-std", "0.04")
     (run,) = summary("two")["runs"]
     rows = run["ignored_rows"]["unsure_bearing"]
     assert rows + run["ignored_rows"]["nothing_heard"] == 320
     assert f"none of the {rows} rows of fused sensing is of a landmark" in said
     assert f"{rows} rows of fused sensing are left out" in said
-    assert "--association.bearing-std 0." in said
+    assert "--association.max-angle-std 0." in said
     assert "nothing in it is heard" not in said
 
 

@@ -102,12 +102,12 @@ def test_as_many_workers_as_asked_for_do_the_study(obey, monkeypatch):
 
 
 def test_settings_override_the_plan_and_are_kept(obey, monkeypatch):
-    monkeypatch.setenv("PIPISTRELLE_RAYS__POWER", "4")
+    monkeypatch.setenv("PIPISTRELLE_RAYS__EXPONENT", "4")
     words = ("--iterations", "1", "--seed", "9", "--filter.gate", "0.99", "--quiet")
     assert obey("small.toml", *words, "-o", "one")[0] == 0
     config = read_plan(Path("one/plan.toml")).config
-    assert (config.seed, config.filter.gate, config.rays.power) == (9, 0.99, 4.0)
-    monkeypatch.delenv("PIPISTRELLE_RAYS__POWER")
+    assert (config.seed, config.filter.gate, config.rays.exponent) == (9, 0.99, 4.0)
+    monkeypatch.delenv("PIPISTRELLE_RAYS__EXPONENT")
     assert obey("one/plan.toml", "--quiet", "-o", "one")[0] == 0
     assert obey("one/plan.toml", "--quiet", "-o", "two")[0] == 0
     assert_same(results("one"), results("two"))
@@ -198,7 +198,7 @@ def test_a_length_of_time_is_worded_in_the_unit_that_fits(seconds, words):
             "--iterations: found 1000000000000, expected 1 to",
         ),
         ("small.toml --emitter.radius 0.01", "--emitter.radius: the plan varies this setting"),
-        ("small.toml --rays.power 0", "--rays.power: found 0.0, expected greater than 0"),
+        ("small.toml --rays.exponent 0", "--rays.exponent: found 0.0, expected greater than 0"),
         ("small.toml --workers 2 --scheduler tcp://here:1", "--workers: the cluster at tcp://here"),
         ("small.toml -o small.toml", "small.toml: could not be written (File exists)"),
         ("small.toml -o .", "holds small.toml and no plan.toml"),

@@ -277,7 +277,7 @@ def read_call(path: Path, frequency: float, duration: float, where: str) -> Reco
         rate, samples = float(file.samplerate), file.read(dtype="float64")
     longest = round(duration * rate)
     if not LEAST_SAMPLES <= samples.size <= longest:
-        fix = "cut it, or set emitter.pulse, which all calls last"
+        fix = "cut it, or set emitter.call_duration, which all calls last"
         expected = f"{LEAST_SAMPLES} to {longest} ({duration:g} s)"
         raise refusal(place, f"{samples.size} samples at {rate:g} Hz", expected, fix)
     if not np.isfinite(samples).all() or not np.ptp(samples) > 0.0:

@@ -169,7 +169,7 @@ def callers_of(config: Config, beacon: Float[np.ndarray, "2"]) -> tuple[Caller, 
     >>> [(caller.name, caller.frequency) for caller in callers_of(Config(), np.zeros(2))]
     [('vehicle', 35000.0), ('beacon', 30000.0)]
     """
-    own, other, pulse = config.emitter, config.beacon, config.emitter.pulse
+    own, other, pulse = config.emitter, config.beacon, config.emitter.call_duration
     return (
         Caller(
             name="vehicle",

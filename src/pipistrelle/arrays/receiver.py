@@ -251,11 +251,8 @@ def record_samples(
     elements): the analytic signal, or its real part with `Sampling.banded`.
     """
     signal = np.zeros((blocks * sampling.block, *layout.shape), dtype=np.complex128)
-    channels, first, rate = (
-        signal.reshape(len(signal), -1),
-        sampling.pulse * sampling.block,
-        sampling.rate,
-    )
+    channels = signal.reshape(len(signal), -1)
+    first, rate = sampling.pulse * sampling.block, sampling.rate
     early, gain = _heard_by_each(arrivals, layout, sampling)
     gain = gain * 10.0 ** (arrivals.level_db[:, np.newaxis] / 20.0)
     for a, duration in enumerate(_durations(arrivals, sampling)):

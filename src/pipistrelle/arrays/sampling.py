@@ -72,7 +72,7 @@ def sampling(
     >>> settled.block, settled.pulse, settled.tones
     (40, 14, array([35000., 30000.]))
     """
-    rate, pulse = config.receiver.sample_rate, config.emitter.pulse
+    rate, pulse = config.receiver.sample_rate, config.emitter.call_duration
     for caller in callers:
         check_caller(caller)
     if not 1 <= len(callers) <= MAX_CALLERS:
@@ -113,7 +113,7 @@ def _refuse_undersampled(config: Config, callers: Sequence[Caller], calls: Seque
             f"{LEAST_RATE:g} to {LARGEST_RATE:g} Hz"
         )
     for caller, call in zip(callers, calls, strict=True):
-        named = {"duration": "emitter.pulse", "named": "receiver.sample_rate"}
+        named = {"duration": "emitter.call_duration", "named": "receiver.sample_rate"}
         check_sampled(call, rate, where=caller.key or caller.name, **named)
     share = cross_talk(calls, rate)
     np.fill_diagonal(share, 0.0)

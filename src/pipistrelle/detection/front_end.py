@@ -285,7 +285,7 @@ def unlabelled_scan(
     gates, direct = config.matching, detections.direct
     echo = same_echo(
         detections,
-        delay_gate=gates.delay_gate * config.emitter.pulse,
+        delay_gate=gates.delay_gate * config.emitter.call_duration,
         bearing_gate=gates.bearing_gate,
     )
     callers = np.full(missable.size, UNLABELLED)
@@ -368,7 +368,7 @@ def front_end(
     >>> round(found.threshold, 1), found.beams.bearing.size
     (18.8, 143)
     """
-    rate, pulse = config.receiver.sample_rate, config.emitter.pulse
+    rate, pulse = config.receiver.sample_rate, config.emitter.call_duration
     sent = calls or tuple(ToneBurst(tone, pulse) for tone in tones)
     wide = [p for p, call in enumerate(sent) if not isinstance(call, ToneBurst)]
     narrow = np.unique(np.append(0, np.setdiff1d(np.arange(tones.size), wide)))

@@ -333,7 +333,7 @@ def _ekf_bytes(landmarks: int, members: int, _: Config) -> float:
 
 def _fastslam_bytes(landmarks: int, members: int, config: Config) -> float:
     """Estimate FastSLAM's memory [bytes]: particles before and after an update, and resampled."""
-    slopes = 4 if config.listening.timing else 0
+    slopes = 4 if config.listening.excess_paths else 0
     each = 6 * landmarks * members + landmarks + slopes * landmarks
     return COPIES * DOUBLE * config.fastslam.particles * each
 

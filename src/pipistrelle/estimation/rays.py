@@ -77,7 +77,7 @@ Sources: Bradley & Abaid, Eqs. (17) to (21); Sola, Monin, Devy & Lemaire (2005).
 import math
 from functools import lru_cache
 from statistics import NormalDist
-from typing import NamedTuple, get_args
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float
@@ -90,8 +90,8 @@ SMALLEST_SHARE = 1e-12
 UNDERFLOW = 1e-200
 FEDERATED, AS_PRINTED, EXACT, FITTED = range(4)
 ANEW, BEARING, MOVED = range(3)
-RANGED = {name: k for k, name in enumerate(get_args(RayConfig.model_fields["ranged"].annotation))}
-"""Codes of the values of ``rays.ranged``, in their order; a ray stays a ray from BEARING on."""
+RANGED = {"anew": ANEW, "bearing": BEARING, "moved": MOVED}
+"""Codes of the values of ``rays.range_update``; a ray stays a ray from BEARING on."""
 _SHARING = {
     ("paper", "normal"): FEDERATED, ("paper", "printed"): AS_PRINTED, ("auto", "normal"): FITTED,
 }  # fmt: skip
@@ -108,11 +108,11 @@ def ray_members(rays: RayConfig) -> tuple[Float[np.ndarray, " h"], Float[np.ndar
     array([ 0.71,  2.14,  6.43, 19.29])
     """
     near, far = rays.range_bounds
-    first = near / (1.0 - rays.ratio)
-    span = (1.0 - rays.ratio) / (1.0 + rays.ratio) * far / near
-    members = 1 + max(0, math.ceil(math.log(span) / math.log(rays.density)))
-    ranges = first * rays.density ** np.arange(members)
-    return ranges, rays.ratio * ranges
+    first = near / (1.0 - rays.relative_std)
+    span = (1.0 - rays.relative_std) / (1.0 + rays.relative_std) * far / near
+    members = 1 + max(0, math.ceil(math.log(span) / math.log(rays.range_ratio)))
+    ranges = first * rays.range_ratio ** np.arange(members)
+    return ranges, rays.relative_std * ranges
 
 
 class UpdateParams(NamedTuple):
@@ -161,12 +161,12 @@ def update_params(
         active_bound=active_bound,
         ray_ranges=ray_ranges,
         ray_stds=ray_stds,
-        power=rays.power,
-        prune=rays.prune,
+        power=rays.exponent,
+        prune=rays.prune_threshold,
         merge=rays.merge,
         aggregated=rays.weights == "aggregated",
-        ranged=RANGED[rays.ranged],
-        sharing=EXACT if exact else _SHARING[rays.spacing, rays.likelihood],
+        ranged=RANGED[rays.range_update],
+        sharing=EXACT if exact else _SHARING[rays.precise_bearings, rays.likelihood],
         loss=loss,
         rays_weigh=swarm is not None and swarm.weighed_by == "all",
     )

@@ -111,11 +111,8 @@ def at_sensor(drive: Drive) -> Drive:
     if not any(drive.sensor):
         return drive
     way, covariance = relative_motions(drive.motion, drive.controls, np.diff(drive.time))
-    moved, turned = (
-        carried(Gaussian(mean=way, covariance=covariance), drive.sensor),
-        drive.sensor[2],
-    )
-    c, s = np.cos(turned), np.sin(turned)
+    moved = carried(Gaussian(mean=way, covariance=covariance), drive.sensor)
+    c, s = np.cos(drive.sensor[2]), np.sin(drive.sensor[2])
     back = np.array([[c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, 1.0]])
     ways = np.einsum("ij,kj->ki", back, moved.mean - np.array(drive.sensor))
     ways[:, 2] = way[:, 2]  # turns are not wrapped

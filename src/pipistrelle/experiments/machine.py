@@ -42,7 +42,7 @@ def check_memory(
     each_ray = ray_members(config.rays)[0].size if passive else 1
     for name in filters:
         estimator = entry(name)
-        ray = f" of {each_ray:,} members each (rays.density)" if passive else ""
+        ray = f" of {each_ray:,} members each (rays.range_ratio)" if passive else ""
         particles = f" and {config.fastslam.particles} particles (fastslam.particles)"
         held = particles if "fastslam" in estimator.sections else ""
         need = estimator.memory(landmarks, each_ray, config)
@@ -86,7 +86,7 @@ def check_recording(
     # Path to a landmark and back: at most 4 radii of the circle around the centre that holds all.
     length = {
         key: 4.0 * reach[key] / settled.speed_of_sound,
-        "emitter.pulse": settled.pulse * settled.interval,
+        "emitter.call_duration": settled.pulse * settled.interval,
     }
     numbers = 2 * settled.tones.size  # complex sums of each tone
     if settled.banded:  # envelopes, noise and outputs of each call, in single precision

@@ -60,12 +60,12 @@ STEPS: Key = ("scenario", "steps")
 GATE_KEY: Key = ("filter", "gate")
 OWN: dict[Key, str] = {
     GATE_KEY: "auto",
-    ("rays", "spacing"): "auto",
+    ("rays", "precise_bearings"): "auto",
     ("filter", "noise"): "measured",
     ("fastslam", "estimate"): "mixture",
 }
 """Defaults for recorded logs, where they differ from simulated missions."""
-TIMING: Key = ("listening", "timing")
+TIMING: Key = ("listening", "excess_paths")
 """Setting that is on for logs with excess paths or a moving caller."""
 SHORT: dict[str, Key] = {
     "world": WORLD_KEY,
@@ -386,7 +386,7 @@ def with_log(layer: Layer, recorded: "Log", log: Path) -> tuple[Config, list[str
         where = f"{log}: excess_path_std"
         own["filter", "excess_path_std"] = Given(recorded.excess_path_std, where)
     if ("rays", "likelihood") in layer:  # it is a reading of the paper's rays
-        del own["rays", "spacing"]
+        del own["rays", "precise_bearings"]
     wished, settled, notes = resolve(layer), resolve(laid(own, layer, decided)), []
     for section, name in sorted(LOGGED & layer.keys()):
         value = getattr(getattr(settled, section), name)

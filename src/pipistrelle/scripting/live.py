@@ -171,7 +171,7 @@ class Slam:
         check_filters([name], drive.motion, config, drive.moving.values())
         check_calibrated(log, config)
         self._drive, found, sensor = drive, entry(name), at_sensor(drive)
-        self._follows = found.follows and config.listening.timing
+        self._follows = found.follows and config.listening.excess_paths
         self._session: Session[Any] = Session(
             found.build(config, sensor.motion),
             sensor.start,

@@ -44,9 +44,12 @@ MAX_NIS = 2.0
 """Largest NIS without a warning; below 1 a filter is cautious, as with the paper's noise."""
 MIN_EXCESS_PATH = 0.2
 """Excess paths in metres are rarely smaller, excess paths in seconds mostly [m]."""
-UNSURE = {"bearing_std": ("bearings", "rad", WIDEST), "way_std": ("ranges", "m", inf)}
-"""Settings by which an association discards rows: the measured numbers, their unit, and the largest
-standard deviation for which a larger value is advised."""
+UNSURE = {
+    "bearing_std": ("angle", "bearings", "rad", WIDEST),
+    "way_std": ("range", "ranges", "m", inf),
+}
+"""By the standard deviation for which an association discards rows: a word of the setting, the
+measured numbers, their unit, and the largest one for which a larger value is advised."""
 DEGREE = pi / 180.0
 COMPARED = 32
 """Most scans, and most rows of a scan, that are compared with earlier scans."""
@@ -237,10 +240,8 @@ def _refuted(trial: "TrialResult", recorded: "Log") -> Iterator[Question]:
         since = f"from {', '.join(times[:4])}{', ...' * (len(times) > 4)} s on"
         if call == POSE:
             found = "no measurements fit the map from where the odometry leads"
-            then, asked = (
-                "its pose was found again on the map",
-                "did it skid, slip, was it moved, or is its odometry less precise than stated?",
-            )
+            then = "its pose was found again on the map"
+            asked = "did it skid, slip, was it moved, or is its odometry less precise than stated?"
         elif call == OWN:
             found = "the ranges to the map's landmarks do not fit, other calls' paths do"
             then, asked = "", "was the sensor moved, or another range setting used?"
@@ -269,17 +270,17 @@ def _unsure(trials: "Sequence[TrialResult]", config: Config) -> Iterator[str]:
         for name, stds in trial.left_out.items():
             if stds.size < (1.0 - MAX_IGNORED_SHARE) * rows:
                 continue
-            measured, unit, most = UNSURE[name]
-            limit, taken = getattr(settings, name), stds[stds <= most]
+            word, measured, unit, most = UNSURE[name]
+            limit, taken = getattr(settings, f"max_{word}_std"), stds[stds <= most]
             spread = dict.fromkeys(f"{std:.2g}" for std in (stds.min(), stds.max()))
             note = (
                 f"{stds.size} rows of {trial.strategy} sensing are left out: the standard "
                 f"deviation of their {measured}, {' to '.join(spread)} {unit}, is above "
-                f"association.{name}, {limit:g} {unit}"
+                f"association.max_{word}_std, {limit:g} {unit}"
             )
             if taken.size:
                 digit = 10.0 ** floor(log10(taken.max()))
-                flag = f"--association.{name.replace('_', '-')}"
+                flag = f"--association.max-{word}-std"
                 value = ceil(taken.max() / digit) * digit
                 whole = "them" if taken.size == stds.size else f"{taken.size} of them"
                 note += f"; {flag} {value:g} takes {whole}"

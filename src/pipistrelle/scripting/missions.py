@@ -311,7 +311,8 @@ def files_of_log(mission: Mission) -> dict[str, str]:
     def rank(trial: TrialResult) -> tuple[bool, bool, bool, str]:
         own = own_config(mission.config, trial.filter)
         unlabelled = own.association.method != KNOWN
-        return unlabelled, not own.listening.timing, own.filter.noise == "constant", trial.filter
+        constant = own.filter.noise == "constant"
+        return unlabelled, not own.listening.excess_paths, constant, trial.filter
 
     strategies = [trial.strategy for trial in mission.trials]
     chosen = "fused" if "fused" in strategies else strategies[-1]
@@ -323,7 +324,7 @@ def _log(mission: Mission, trial: TrialResult, scans: Sequence[Scan]) -> Log:
     """Convert a simulated mission to a recorded log, with the settings of a trial's filter."""
     config = own_config(mission.config, trial.filter)
     drive, _ = split_at(mission.drive, [scan.time for scan in scans])
-    timing = config.listening.timing
+    timing = config.listening.excess_paths
     if config.filter.noise == "constant":  # log.toml has the standard deviations
         scans = list(map(unstated, scans))
     world = mission.scenario

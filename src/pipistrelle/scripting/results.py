@@ -246,7 +246,7 @@ def run(
 ) -> Results:
     """Simulate a drive through a world and map it, as `pipistrelle run` does.
 
-    Settings are keywords: ``seed=3``, ``rays__power=8.0``, or sections,
+    Settings are keywords: ``seed=3``, ``rays__exponent=8.0``, or sections,
     ``air={"temperature_c": 5.0}``; `pipistrelle config show` lists them. Environment variables
     apply only on the command line.
 
@@ -302,9 +302,9 @@ def run(
     >>> quiet = run(strategies="active", duration=4.0, landmarks=10, beacon__level_db=-50.0)
     >>> quiet.measurements["range_m"].null_count()
     0
-    >>> run(rays__powr=3)
+    >>> run(rays__merg=3)
     Traceback (most recent call last):
-    pipistrelle.config.InputError: rays__powr: no such setting; did you mean rays__power?
+    pipistrelle.config.InputError: rays__merg: no such setting; did you mean rays__merge?
     """
     asked = {**locals()}
     if isinstance(landmarks, Iterable) and not isinstance(landmarks, str):

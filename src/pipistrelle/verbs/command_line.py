@@ -1,5 +1,6 @@
 """The verbs of the command line, and messages for mistakes in it."""
 
+import warnings
 from collections.abc import Sequence
 from errno import ENOSPC
 from inspect import Parameter as Argument
@@ -16,12 +17,12 @@ from cyclopts import (
     UnusedCliTokensError,
 )
 
-from pipistrelle.verbs.streams import flush_results, say
+from pipistrelle.verbs.streams import flush_results, say, warn
 from pipistrelle.version import find_version
 
 SPELLINGS = (
-    "--help-all lists all settings. A setting is --rays.power 3 as a flag, "
-    "PIPISTRELLE_RAYS__POWER=3 in the environment and power = 3 under [rays] in FILE.toml; flags "
+    "--help-all lists all settings. A setting is --rays.merge 3 as a flag, "
+    "PIPISTRELLE_RAYS__MERGE=3 in the environment and merge = 3 under [rays] in FILE.toml; flags "
     "override the environment, that a file, and that settings by name."
 )
 
@@ -84,7 +85,9 @@ def obey(words: Sequence[str], heard: Sequence[int] = ()) -> int:
             "--animate=gif" if word == "--animate" and after not in FILMS else word
             for word, after in zip_longest(words, words[1:])
         ]
-        status = app(completed) or 0
+        with warnings.catch_warnings():
+            warnings.showwarning = lambda message, *_, **__: warn(str(message))
+            status = app(completed) or 0
         flush_results()
     except SystemExit:  # help, if its reader has left
         return 0
@@ -105,11 +108,8 @@ def _refuse_empty(words: Sequence[str]) -> None:
         if not word or (flag.startswith("-") and given and not value):
             from pipistrelle.config import InputError
 
-            where, expected = (
-                flag if given else before,
-                "a value (for the folder that you are in: .)",
-            )
-            raise InputError(f"{where}: found '', expected {expected}")
+            expected = "a value (for the folder that you are in: .)"
+            raise InputError(f"{flag if given else before}: found '', expected {expected}")
 
 
 def _refuse_sections(words: Sequence[str]) -> None:
@@ -168,12 +168,14 @@ def _explained(error: Exception, words: Sequence[str]) -> str | None:
 def _unknown(error: UnknownOptionError) -> str:
     """Return the message for an unknown option, with the most similar known option."""
     from pipistrelle.refusals import meant
+    from pipistrelle.settings import RENAMED
 
     word = (error.token.keyword or error.token.value).partition("=")[0]
     names = {name[2:] for argument in error.argument_collection for name in argument.names}
     known, wanted = sorted(names - _sections().keys()), word.lstrip("-").replace("_", "-")
     same = [name for name in known if wanted in (name.partition(".")[2], SHORT.get(name))]
-    near = same[0] if same else meant(wanted, known)
+    near = same[0] if same else meant(wanted, known) or ""
+    near = RENAMED.get(near.replace("-", "_"), near).replace("_", "-")
     return f"Unknown option: {word}. " + (f"Did you mean --{near}?" if near else "See --help.")
 
 

@@ -18,6 +18,7 @@ from pipistrelle.settings import (
     ARRAY_KEY,
     CALLERS,
     OWN,
+    RENAMED,
     SETTINGS,
     Key,
     Layer,
@@ -209,9 +210,6 @@ def setting_flags(
 
     ``--help-all`` lists the settings that are `shown`, ``--help`` only the seed; all flags work.
     `own` holds defaults of the verb that differ, for the help.
-
-    >>> sorted(setting_flags().__annotations__)[:3]
-    ['air', 'association', 'assumed']
     """
     sections: dict[str, dict[str, Any]] = {}
     for key, field in known_settings().items():
@@ -231,6 +229,10 @@ def setting_flags(
             kind = Annotated[Any, as_written]
         flag = Annotated[kind, Parameter(help=words, show=show, consume_multiple=True)]
         sections.setdefault("".join(key[:-1]), {})[key[-1]] = flag
+        for old in (old for old, new in RENAMED.items() if new == ".".join(key)):
+            sections[key[0]][old.split(".")[1]] = Annotated[
+                kind, Parameter(show=False, consume_multiple=True)
+            ]
     record: Any = TypedDict
     flags = sections.pop("")
     for place, (name, table) in enumerate(sections.items()):
@@ -254,11 +256,7 @@ def _unbounded(kind: Any) -> Any:
 
 
 def layers(named: Sequence[str] | None, settings: Mapping[str, Any] | None) -> Layer:
-    """Merge presets, files, environment variables and flags into a layer of settings.
-
-    >>> layers(None, {"seed": 3})["seed",].value
-    3
-    """
+    """Merge presets, files, environment variables and flags into a layer of settings."""
     given = [(word, settings_of(word, "--settings")) for word in named or ()]
     named_here = (layer for word, layer in given if word in NAMES)
     start, environment = (layer for _, layer in given), from_environment(os.environ)

@@ -85,7 +85,7 @@ def _compiled_first(plan: "Plan", show: Show, quiet: bool) -> Show:
             from pipistrelle.experiments.studies.plan import cases_of
 
             cases, tell = cases_of(plan), None if quiet else say
-            timings = {case.config.listening.timing for case in cases}
+            timings = {case.config.listening.excess_paths for case in cases}
             with in_two_processes(tell, cases[0].config, plan.filters):
                 compile_kernels(plan.filters, sorted(timings))
         ready = True

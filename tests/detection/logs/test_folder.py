@@ -105,7 +105,7 @@ def test_optional_settings_are_read_and_may_be_whole_numbers(tmp_path):
     log = read_log(recorded(tmp_path, settings))
     assert (log.gate, log.noise_at_rest, log.range_std) == (0.99, False, 2.0)
     assert log.sensor_pose == (3.8, 0.5, 0.1)
-    assert log.association == {"detection": 1.0, "clutter": 0.01}
+    assert log.association == {"detection_rate": 1.0, "clutter_rate": 0.01}
 
 
 def test_rows_of_one_time_are_one_scan_and_an_empty_range_is_passive(folder):
@@ -474,7 +474,7 @@ def written_log(kind, folder):
         log = replace(read_log(recorded(folder)), gate=0.97, noise_at_rest=False)
         log = replace(log, initial_pose=(0.1, 1e-7, 3.0), sensor_pose=(0.1, 0.2, -3.0))
         log = replace(log, landmarks={7: (1.0, -2.0), 12: (0.0, 3.0)}, landmark_std=0.1)
-        return replace(log, association={"detection": 0.5})
+        return replace(log, association={"detection_rate": 0.5})
     if kind == "a car":
         log = read_log(recorded(folder, CAR, STEERED.format(-1.0)))
         assert (log.motion, log.wheelbase, log.speed_offset) == ("ackermann", 0.3, -0.1)

@@ -80,9 +80,8 @@ def test_a_span_cuts_the_log_at_both_ends():
 
 
 def test_a_span_without_odometry_is_refused():
-    with pytest.raises(
-        InputError, match=r"Robot1_Odometry.dat: found times .* between 5.0 and 6.0"
-    ):
+    message = r"Robot1_Odometry.dat: found times .* between 5.0 and 6.0"
+    with pytest.raises(InputError, match=message):
         read_mrclam(MADE_UP, 1, span=(5.0, 6.0))
 
 

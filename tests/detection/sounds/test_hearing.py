@@ -173,7 +173,7 @@ def test_slam_on_a_recording_repeats_the_run(tmp_path, settings, limit):
     again = pipistrelle.slam(tmp_path / "log", gate=1.0, **asked).tracks
     run = pipistrelle.run(
         duration=4.0, landmarks=20, strategies="fused", receiver__elements=4,
-        listening__timing=True, filter__noise="measured", **settings, **asked,
+        listening__excess_paths=True, filter__noise="measured", **settings, **asked,
     ).tracks  # fmt: skip
     for name in ("x_m", "y_m", "heading_rad"):
         assert np.abs(again[name].to_numpy() - run[name].to_numpy()).max() < limit

@@ -25,9 +25,9 @@ PLACES = np.array([[4.0, 1.0], [6.0, -3.0], [2.0, 5.0], [9.0, 0.5]])
 BEST = {
     "emitter": {"level_db": 49.7},
     "beacon": {"level_db": 42.8},
-    "listening": {"timing": True},
+    "listening": {"excess_paths": True},
     "filter": {"noise": "measured", "robust": "huber"},
-    "rays": {"power": 8.0, "prune": 1e-9, "spacing": "auto"},
+    "rays": {"exponent": 8.0, "prune_threshold": 1e-9, "precise_bearings": "auto"},
 }
 
 
@@ -272,10 +272,8 @@ def test_a_filter_with_constant_noise_finds_its_caller_by_measured_noise(name, s
 
 
 def test_associate_changes_nothing_that_it_is_given():
-    session, stage = (
-        session_of(),
-        association_of(Config(association=AssociationConfig(method="nearest"))),
-    )
+    session = session_of()
+    stage = association_of(Config(association=AssociationConfig(method="nearest")))
     session.hear(scan_of(PLACES))
     memory = stage.start()
     scan = scan_of(PLACES)

@@ -193,10 +193,8 @@ def test_pose_is_where_fewer_landmarks_are_missed(rng, silent):
     near = rng.uniform(2.0, 9.0, (2, 4)) * np.exp(1j * rng.uniform(-1.0, 1.0, (2, 4)))
     landmarks, std = np.concatenate([near[0], near[0] + 60.0, near[1] + silent]), np.full(4, 0.01)
     rows = Rows(np.angle(near[0]), std, abs(near[0]), std, np.ones(4))
-    joint, heard = (
-        joint_of(np.array([30.0, 30.0, 1.0]), landmarks),
-        (0, rows, np.zeros(2), OWN_CALL),
-    )
+    joint = joint_of(np.array([30.0, 30.0, 1.0]), landmarks)
+    heard = (0, rows, np.zeros(2), OWN_CALL)
     found = placed_again(detecting(BINS // 3), joint, *PLACES, [heard], CHANCES)
     assert found is not None
     assert found.mean[:3] == pytest.approx([60.0 - silent, 0.0, 0.0], abs=0.15)

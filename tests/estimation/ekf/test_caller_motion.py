@@ -120,7 +120,8 @@ def test_bearings_of_a_caller_that_moves_are_never_crossed(kind):
     mission = draw_mission(rng, still, start, controls=steady((1.0, 0.0), frames), **field)
     beside = mission.path[1:, :2] + [0.0, 9.0]
     mission = with_boat(mission, beside, rng, bearing_std=1e-3)
-    slam = paper_filter(kind, motion=still, rays=ray_config(spacing="auto"), bearing_std=1e-3)
+    rays = ray_config(precise_bearings="auto")
+    slam = paper_filter(kind, motion=still, rays=rays, bearing_std=1e-3)
     beliefs = [belief for belief, _ in followed(slam, mission, start)]
     assert all(len(belief.moving().landmark) > 1 for belief in beliefs), "a ray, and no more"
     assert all((belief.weight >= 0.0).all() for belief in beliefs), "nothing waits to be crossed"
@@ -166,7 +167,7 @@ def boats():
 
 def caller_nees(kind, boats, told):
     """Mean NEES of a boat's last position, its walk told as a factor of itself."""
-    nees, rays = [], ray_config(power=8.0, prune=1e-9)
+    nees, rays = [], ray_config(exponent=8.0, prune_threshold=1e-9)
     walk = {"speed_std": 0.5, "walk_std": told * WALK_STD}
     slam = paper_filter(kind, motion=STEADY, rays=rays, **walk, **NOISE)
     for mission, place in boats:
@@ -188,7 +189,7 @@ def test_a_tracked_caller_is_consistent_unless_its_walk_is_understated(kind, boa
 SAILING = Config(
     callers=(CallerConfig(course="circle", radius=10.0, speed=0.75),),
     scenario=ScenarioConfig(steps=600),
-    listening=ListeningConfig(timing=True),
+    listening=ListeningConfig(excess_paths=True),
 )
 
 
@@ -209,7 +210,7 @@ def test_a_caller_that_circles_is_followed_by_its_sound():
 
 
 def test_a_moving_caller_is_ignored_without_timing():
-    deaf = SAILING.model_copy(update={"listening": ListeningConfig(timing=False)})
+    deaf = SAILING.model_copy(update={"listening": ListeningConfig(excess_paths=False)})
     strays = deaf.model_copy(update={"filter": FilterConfig(caller_walk_std=9.0)})
     one, other = (run_mission(config, ["fused"], ["iekf"]).trials[0] for config in (deaf, strays))
     assert not one.track.callers

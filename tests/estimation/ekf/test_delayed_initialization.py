@@ -24,7 +24,7 @@ from reference.missions import (
     scan_with,
 )
 
-FITTED = RayConfig(spacing="auto", prune=1e-3, power=1.0)
+FITTED = RayConfig(precise_bearings="auto", prune_threshold=1e-3, exponent=1.0)
 SHARP = {"range_std": 0.05, "bearing_std": 0.01}
 KINDS = [EkfSlam, InvariantEkfSlam]
 
@@ -148,7 +148,7 @@ def test_a_precise_bearing_updates_a_ray_within_its_members_linearity(kind):
             belief = slam.update(belief, scan_with([4], [bearing], bearing_std=known))
         return belief
 
-    linear_to = FITTED.ratio**2 / 2
+    linear_to = FITTED.relative_std**2 / 2
     sharp, members = after(0.003), after(linear_to * (1 + 1e-12))
     assert members.landmark.size > 2
     np.testing.assert_allclose(sharp.mean, members.mean, rtol=0, atol=1e-9)
@@ -157,8 +157,8 @@ def test_a_precise_bearing_updates_a_ray_within_its_members_linearity(kind):
 
 def test_fitted_rays_with_the_printed_likelihood_are_refused():
     with pytest.raises(ValueError, match='spacing "auto" needs likelihood "normal"'):
-        RayConfig(spacing="auto", likelihood="printed")
-    assert resolve(from_flags({"rays": {"spacing": "auto"}})) != Config()
+        RayConfig(precise_bearings="auto", likelihood="printed")
+    assert resolve(from_flags({"rays": {"precise_bearings": "auto"}})) != Config()
 
 
 def errors(kind, spacing, seeds):
@@ -166,7 +166,7 @@ def errors(kind, spacing, seeds):
     found = []
     for seed in seeds:
         drive, scans = turn_and_drive(seed)
-        rays = RayConfig(spacing=spacing, range_bounds=(0.2, 8.0))
+        rays = RayConfig(precise_bearings=spacing, range_bounds=(0.2, 8.0))
         track = run_filter(kind(motion=drive.motion, rays=rays), drive, scans, None)
         reckoned = [drive.start.mean]
         for control, dt in zip(drive.controls, np.diff(drive.time), strict=True):

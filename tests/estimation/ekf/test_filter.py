@@ -95,7 +95,7 @@ def assert_equal_to_reference(slam, mission, start=START):
 
 
 def assert_equal_run(kind, mission, power, gate, **rays):
-    slam = paper_filter(kind, rays=ray_config(power=power, **rays), gate=gate)
+    slam = paper_filter(kind, rays=ray_config(exponent=power, **rays), gate=gate)
     belief = assert_equal_to_reference(slam, mission)
     assert (belief.gated > 0) == (gate < 1)
     return belief
@@ -107,7 +107,7 @@ def test_run_equals_the_slow_reference(kind, strategy, weights, ranged, power, g
     frames, outliers = (24, 0.06) if invariant else (32, 0.04)
     mission = paper_mission(strategy, frames=frames, outliers=outliers)
     merge = 1.0 if invariant and weights == "aggregated" else 0.0
-    rays = {"weights": weights, "ranged": ranged, "merge": merge}
+    rays = {"weights": weights, "range_update": ranged, "merge": merge}
     belief = assert_equal_run(kind, mission, power, gate, **rays)
     assert np.unique(belief.landmark).size > (5 if invariant else 8)
 
@@ -120,7 +120,8 @@ def test_whole_run_equals_the_slow_reference_with_every_option(
     kind, strategy, weights, ranged, power, gate
 ):
     mission = paper_mission(strategy, outliers=0.02)
-    belief = assert_equal_run(kind, mission, power, gate, weights=weights, ranged=ranged)
+    rays = {"weights": weights, "range_update": ranged}
+    belief = assert_equal_run(kind, mission, power, gate, **rays)
     assert np.unique(belief.landmark).size > 30
 
 
@@ -134,7 +135,7 @@ def test_whole_run_of_the_invariant_filter_equals_the_slow_reference(strategy):
 
 @pytest.mark.parametrize("weights", ["instantaneous", "aggregated"])
 def test_rays_weighed_by_the_printed_likelihood_equal_the_slow_reference(weights):
-    rays = ray_config(weights=weights, power=2.0, likelihood="printed")
+    rays = ray_config(weights=weights, exponent=2.0, likelihood="printed")
     assert_equal_to_reference(paper_filter(rays=rays), paper_mission("fused", frames=30))
 
 

@@ -26,7 +26,7 @@ from reference.missions import (
 
 KINDS = [EkfSlam, InvariantEkfSlam]
 PAIRS = [(EkfSlam, SlowEkfSlam), (InvariantEkfSlam, SlowInvariantEkfSlam)]
-FITTED = RayConfig(spacing="auto", prune=1e-3, power=1.0)
+FITTED = RayConfig(precise_bearings="auto", prune_threshold=1e-3, exponent=1.0)
 BELIEVED = 2.0
 NAN = np.nan
 
@@ -225,7 +225,7 @@ def test_a_new_landmark_is_as_sure_as_its_measurement(kind):
 def aligned_error(kind, robust, seed, gross):
     """Aligned RMSE of the path [m] on precise bearings, some of which are off by half a radian."""
     drive, scans = turn_and_drive(seed, gross=gross)
-    rays = RayConfig(spacing="auto", range_bounds=(0.2, 8.0))
+    rays = RayConfig(precise_bearings="auto", range_bounds=(0.2, 8.0))
     track = run_filter(kind(motion=drive.motion, rays=rays, robust=robust), drive, scans, None)
     return aligned_rmse(track.pose.mean[:, :2], drive.truth.path[:, :2])
 

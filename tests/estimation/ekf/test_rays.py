@@ -91,7 +91,7 @@ def test_bearings_from_one_known_position_never_change_the_weights():
 @pytest.mark.parametrize("weights", ["instantaneous", "aggregated"])
 @pytest.mark.parametrize("power", [1.0, 3.0])
 def test_parallax_finds_the_member_that_holds_the_landmark(weights, power):
-    slam = paper_filter(bearing_std=0.05, rays=ray_config(weights=weights, power=power))
+    slam = paper_filter(bearing_std=0.05, rays=ray_config(weights=weights, exponent=power))
     *_, belief = seen_along_a_line(slam, frames=16)
     rows = belief.landmarks()
     heaviest = np.argmax(np.where(rows.landmark == 7, rows.weight, 0))
@@ -101,10 +101,12 @@ def test_parallax_finds_the_member_that_holds_the_landmark(weights, power):
 
 
 def test_a_bearing_that_is_gated_prunes_nothing():
-    *_, belief = seen_along_a_line(paper_filter(bearing_std=0.05, rays=ray_config(prune=0.0)))
+    *_, belief = seen_along_a_line(
+        paper_filter(bearing_std=0.05, rays=ray_config(prune_threshold=0.0))
+    )
     light = belief.weight[belief.landmark == 7] < 0.9 / 4
     assert 0 < light.sum() < light.size == 4
-    strict = paper_filter(bearing_std=0.05, rays=ray_config(prune=0.9), gate=0.9)
+    strict = paper_filter(bearing_std=0.05, rays=ray_config(prune_threshold=0.9), gate=0.9)
     pose = belief.pose().mean
     expected = np.arctan2(TRUTH[1] - pose[1], TRUTH[0] - pose[0]) - pose[2]
     gated = strict.update(belief, scan_of((7, np.nan, wrap(expected + np.pi))))
@@ -117,10 +119,8 @@ def test_a_bearing_that_is_gated_prunes_nothing():
 
 def test_pruning_removes_rows_and_changes_nothing_else():
     """Before and after a prune: the same numbers, to the last bit, without the pruned rows."""
-    pruning, keeping = (
-        paper_filter(bearing_std=0.05),
-        paper_filter(bearing_std=0.05, rays=ray_config(prune=0.0)),
-    )
+    pruning = paper_filter(bearing_std=0.05)
+    keeping = paper_filter(bearing_std=0.05, rays=ray_config(prune_threshold=0.0))
     belief = pruning.update(pruning.init(START), scan_of((1, 3.0, -1.0), (7, np.nan, 1.2)))
     belief = pruning.update(belief, scan_of((8, np.nan, -2.0), (9, 6.0, 2.0)))
     for frame in range(1, 20):
@@ -159,7 +159,8 @@ def test_a_range_replaces_a_partial_landmark():
 def test_members_that_agree_become_the_mixture_of_the_two(kind):
     """One member or several: mean and covariance of the landmark, with all else, are the same."""
     merging, keeping = (
-        paper_filter(kind, rays=ray_config(prune=0.0, merge=merge)) for merge in (1.0, 0.0)
+        paper_filter(kind, rays=ray_config(prune_threshold=0.0, merge=merge))
+        for merge in (1.0, 0.0)
     )
     for belief in seen_along_a_line(keeping, frames=40):
         heard = scan_of((7, np.nan, bearing_of(TRUTH, belief.mean)))

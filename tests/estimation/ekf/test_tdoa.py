@@ -234,7 +234,7 @@ def test_a_caller_that_is_a_ray_is_placed_by_a_landmark_that_is_known(kind):
 def test_the_invariant_filter_with_excess_paths_is_consistent_and_not_with_a_tenth_of_their_noise():
     """Mean NEES of the last pose of 40 drives of twenty seconds."""
     nees, noise = [], {"range_std": 0.05, "bearing_std": 0.02}
-    rays = ray_config(power=8.0, prune=1e-9)
+    rays = ray_config(exponent=8.0, prune_threshold=1e-9)
     slam = paper_filter(InvariantEkfSlam, motion=STEADY, rays=rays, **noise)
     for seed in range(40):
         rng, heard_to = np.random.default_rng([7, seed]), {"beamwidth": 0.0, "hearing": 30.0}

@@ -122,7 +122,7 @@ def assert_equal_to_reference(slam, mission, start=START):
 
 
 def assert_equal_whole_run(mission, particles, weights, ranged, mixture, power, gate):
-    rays = ray_config(weights=weights, ranged=ranged, power=power)
+    rays = ray_config(weights=weights, range_update=ranged, exponent=power)
     slam = swarm_filter(particles, mixture, rays=rays, gate=gate)
     belief, slow = assert_equal_to_reference(slam, mission)
     assert slow.resampled > 2
@@ -148,14 +148,15 @@ def test_whole_run_equals_the_slow_reference_with_every_option(
 
 
 def test_rays_that_restart_at_resampling_equal_the_slow_reference():
-    slam = swarm_filter(5, resampled_rays="restart", resample_below=1.0, rays=ray_config(power=2.0))
+    known = {"resampled_rays": "restart", "resample_below": 1.0}
+    slam = swarm_filter(5, **known, rays=ray_config(exponent=2.0))
     _, slow = assert_equal_to_reference(slam, small_mission("fused", frames=16))
     assert slow.resampled > 2
 
 
 @pytest.mark.parametrize(("ranged", "weights"), [("anew", "marginal"), ("bearing", "sampled")])
 def test_particles_that_rays_do_not_weigh_equal_the_slow_reference(ranged, weights):
-    rays = ray_config(power=2.0, ranged=ranged)
+    rays = ray_config(exponent=2.0, range_update=ranged)
     slam = swarm_filter(5, weights=weights, weighed_by="initialised", rays=rays)
     _, slow = assert_equal_to_reference(slam, small_mission("fused", frames=16))
     assert slow.resampled > 0
@@ -170,7 +171,7 @@ def test_particles_that_rays_do_not_weigh_equal_the_slow_reference(ranged, weigh
     ],
 )
 def test_every_range_for_a_ray_equals_the_slow_reference(ranged, weights, mixture):
-    rays = ray_config(power=2.0, ranged=ranged)
+    rays = ray_config(exponent=2.0, range_update=ranged)
     slam = swarm_filter(4, mixture, weights=weights, rays=rays)
     assert_equal_to_reference(slam, small_mission("fused", frames=8))
 
@@ -188,7 +189,7 @@ def test_every_range_for_a_ray_equals_the_slow_reference(ranged, weights, mixtur
 def test_every_weight_with_every_likelihood_equals_the_slow_reference(
     frames, likelihood, weights, mixture
 ):
-    rays = ray_config(power=2.0, likelihood=likelihood)
+    rays = ray_config(exponent=2.0, likelihood=likelihood)
     slam = swarm_filter(5, mixture, weights=weights, rays=rays)
     assert_equal_to_reference(slam, small_mission("fused", frames=frames))
 

@@ -22,7 +22,8 @@ KNOWN = np.array([0.3, -0.2, 0.4])
 CONTROLS, DT, WHEELBASE = np.array([[0.75, 0.03], [0.75, -0.02]]), 1.0, 0.2
 CONTROL_STD, RANGE_STD, BEARING_STD = (0.005, 0.0008), 0.005, 0.0025
 # Four members, each as long as the gap to the next, which some bearings can tell apart.
-SHORT = RayConfig(ratio=0.005, density=1.025, range_bounds=(3.9, 4.2), prune=0.0)
+NARROW = {"relative_std": 0.005, "range_ratio": 1.025, "prune_threshold": 0.0}
+SHORT = RayConfig(range_bounds=(3.9, 4.2), **NARROW)
 
 
 def heard_on_a_drive(seed, passive):
@@ -99,7 +100,7 @@ def test_posterior_of_pose_and_landmark_matches_a_brute_force_grid(passive):
 
 def assert_only_the_exact_mixture_matches(seed):
     rows = heard_on_a_drive(seed, (True, True, True))
-    grid = grid_moments(rows, [(s, SHORT.ratio * s) for s in ray_ranges(SHORT)])
+    grid = grid_moments(rows, [(s, SHORT.relative_std * s) for s in ray_ranges(SHORT)])
     assert np.sort(grid[2])[-2] > 0.05  # At least two members could be it.
     assert max(departures(swarm_moments(rows, SHORT, "exact"), grid)) < 1
     mean, covariance, _ = departures(swarm_moments(rows, SHORT, "federated"), grid)

@@ -94,9 +94,8 @@ def test_mean_number_of_full_landmarks_is_weighted():
     fractional = 0
     for belief, _ in followed(slam, mission, START, drawing()):
         weight = normalised(belief.log_weight)
-        assert belief.full == pytest.approx(
-            weight @ (particles_of(belief).count == 1).sum(axis=1), abs=1e-12
-        )
+        expected = pytest.approx(weight @ (particles_of(belief).count == 1).sum(axis=1), abs=1e-12)
+        assert belief.full == expected
         fractional += abs(belief.full - round(belief.full)) > 0.01
     assert fractional > 3
 

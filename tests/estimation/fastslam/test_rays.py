@@ -68,7 +68,7 @@ def drive_past(slam, frames, seed=1):
 def test_pruning_removes_rows_of_some_particles_and_changes_nothing_else():
     """Rows before and after a prune are the same numbers, but for the weights' renormalisation."""
     pruning = never_resampling(swarm_filter(bearing_std=0.05))
-    keeping = replace(pruning, rays=ray_config(prune=0.0))
+    keeping = replace(pruning, rays=ray_config(prune_threshold=0.0))
     uneven = 0
     for belief, scan in drive_past(pruning, frames=20):
         pruned, kept = (slam.update(belief, scan, drawing(9)) for slam in (pruning, keeping))
@@ -77,7 +77,7 @@ def test_pruning_removes_rows_of_some_particles_and_changes_nothing_else():
         assert pruned.member.shape[1] == 1 + counts.max()
         for particle, before in enumerate(counts):
             rows = members(kept, particle, 7)
-            stay = rows[:, 5] >= pruning.rays.prune / before
+            stay = rows[:, 5] >= pruning.rays.prune_threshold / before
             found = members(pruned, particle, 7)
             np.testing.assert_array_equal(found[:, :5], rows[stay, :5])
             weight = rows[stay, 5] / rows[stay, 5].sum()
@@ -87,7 +87,7 @@ def test_pruning_removes_rows_of_some_particles_and_changes_nothing_else():
 
 
 def test_columns_shrink_when_all_particles_have_pruned():
-    slam = swarm_filter(bearing_std=0.05, rays=ray_config(prune=0.1))
+    slam = swarm_filter(bearing_std=0.05, rays=ray_config(prune_threshold=0.1))
     widths = [belief.member.shape[1] for belief, _ in drive_past(slam, frames=40)]
     assert widths[0] == 5
     assert widths[-1] == 2

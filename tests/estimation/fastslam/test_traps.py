@@ -146,7 +146,7 @@ def test_few_particles_have_a_pose_with_an_inverse_covariance(particles):
 
 
 def test_a_bearing_neither_prunes_a_member_too_near_to_foresee_it_nor_loses_the_ray():
-    rays = ray_config(prune=0.0)
+    rays = ray_config(prune_threshold=0.0)
     slam = swarm_filter(1, rays=rays)
     belief = slam.update(slam.init(START), scan_of((1, np.nan, 0.3)), np.random.default_rng(1))
     member = particles_of(belief).member.copy()

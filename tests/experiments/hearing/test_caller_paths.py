@@ -368,7 +368,7 @@ def test_a_vehicles_call_is_the_same_to_itself_and_to_the_other(hearing):
 
 
 def test_of_a_vehicle_that_points_away_no_echo_is_taken_for_its_direct_call():
-    config = PAIR.model_copy(update={"listening": ListeningConfig(timing=True)})
+    config = PAIR.model_copy(update={"listening": ListeningConfig(excess_paths=True)})
     frames, excess_paths = {True: 0, False: 0}, {True: 0, False: 0}
     for number in range(3):
         world = world_of(config, number)

@@ -18,7 +18,7 @@ SETUP = {"steps": 80, "landmarks": 25}
 
 
 def config_of(*callers, timing=True, **more):
-    given = {"callers": [*callers], "scenario": SETUP, "listening": {"timing": timing}}
+    given = {"callers": [*callers], "scenario": SETUP, "listening": {"excess_paths": timing}}
     return resolve(from_flags(given | more))
 
 

@@ -167,7 +167,7 @@ def found_by_two_faces(late, off=0.0):
 @pytest.mark.parametrize(("pulse", "share"), [(2.8e-3, 0.25), (2.0e-3, 0.25), (2.8e-3, 0.1)])
 def test_without_labels_two_faces_hear_one_echo_within_the_gates_share_of_a_call(pulse, share):
     gates = MatchingConfig(delay_gate=share)
-    world, config = short(4, matching=gates, emitter=EmitterConfig(pulse=pulse))
+    world, config = short(4, matching=gates, emitter=EmitterConfig(call_duration=pulse))
     for late, echoes in ((0.99 * share * pulse, 1), (1.01 * share * pulse, 2)):
         ((heard,),) = listen(world, config, [0.0088], labels=False, find=found_by_two_faces(late))
         assert heard.unlabelled.landmark.size == echoes
@@ -203,7 +203,7 @@ def test_the_oracle_receives_gates_call_duration_and_faintest_level(margin_db, n
     settings = {
         "matching": gates,
         "receiver": ReceiverConfig(noise_level_db=noise_db),
-        "emitter": EmitterConfig(pulse=blocks * BLOCK),
+        "emitter": EmitterConfig(call_duration=blocks * BLOCK),
     }
     (world, config), told = short(4, **settings), []
 
@@ -314,7 +314,7 @@ def test_ranges_bearings_and_beams_use_the_configured_speed_of_sound():
 
 def test_the_off_axis_loss_follows_the_settings():
     config = Config(scenario=ScenarioConfig(steps=80))
-    mild = config.model_copy(update={"emitter": EmitterConfig(off_axis="power")})
+    mild = config.model_copy(update={"emitter": EmitterConfig(directivity_law="power")})
     world = draw_scenario(config, np.random.default_rng(7))
 
     def forgiving(arrivals, **piston):

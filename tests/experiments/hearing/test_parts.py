@@ -217,7 +217,7 @@ def test_a_data_sheet_in_the_settings_gives_the_echo_of_the_sonar_equation():
     rate, tone, still = 500e3, 150e3, np.zeros((1, 2))
     config = Config(
         scenario=ScenarioConfig(medium="water"),
-        emitter=EmitterConfig(frequency=tone, pulse=length, level_db=source + strength),
+        emitter=EmitterConfig(frequency=tone, call_duration=length, level_db=source + strength),
         receiver=ReceiverConfig(
             sample_rate=rate, noise_level_db=density + 10.0 * np.log10(rate), spacing=0.005
         ),
@@ -237,7 +237,7 @@ def test_a_data_sheet_in_the_settings_gives_the_echo_of_the_sonar_equation():
 
 def test_a_mission_in_water_ranges_by_the_sound_in_water_and_not_by_that_in_air():
     setup = ScenarioConfig(medium="water", steps=40)
-    wet = Config(scenario=setup, emitter=EmitterConfig(pulse=6e-4))
+    wet = Config(scenario=setup, emitter=EmitterConfig(call_duration=6e-4))
     deceived = wet.model_copy(update={"assumed": AssumedConfig(speed_of_sound=343.0)})
     world, off = world_of(wet), []
     for config in (wet, deceived):

@@ -114,7 +114,7 @@ def test_written_missions_are_read_back(folder):
     mission = read_mission(folder)
     assert list(mission.scores) == list(PATHS)
     assert (mission.folder, mission.settings["seed"]) == (folder, 9)
-    assert mission.settings["rays.power"] == Config().rays.power
+    assert mission.settings["rays.exponent"] == Config().rays.exponent
     for estimate, path in PATHS.items():
         stored = mission.paths[estimate]
         np.testing.assert_array_equal(stored.time, TIME)

@@ -270,15 +270,13 @@ def test_the_scores_follow_from_the_tables(tmp_path):
     landmarks = pl.read_parquet(tmp_path / "landmarks.parquet")
     for t in (one, two):
         rows = steps.filter(pl.col("strategy") == t.strategy)[1:]
-        assert np.sqrt((rows["position_error_m"] ** 2).mean()) == pytest.approx(
-            t.scores.position_rmse_m, rel=1e-12
-        )
+        expected = pytest.approx(t.scores.position_rmse_m, rel=1e-12)
+        assert np.sqrt((rows["position_error_m"] ** 2).mean()) == expected
         assert rows["nees"].max() == t.scores.nees_max
         full = landmarks.filter(strategy=t.strategy, status="full")
         assert len(full) == t.scores.landmarks_full
-        assert np.sqrt((full["error_m"] ** 2).mean()) == pytest.approx(
-            t.scores.map_rmse_m, rel=1e-12
-        )
+        expected = pytest.approx(t.scores.map_rmse_m, rel=1e-12)
+        assert np.sqrt((full["error_m"] ** 2).mean()) == expected
 
 
 def test_two_filters_of_one_strategy_share_their_measurements(tmp_path):

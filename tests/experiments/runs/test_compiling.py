@@ -136,7 +136,7 @@ def test_kernels_are_compiled_for_the_filters_and_timings_that_are_named(monkeyp
     tried = []
 
     def noted(config, _, filters):
-        tried.append((config.listening.timing, *filters))
+        tried.append((config.listening.excess_paths, *filters))
 
     monkeypatch.setattr(compiling, "run_mission", noted)
     compiling.compile_kernels(["iekf", "my.own:Filter"], [True])

@@ -318,7 +318,7 @@ def test_excess_paths_are_dropped_without_timing():
     timed = replace(TIMED, time=look.time, callers=np.array([-1, 9, 8]))
     log = replace(log, scans=(timed,))
     for timing, rows in ((True, 4), (False, 3)):
-        config = Config(listening=ListeningConfig(timing=timing))
+        config = Config(listening=ListeningConfig(excess_paths=timing))
         (trial,) = replay(log, NO_TRUTH, ["fused"], ["ekf"], None, config).trials
         (scan,) = trial.scans
         assert scan.landmark.size == rows
@@ -466,7 +466,7 @@ def test_the_stated_position_of_a_caller_initialises_its_echoes(estimator):
     scan = replace(made, callers=np.array([-1, 9]))
     caller = LogCaller(name="boat", landmark=9, place=(8.0, 5.0))
     told = FilterConfig(bearing_std=0.01, excess_path_std=0.02)
-    config = Config(listening=ListeningConfig(timing=True), filter=told)
+    config = Config(listening=ListeningConfig(excess_paths=True), filter=told)
     for known in (True, False):
         callers = (caller if known else caller.model_copy(update={"place": None}),)
         log = replace(looks((0.0, 0.1, 0.1)), callers=callers, scans=(scan,))
@@ -545,11 +545,12 @@ def test_odometry_calibration_with_an_offset_sensor_is_refused(asked):
 
 
 def test_a_logs_sensor_settings_are_defaults():
-    log = replace(a_log(), association={"clutter": 0.01, "detection": 0.7})
+    log = replace(a_log(), association={"clutter_rate": 0.01, "detection_rate": 0.7})
     settled, _ = with_log({}, log, Path("log"))
-    assert (settled.association.clutter, settled.association.detection) == (0.01, 0.7)
-    asked, _ = with_log(from_flags({"association": {"clutter": 0.5}}), log, Path("log"))
-    assert asked.association.clutter == 0.5
+    found = settled.association
+    assert (found.clutter_rate, found.detection_rate) == (0.01, 0.7)
+    asked, _ = with_log(from_flags({"association": {"clutter_rate": 0.5}}), log, Path("log"))
+    assert asked.association.clutter_rate == 0.5
 
 
 def a_log():
@@ -562,7 +563,8 @@ def test_a_caller_with_a_stated_position_is_mapped_once_without_labels():
     place = np.array([4.0, 5.0])
     log = heard_without_labels(place)
     config = Config(
-        association=AssociationConfig(method="marginal"), listening=ListeningConfig(timing=True)
+        association=AssociationConfig(method="marginal"),
+        listening=ListeningConfig(excess_paths=True),
     )
     mission = replay(log, Truth(time=log.time), ["fused"], ["iekf"], None, config)
     (trial,) = mission.trials

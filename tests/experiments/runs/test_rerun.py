@@ -29,7 +29,7 @@ def made(tmp_path_factory):
             "run": ("run", *SHORT, "--seed", "5", "--filter", "both", "--beamwidth", "60",
                     "--filter.gate", "0.99", "--save-log", place / "log"),
             "slam": ("slam", place / "log", "--strategy", "all", "--beamwidth", "70",
-                     "--gate", "0.9", "--rays.density", "5"),
+                     "--gate", "0.9", "--rays.range-ratio", "5"),
             "robot": ("slam", OWN / "mrclam_made_up", "--robot", "1"),
         }  # fmt: skip
         for name, line in words.items():

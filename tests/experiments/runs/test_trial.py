@@ -411,7 +411,7 @@ def test_the_smoother_follows_a_caller_that_circles_by_its_sound(seed):
         seed=seed,
         scenario=ScenarioConfig(steps=280),
         callers=({"course": "circle", "radius": 10.0, "speed": 0.75},),
-        listening={"timing": True},
+        listening={"excess_paths": True},
         filter=FilterConfig(noise="measured", robust="huber"),
     )
     for trial in run_mission(config, ["fused", "passive"], ["smoother"]).trials:
@@ -428,7 +428,7 @@ def test_the_smoother_has_a_map_though_cholesky_fails():
         seed=774396,
         scenario=ScenarioConfig(steps=160, landmarks=3),
         motion={"speed_std": 1e-6},
-        listening={"timing": True},
+        listening={"excess_paths": True},
         callers=(
             {"name": "c0", "frequency": 45e3, "course": "mission"},
             {"name": "c1", "frequency": 25e3},
@@ -484,7 +484,7 @@ OF_MAPS = ("map_", "gospa_", "landmarks_missed", "landmarks_false", "landmarks_t
 
 @pytest.mark.parametrize("timing", [False, True])
 def test_an_association_with_the_oracles_labels_gives_the_oracles_map(timing):
-    listening = {"listening": ListeningConfig(timing=timing)}
+    listening = {"listening": ListeningConfig(excess_paths=timing)}
     config = SHORT.model_copy(update=listening)
     world = draw_scenario(config, RNG(3))
     (heard,) = listen(world, config, (config.emitter.radius,))

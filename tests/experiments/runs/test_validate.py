@@ -65,7 +65,7 @@ def test_cold_air_makes_half_a_wave_shorter():
 def test_settings_for_air_are_reported_in_water():
     water = ScenarioConfig(medium="water")
     deaf, close = warnings_of(Config(scenario=water))
-    assert deaf.startswith("emitter.pulse: nothing nearer than 2.1 m is heard")  # c T / 2
+    assert "in water hides echoes from less than 2.1 m" in deaf  # c T / 2
     assert "rays.range_bounds begin at 0.5 m" in deaf
     assert close.startswith("receiver.spacing: 0.0049 m is 0.12 of a wave in water")
     assert "4.3 times as coarse as of half a wave (0.021 m)" in close
@@ -73,7 +73,8 @@ def test_settings_for_air_are_reported_in_water():
     assert idle.startswith('water.depth: counts for nothing where scenario.medium is "air"')
     cold = warnings_of(Config(scenario=water, air=AirConfig(temperature_c=5.0)))
     assert [line.split(":")[0] for line in cold[:1]] == ["air.temperature_c"]
-    fits = {"emitter": EmitterConfig(pulse=6e-4), "receiver": ReceiverConfig(spacing=0.0212)}
+    emitter, receiver = EmitterConfig(call_duration=6e-4), ReceiverConfig(spacing=0.0212)
+    fits = {"emitter": emitter, "receiver": receiver}
     assert warnings_of(Config(scenario=water, **fits)) == ()
 
 
@@ -96,7 +97,7 @@ def test_without_room_for_a_recording_the_setting_that_makes_it_long_is_named(mo
         ("scenario", ("beacon_distance", 15e3), "scenario.beacon_distance"),
         ("scenario", ("radius", 15e3), "scenario.radius"),
         ("scenario", ("start", (15e3, 0.0, 0.0)), "scenario.start"),
-        ("emitter", ("pulse", 60.0), "emitter.pulse"),
+        ("emitter", ("call_duration", 60.0), "emitter.call_duration"),
     ):
         with pytest.raises(InputError, match=rf"^{key}: a recording of \d+ s may need .* GB"):
             checked_scenario(settings(**{section: pair}))

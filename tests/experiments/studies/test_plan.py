@@ -26,7 +26,7 @@ from reference.studies import SMALL, plan_of
 
 BARE = "format = 1\niterations = 2\n"
 BEAMS = "[grid]\nbeamwidth = [33, 11]\n"
-BEAMWIDTHS = BARE + '[grid]\nbeamwidth = [180, 90, 33.2, 11]\n"rays.power" = [1.0, 2.0]\n'
+BEAMWIDTHS = BARE + '[grid]\nbeamwidth = [180, 90, 33.2, 11]\n"rays.exponent" = [1.0, 2.0]\n'
 
 
 @pytest.fixture
@@ -61,11 +61,12 @@ def named(plan):
 
 
 def test_packaged_plans_name_only_fitted_settings_and_readings():
-    fitted = {"emitter": ["level_db"], "beacon": ["level_db"], "rays": ["prune", "power"]}
+    rays = ["prune_threshold", "exponent"]
+    fitted = {"emitter": ["level_db"], "beacon": ["level_db"], "rays": rays}
     assert named("physics") == fitted
-    readings = {"detection": ["snapshots", "peak_db"], "emitter": ["off_axis", "level_db"]}
+    readings = {"detection": ["snapshots", "peak_db"], "emitter": ["directivity_law", "level_db"]}
     readings["scenario"] = ["inner_radius", "spacing"]
-    assert named("paper") == fitted | readings | {"rays": ["ranged", *fitted["rays"]]}
+    assert named("paper") == fitted | readings | {"rays": ["range_update", *fitted["rays"]]}
 
 
 def test_the_plans_of_the_package_have_the_same_cases_and_counts():
@@ -100,20 +101,20 @@ def test_a_plan_without_strategies_filters_and_name_has_them_all_and_is_named_af
 def test_the_cases_are_the_product_of_grid_strategies_and_filters(tmp_path):
     text = BARE + (
         'strategies = ["fused", "active"]\n'
-        'grid = {"rays.power" = [1, 3], "air.spreading" = ["paper", "bistatic"]}\n'
+        'grid = {"rays.exponent" = [1, 3], "air.spreading" = ["paper", "bistatic"]}\n'
     )
     cases = cases_of(plan_of(tmp_path, text))
     assert len(cases) == 2 * 2 * 2 * 2
     for case in cases:
-        assert case.config.rays.power == case.values["rays.power"]
+        assert case.config.rays.exponent == case.values["rays.exponent"]
         assert case.config.air.spreading == case.values["air.spreading"]
     assert len({(c.strategy, c.filter, *c.values.values()) for c in cases}) == 16
 
 
 def test_cases_are_numbered_by_the_grid_then_the_strategies_then_the_filters(tmp_path):
-    text = BARE + 'strategies = ["fused", "active"]\ngrid = {"rays.power" = [3, 1]}\n'
+    text = BARE + 'strategies = ["fused", "active"]\ngrid = {"rays.exponent" = [3, 1]}\n'
     cases = cases_of(plan_of(tmp_path, text))
-    assert [(case.values["rays.power"], case.strategy, case.filter) for case in cases] == [
+    assert [(case.values["rays.exponent"], case.strategy, case.filter) for case in cases] == [
         (power, strategy, name)
         for power in (3.0, 1.0)
         for strategy in ("fused", "active")
@@ -123,7 +124,7 @@ def test_cases_are_numbered_by_the_grid_then_the_strategies_then_the_filters(tmp
 
 
 def test_one_passive_case_serves_all_radii_with_the_narrowest_beam(tmp_path):
-    text = SMALL.replace("[0.0025, 0.025]", "[0.025, 0.0025]") + '"rays.power" = [1.0, 2.0, 3.0]\n'
+    text = SMALL.replace("[0.0025, 0.025]", "[0.025, 0.0025]") + '"rays.merge" = [1.0, 2.0, 3.0]\n'
     passive = [case for case in cases_of(plan_of(tmp_path, text)) if case.strategy == "passive"]
     assert len(passive) == 3 * 2
     assert {case.values["emitter.radius"] for case in passive} == {None}
@@ -144,7 +145,7 @@ def test_settings_may_vary_that_are_no_numbers(tmp_path):
 
 
 def test_a_plan_as_written_reads_as_the_same_plan(tmp_path):
-    plan = plan_of(tmp_path, SMALL, over=from_flags({"rays": {"power": 3.0}}))
+    plan = plan_of(tmp_path, SMALL, over=from_flags({"rays": {"exponent": 3.0}}))
     written = plan_text(plan)
     assert plan_of(tmp_path, written) == plan
     unsaid = {"settings", "own", "callers"}
@@ -153,7 +154,7 @@ def test_a_plan_as_written_reads_as_the_same_plan(tmp_path):
 
 def test_a_plan_made_of_both_a_setting_and_its_values_can_be_read_again(tmp_path):
     ways = {"strategies": ("active",), "filters": ("ekf",)}
-    config, grid = Config(seed=3, rays=RayConfig(power=5.0)), {"rays.power": (1.0, 2.0)}
+    config, grid = Config(seed=3, rays=RayConfig(exponent=5.0)), {"rays.exponent": (1.0, 2.0)}
     plan = Plan(name="small", iterations=1, config=config, grid=grid, **ways)
     there = plan_of(tmp_path, plan_text(plan))
     assert cases_of(there) == cases_of(plan)
@@ -181,10 +182,10 @@ REFUSED = [
     ('filters = ["ekf", "ekf"]', "filters: found 'ekf' twice"),
     ("config = 3", "key 'config': found 3, expected a table"),
     ("grid = [1]", "key 'grid': found [1], expected a table"),
-    ("[config.rays]\npowr = 1\n", "config.rays.powr: no such setting; did you mean rays.power?"),
+    ("[config.rays]\npowr = 1\n", "config.rays.powr: no such setting; did you mean config.rays.ex"),
     ("[config.sonar]", "config.sonar: no such setting"),
-    ("[config]\nrays = 3\n", "config.rays: no such setting"),
-    ("[config.rays]\npower = 0\n", "config.rays.power: found 0, expected greater than 0"),
+    ("[config]\nrays = 3\n", "config.rays: found 3, expected a section of settings"),
+    ("[config.rays]\nexponent = 0\n", "config.rays.exponent: found 0, expected greater than 0"),
     ('[grid]\n"radius" = [1]\n', "grid.radius: no such setting; did you mean"),
     ('[grid]\n"emitter.radius" = [0.01, -1.0]\n',
      "grid.emitter.radius: found -1.0, expected greater than 0"),
@@ -192,23 +193,23 @@ REFUSED = [
      "grid.emitter.radius: found nan, expected a finite number"),
     ('[grid]\n"emitter.radius" = ["wide"]\n',
      "grid.emitter.radius: found 'wide', expected a valid number"),
-    ('[grid]\n"rays.power" = 2.0\n', "grid.rays.power: found 2.0, expected a list"),
-    ('[grid]\n"rays.power" = []\n', "grid.rays.power: found [], expected a list"),
-    ('[grid]\n"rays.power" = [2, 2.0]\n',
-     "grid.rays.power: found 2.0 twice, expected each value once"),
+    ('[grid]\n"rays.exponent" = 2.0\n', "grid.rays.exponent: found 2.0, expected a list"),
+    ('[grid]\n"rays.exponent" = []\n', "grid.rays.exponent: found [], expected a list"),
+    ('[grid]\n"rays.exponent" = [2, 2.0]\n',
+     "grid.rays.exponent: found 2.0 twice, expected each value once"),
     ("[grid]\nseed = [1, 2]\n", "grid.seed: every iteration is another world"),
     ("own = 3", "key 'own': found 3, expected a table"),
     ("[own]\nekf = 3\n", "key 'own.ekf': found 3, expected a table"),
-    ("[own.iekf]\nfilter.gate = 0.9\n", "own.iekf: no filter of this plan; did you mean ekf?"),
+    ("[own.iekf]\nfilter.gate = 0.9\n", "own.iekf: no filter of this plan; expected one of ekf"),
     ("[own.ekf]\nemitter.radius = 0.01\n",
-     "own.ekf.emitter.radius: this setting changes what is heard; expected one of the "
+     "own.ekf.emitter.radius: changes what is heard; expected one of the "
      "sections listening, association, filter, rays, fastslam"),
-    ("[own.ekf]\nseed = 1\n", "own.ekf.seed: this setting changes what is heard"),
-    ('[own.ekf]\nrays.power = 2.0\n[grid]\n"rays.power" = [1.0, 2.0]\n',
-     "own.ekf.rays.power: the plan varies this setting; take it out"),
+    ("[own.ekf]\nseed = 1\n", "own.ekf.seed: changes what is heard"),
+    ('[own.ekf]\nrays.exponent = 2.0\n[grid]\n"rays.exponent" = [1.0, 2.0]\n',
+     "own.ekf.rays.exponent: the plan varies this setting; take it out"),
     ("[own.ekf]\nfilter.gat = 0.9\n",
      "own.ekf.filter.gat: no such setting; did you mean filter.gate?"),
-    ("[own.ekf]\nfilter = 3\n", "own.ekf.filter: no such setting"),
+    ("[own.ekf]\nfilter = 3\n", "own.ekf.filter: found 3, expected a section of settings"),
     ("[own.ekf]\nfilter.gate = 2.0\n",
      'own.ekf.filter.gate: found 2.0, expected above 0 and up to 1, or "auto"'),
     ("[own.ekf]\nfilter.initial_pose_std = [0.1, 0.1]\n",
@@ -226,8 +227,8 @@ REFUSED = [
      "config.callers: the plan varies this setting"),
     ('[grid]\n"rays.range_bounds" = [[0.5, 20.0], [20.0, 30.0], [9.0, 3.0]]',
      "grid.rays.range_bounds: range_bounds must rise, found [9.0, 3.0]"),
-    ('[config.rays]\npower = 3.0\n[grid]\n"rays.power" = [1.0, 2.0]',
-     "config.rays.power: the plan varies this setting; take it out of [grid] in PLAN"),
+    ('[config.rays]\nexponent = 3.0\n[grid]\n"rays.exponent" = [1.0, 2.0]',
+     "config.rays.exponent: the plan varies this setting; take it out of [grid] in PLAN"),
     ("[grid]\nbeamwith = [33]", "grid.beamwith: no such setting; did you mean beamwidth?"),
     *(
         (f"[grid]\nbeamwidth = [33, {value}]",
@@ -282,14 +283,14 @@ def test_a_mistake_is_named_in_a_line_with_file_key_and_expectation(refused, tex
 
 def test_more_cases_than_the_tables_can_number_are_refused(refused):
     values = str([1.0 + i / 1000 for i in range(100)])
-    text = BARE + f'[grid]\n"rays.power" = {values}\n"air.pressure_kpa" = {values}\n'
+    text = BARE + f'[grid]\n"rays.exponent" = {values}\n"air.pressure_kpa" = {values}\n'
     assert refused(text) == "PLAN: grid: found 60000 cases, expected at most 32767"
 
 
 def test_a_default_of_a_varied_setting_has_no_effect(tmp_path):
     path = tmp_path / "plan.toml"
-    path.write_text(BARE + '[grid]\n"rays.power" = [1.0, 3.0]\n[config.rays]\npower = 2.0\n')
-    assert read_plan(path).grid == {"rays.power": (1.0, 3.0)}
+    path.write_text(BARE + '[grid]\n"rays.exponent" = [1.0, 3.0]\n[config.rays]\nexponent = 2.0\n')
+    assert read_plan(path).grid == {"rays.exponent": (1.0, 3.0)}
 
 
 @pytest.mark.parametrize(
@@ -298,7 +299,7 @@ def test_a_default_of_a_varied_setting_has_no_effect(tmp_path):
         (SMALL, {"emitter": {"radius": 0.01}}, "emitter.radius: the plan varies this setting; "),
         (BARE + BEAMS, {"emitter": {"radius": 0.01}},
          "emitter.radius: the plan varies this setting as beamwidth; take it out of [grid]"),
-        (SMALL, {"rays": {"power": -1}}, "rays.power: found -1, expected"),
+        (SMALL, {"rays": {"exponent": -1}}, "rays.exponent: found -1, expected"),
     ],
 )  # fmt: skip
 def test_a_flag_that_contradicts_a_plan_is_named(refused, text, flag, said):
@@ -316,12 +317,12 @@ def test_all_that_differs_is_named_but_for_the_number_of_worlds(tmp_path):
     there = plan_of(tmp_path, SMALL)
     assert changed_settings(there, plan_of(tmp_path, SMALL, iterations=30)) == []
     text = SMALL.replace("landmarks = 12", "landmarks = 13").replace("0.025]", "0.02]")
-    text = text.replace("[config", 'filters = ["ekf"]\n[config') + '"rays.power" = [1.0]\n'
+    text = text.replace("[config", 'filters = ["ekf"]\n[config') + '"rays.exponent" = [1.0]\n'
     assert changed_settings(there, plan_of(tmp_path, text)) == [
         'filters: ["ekf", "fastslam"] there, ["ekf"] asked for',
         "config.scenario.landmarks: 12 there, 13 asked for",
         "grid.emitter.radius: [0.0025, 0.025] there, [0.0025, 0.02] asked for",
-        "grid.rays.power: nothing there, [1.0] asked for",
+        "grid.rays.exponent: nothing there, [1.0] asked for",
     ]
 
 
@@ -352,26 +353,26 @@ def test_settings_that_are_not_varied_follow_the_plan(tmp_path):
 OWN = BARE + (
     'filters = ["ekf", "iekf", "a.b:Mine"]\n'
     "[config]\nfilter.gate = 0.99\n"
-    '[grid]\n"rays.power" = [1.0, 3.0]\n'
-    '[own.iekf]\nfilter.noise = "measured"\nrays.spacing = "auto"\n'
+    '[grid]\n"rays.exponent" = [1.0, 3.0]\n'
+    '[own.iekf]\nfilter.noise = "measured"\nrays.precise_bearings = "auto"\n'
     '[own."a.b:Mine"]\nfilter.gate = 0.5\nfilter.initial_pose_std = [0.1, 0.1, 0.2]\n'
 )
 
 
 def test_settings_of_one_filter_apply_only_to_its_cases(tmp_path):
     plan = plan_of(tmp_path, OWN)
-    assert plan.own["iekf"] == {"filter.noise": "measured", "rays.spacing": "auto"}
+    assert plan.own["iekf"] == {"filter.noise": "measured", "rays.precise_bearings": "auto"}
     for case in cases_of(plan):
-        shared = common(plan, {"rays.power": case.values["rays.power"]})
+        shared = common(plan, {"rays.exponent": case.values["rays.exponent"]})
         assert shared.filter.gate == 0.99
-        assert case.config.rays.power == shared.rays.power == case.values["rays.power"]
+        assert case.config.rays.exponent == shared.rays.exponent == case.values["rays.exponent"]
         told, rays = case.config.filter, case.config.rays
         if case.filter == "ekf":
             assert case.config == shared
         elif case.filter == "iekf":
-            assert (told.noise, told.gate, rays.spacing) == ("measured", 0.99, "auto")
+            assert (told.noise, told.gate, rays.precise_bearings) == ("measured", 0.99, "auto")
         else:
-            assert (told.noise, told.gate, rays.spacing) == ("constant", 0.5, "paper")
+            assert (told.noise, told.gate, rays.precise_bearings) == ("constant", 0.5, "paper")
             assert told.initial_pose_std == (0.1, 0.1, 0.2)
 
 
@@ -389,10 +390,11 @@ def test_a_plan_without_settings_per_filter_has_no_table_of_them(tmp_path):
 
 
 def test_settings_that_contradict_a_grid_value_are_refused(refused):
-    text = '[own.ekf]\nrays.spacing = "auto"\n[grid]\n"rays.likelihood" = ["normal", "printed"]\n'
+    text = '[own.ekf]\nrays.precise_bearings = "auto"\n'
+    text += '[grid]\n"rays.likelihood" = ["normal", "printed"]\n'
     said = refused(BARE + text)
     assert said.startswith("PLAN: ")
-    assert 'spacing "auto" needs likelihood "normal", found "printed"' in said
+    assert 'bearings "auto" needs likelihood "normal", found "printed"' in said
 
 
 def test_changed_settings_of_one_filter_are_listed(tmp_path):
@@ -457,13 +459,13 @@ def test_a_plan_has_the_worlds_of_another_with_timing(name, of, sections):
     differ = {key for key in plan.keys() | other.keys() if plan.get(key) != other.get(key)}
     there = {key.rpartition(".")[0] for key in differ if not key.startswith("grid.")}
     assert there == {"", "config.listening", *sections}
-    assert plan["config.listening.timing"] is True
+    assert plan["config.listening.excess_paths"] is True
 
 
 @pytest.mark.parametrize("name", ["callers", "pair"])
 def test_plans_with_callers_use_the_papers_worlds_with_timing(name):
     plan, physics = (read_plan(find_plan(word)) for word in (name, "physics"))
-    assert plan.config.listening.timing
+    assert plan.config.listening.excess_paths
     for part in ("seed", "emitter", "beacon", "motion", "air", "target", "detection"):
         assert getattr(plan.config, part) == getattr(physics.config, part)
     assert plan.config.scenario == physics.config.scenario
@@ -485,7 +487,7 @@ def width_of(case, tone=35e3):
 
 def test_a_beamwidth_is_converted_to_its_radius(tmp_path):
     plan = plan_of(tmp_path, BEAMWIDTHS)
-    assert list(plan.grid) == ["emitter.radius", "rays.power"], "in the place of the beamwidths"
+    assert list(plan.grid) == ["emitter.radius", "rays.exponent"], "in the place of the beamwidths"
     cases = [case for case in cases_of(plan) if case.strategy == "active"]
     widths = [width_of(case) for case in cases[::4]]
     assert widths[0] == 180.0

@@ -332,6 +332,6 @@ def test_a_folder_without_a_plan_is_no_study(tmp_path):
 
 
 def test_a_plan_file_that_names_the_defaults_still_matches(tmp_path):
-    plan = plan_of(tmp_path, SMALL + f"[config.rays]\npower = {Config().rays.power}\n")
+    plan = plan_of(tmp_path, SMALL + f"[config.rays]\nexponent = {Config().rays.exponent}\n")
     open_store(tmp_path / "one", plan_of(tmp_path))
     open_store(tmp_path / "one", plan)

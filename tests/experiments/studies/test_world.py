@@ -45,7 +45,7 @@ BOUNDS = ("position_bound_m", "heading_bound_rad")
 
 @pytest.fixture(scope="module")
 def varied(tmp_path_factory):
-    grid = '"rays.power" = [2.0, 4.0]\n"scenario.landmarks" = [10, 12]\n'
+    grid = '"rays.exponent" = [2.0, 4.0]\n"scenario.landmarks" = [10, 12]\n'
     text = SMALL.replace("landmarks = 12\n", "") + grid
     return plan_of(tmp_path_factory.mktemp("plan"), text)
 
@@ -160,7 +160,7 @@ def test_cases_that_hear_the_same_world_listen_once(varied, monkeypatch):
     listen = world.listen
 
     def counted(scenario, config, radii, **named):
-        heard.append((config.scenario.landmarks, config.rays.power, *radii))
+        heard.append((config.scenario.landmarks, config.rays.exponent, *radii))
         return listen(scenario, config, radii, **named)
 
     monkeypatch.setattr(world, "listen", counted)
@@ -187,7 +187,7 @@ OTHERS = {
     "target.shape": "sphere", "target.radius": 0.05,
     "emitter.call": "sweep", "emitter.sweep": "hyperbolic", "emitter.band": [60000.0, 45000.0],
     "emitter.taper": 0.5, "emitter.frequency": 40000.0, "emitter.radius": 0.02,
-    "emitter.level_db": 60.0, "emitter.off_axis": "power", "emitter.pulse": 0.002,
+    "emitter.level_db": 60.0, "emitter.directivity_law": "power", "emitter.call_duration": 0.002,
     "beacon.call": "sweep", "beacon.sweep": "hyperbolic", "beacon.band": [28000.0, 15000.0],
     "beacon.taper": 0.5, "beacon.frequency": 25000.0, "beacon.level_db": 55.0,
     "receiver.array": [[x, y, 0.0, 0.0, ""] for x, y in ((0.01, 0.0), (0.0, 0.01), (-0.01, 0.0))],
@@ -198,7 +198,7 @@ OTHERS = {
     "detection.angle_limit_deg": 40.0, "detection.averaging": "weighted",
     "detection.overlaps": "resolve",
     "matching.delay_gate": 0.01, "matching.bearing_gate": 0.01, "matching.margin_db": 0.0,
-    "listening.timing": True,
+    "listening.excess_paths": True,
     "motion.model": "unicycle", "motion.wheelbase": 0.3, "motion.speed_std": 0.2,
     "motion.steering_std": 0.06, "motion.angular_rate_std": 0.2, "motion.speed_bias": 0.1,
     "motion.turn_bias": 0.01,
@@ -213,9 +213,10 @@ OTHERS = {
     "prior.speed_of_sound_std": 1.0, "prior.sensor_heading_std": 0.01,
     "prior.sensor_place_std": 0.5, "prior.time_offset_std": 0.01,
     "prior.range_scale_std": 0.01, "prior.range_bias_std": 0.01,
-    "rays.ratio": 0.2, "rays.density": 2.0, "rays.range_bounds": [1.0, 15.0], "rays.prune": 0.3,
-    "rays.power": 4.0, "rays.weights": "aggregated", "rays.likelihood": "printed",
-    "rays.spacing": "auto", "rays.ranged": "moved", "rays.merge": 2.0,
+    "rays.relative_std": 0.2, "rays.range_ratio": 2.0, "rays.range_bounds": [1.0, 15.0],
+    "rays.prune_threshold": 0.3, "rays.exponent": 4.0, "rays.weights": "aggregated",
+    "rays.likelihood": "printed",
+    "rays.precise_bearings": "auto", "rays.range_update": "moved", "rays.merge": 2.0,
     "fastslam.particles": 30, "fastslam.resample_below": 1.0, "fastslam.mixture": "exact",
     "fastslam.weights": "sampled", "fastslam.resampled_rays": "restart",
     "fastslam.weighed_by": "initialised", "fastslam.estimate": "mixture",
@@ -224,8 +225,8 @@ OTHERS = {
 FEW = ("air.spreading", "water.spreading", "target.shape", "emitter.radius", "beacon.level_db",
        "receiver.elements",
        "detection.peak_db", "matching.bearing_gate", "motion.speed_std", "scenario.landmarks",
-       "assumed.wheelbase", "listening.timing", "callers",
-       "filter.range_std", "prior.wheelbase_std", "rays.power", "fastslam.particles",
+       "assumed.wheelbase", "listening.excess_paths", "callers",
+       "filter.range_std", "prior.wheelbase_std", "rays.exponent", "fastslam.particles",
        "seed")  # fmt: skip
 """One of each section."""
 
@@ -245,7 +246,7 @@ def test_every_setting_is_varied_here_or_listed_as_exempt():
 
 
 WATER = {"scenario": {"medium": "water"}}
-ROAMING = {"listening": {"timing": True}, "callers": [{"course": "circle", "radius": 5.0}]}
+ROAMING = {"listening": {"excess_paths": True}, "callers": [{"course": "circle", "radius": 5.0}]}
 NEEDS = {
     **{f"emitter.{name}": {"emitter": {"call": "sweep"}} for name in ("sweep", "band")},
     **{f"beacon.{name}": {"beacon": {"call": "sweep"}} for name in ("sweep", "band")},
@@ -254,13 +255,13 @@ NEEDS = {
     "scenario.extent": {"scenario": {"course": "eight"}},
     "scenario.lane": {"scenario": {"field": "rows"}},
     "motion.angular_rate_std": {"motion": {"model": "unicycle"}},
-    "filter.excess_path_std": {"listening": {"timing": True}},
+    "filter.excess_path_std": {"listening": {"excess_paths": True}},
     "filter.caller_speed_std": ROAMING,
     "filter.caller_walk_std": ROAMING,
     "filter.robust": {"filter": {"noise": "measured"}},
     "filter.window": {"scenario": {"steps": 640}},
     **{f"prior.{name}_std": {"filter": {"calibrate": [name]}} for name in PARAMETERS},
-    "rays.spacing": {"filter": {"bearing_std": 0.003}},
+    "rays.precise_bearings": {"filter": {"bearing_std": 0.003}},
     "rays.merge": {"scenario": {"steps": 80}},
     "assumed.angular_rate_std": {"motion": {"model": "unicycle"}},
 }
@@ -269,10 +270,8 @@ NEEDS = {
 
 def plan_with(config, setting="", values=(), filters=("ekf", "fastslam")):
     """A plan of one world, in which a setting may vary."""
-    grid, ways = (
-        {setting: values} if setting else {},
-        {"strategies": ("fused",), "filters": filters},
-    )
+    grid = {setting: values} if setting else {}
+    ways = {"strategies": ("fused",), "filters": filters}
     return Plan(name="one", iterations=1, config=config, grid=grid, **ways)
 
 
@@ -505,10 +504,8 @@ def test_only_measured_noise_raises_the_bound(varied, monkeypatch):
         more = {name: 2.0 * getattr(rows, name) for name in ("bearing_std", "range_std")}
         return with_columns(rows, **more)
 
-    without_hidden, short = (
-        heard_world.without_hidden,
-        replace(varied, strategies=("active",), filters=("ekf",)),
-    )
+    without_hidden = heard_world.without_hidden
+    short = replace(varied, strategies=("active",), filters=("ekf",))
     before = run_world(short, 0)
     coarse = short.config.filter.model_copy(update={"range_std": 0.4, "bearing_std": 0.3})
     stated = replace(short, config=short.config.model_copy(update={"filter": coarse}))
@@ -673,9 +670,8 @@ def test_an_overtaken_writer_succeeds(folder, plan, records, monkeypatch):
 
 def test_a_damaged_world_is_named_with_the_way_out(folder, plan):
     world_file(folder, "trials", 0).write_bytes(b"nothing of ours")
-    with pytest.raises(
-        InputError, match=r"0\.parquet: could not be read: it is no whole .*; remove"
-    ):
+    message = r"0\.parquet: could not be read: it is no whole .*; remove"
+    with pytest.raises(InputError, match=message):
         read_outcomes(folder, plan, 0)
 
 
@@ -710,7 +706,7 @@ def test_a_world_of_another_plan_is_noticed_and_more_worlds_are_no_other_plan(
 ):
     write_world(folder, plan, 0, records)
     check_world(folder, replace(plan, iterations=99), 0)
-    other = replace(plan, config=resolve(from_flags({"rays": {"power": 3.0}})))
+    other = replace(plan, config=resolve(from_flags({"rays": {"exponent": 3.0}})))
     with pytest.raises(InputError, match=r"iteration_00000\.parquet: was computed by another plan"):
         check_world(folder, other, 0)
 

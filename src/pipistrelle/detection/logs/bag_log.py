@@ -503,7 +503,7 @@ def _widest_beam(std: Float[np.ndarray, " n"]) -> dict[str, float]:
     as likely noise for it.
     """
     widest = float(std[std <= WIDEST].max(initial=0.0))
-    return {"bearing_std": widest} if widest > AssociationConfig().bearing_std else {}
+    return {"max_angle_std": widest} if widest > AssociationConfig().max_angle_std else {}
 
 
 def _alike(topic: str, rows: TopicEchoes) -> list[str]:

@@ -59,10 +59,8 @@ def read_mrclam(folder: Path, robot: int, span: tuple[float, float] = (-math.inf
     landmark, robots = np.isin(subject, LANDMARKS), np.isin(subject, ROBOTS)
     unknown = ~(landmark | robots)
     if unknown.mean() > _UNKNOWN_MAX:
-        row, rows = (
-            int(np.argmax(unknown)),
-            f"{unknown.sum()} unknown barcodes in {unknown.size} rows",
-        )
+        row = int(np.argmax(unknown))
+        rows = f"{unknown.sum()} unknown barcodes in {unknown.size} rows"
         expected = f"at most {_UNKNOWN_MAX:.0%} that Barcodes.dat does not know"
         fix = "use the Barcodes.dat of this set"
         raise refusal(place_of(seen, row), f"barcode {barcode[row]}, and {rows}", expected, fix)

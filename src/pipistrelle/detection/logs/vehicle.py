@@ -5,7 +5,7 @@ from math import inf
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from pydantic import ConfigDict, Field, ValidationError, field_validator
+from pydantic import AliasChoices, ConfigDict, Field, ValidationError, field_validator
 
 from pipistrelle.config import (
     LATEST,
@@ -23,7 +23,7 @@ from pipistrelle.detection.logs.poses import MOTION_COVARIANCE, POSE
 from pipistrelle.detection.logs.recording import LogCaller
 from pipistrelle.files import read_text
 from pipistrelle.refusals import table_refusal
-from pipistrelle.settings import parse_toml
+from pipistrelle.settings import RENAMED, parse_toml
 from pipistrelle.text_tables import FORMER_NAMES, Schema
 
 _Triple = Annotated[tuple[Real, Real, Real], Field(strict=False)]
@@ -55,14 +55,21 @@ ODOMETRY["poses"] = Schema(
 )
 
 
+def _also(old: str) -> Any:
+    """Return the field of a sensor property that older logs call `old`."""
+    return Field(
+        validation_alias=AliasChoices(RENAMED[f"association.{old}"].partition(".")[2], old)
+    )
+
+
 class _Association(Section):
     """Sensor properties in ``log.toml``, named like the settings of `association`."""
 
     model_config = ConfigDict(strict=True)
 
-    detection: Probability | None = None
-    clutter: Positive | None = None
-    bearing_std: Positive | None = None
+    detection_rate: Annotated[Probability | None, _also("detection")] = None
+    clutter_rate: Annotated[Positive | None, _also("clutter")] = None
+    max_angle_std: Annotated[Positive | None, _also("bearing_std")] = None
 
 
 class Vehicle(Section):

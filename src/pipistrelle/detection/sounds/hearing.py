@@ -347,7 +347,7 @@ def _settled(config: Config, about: Description, rate: float) -> Config:
     assumed = config.assumed.speed_of_sound or about.speed_of_sound
     return config.model_copy(
         update={
-            "emitter": config.emitter.model_copy(update={"pulse": about.call.duration}),
+            "emitter": config.emitter.model_copy(update={"call_duration": about.call.duration}),
             "receiver": config.receiver.model_copy(update={"sample_rate": rate}),
             "assumed": config.assumed.model_copy(update={"speed_of_sound": assumed}),
         }

@@ -571,8 +571,8 @@ def left_out(config: Config, scans: Iterable[Scan]) -> dict[str, Float[np.ndarra
     settings, found = config.association, {"bearing_std": [], "way_std": []}
     for scan in scans:
         for name, limits in (
-            ("bearing_std", (settings.bearing_std, math.inf, math.inf)),
-            ("way_std", (math.inf, settings.way_std, math.inf)),
+            ("bearing_std", (settings.max_angle_std, math.inf, math.inf)),
+            ("way_std", (math.inf, settings.max_range_std, math.inf)),
         ):
             rows = rows_of_scan(scan, limits, _assumed(config))
             found[name].append(getattr(rows, name)[~rows.usable & (scan.landmark == UNLABELLED)])
@@ -598,17 +598,17 @@ def association_of(config: Config, labels: int = 0) -> Association | None:
     if name == KNOWN:
         return None
     if name in METHODS:
-        stated, vague = config.filter, VAGUE / settings.clutter
+        stated, vague = config.filter, VAGUE / settings.clutter_rate
         if stated.noise == "constant":  # no landmark is known better after one detection
             vague = max(vague, BARELY * stated.bearing_std * stated.range_std)
         chances = Chances(
             gate=GATE,
-            clutter=settings.clutter,
-            bearing_clutter=20.0 * settings.clutter,
-            detection=settings.detection,
+            clutter=settings.clutter_rate,
+            bearing_clutter=20.0 * settings.clutter_rate,
+            detection=settings.detection_rate,
             vague=vague,
         )
-        stds = {"bearing_std": settings.bearing_std, "way_std": settings.way_std}
+        stds = {"bearing_std": settings.max_angle_std, "way_std": settings.max_range_std}
         return Sequential(
             match=METHODS[name],
             chances=tuple(chances),

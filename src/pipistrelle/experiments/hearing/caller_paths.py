@@ -179,7 +179,7 @@ def _placeless(
         frequency=sent.centre,
         level_db=usual.level_db if one.level_db is None else one.level_db,
         key=key,
-        sound=sound_of(sent, config.emitter.pulse, key),
+        sound=sound_of(sent, config.emitter.call_duration, key),
     )
 
 

@@ -102,7 +102,7 @@ def frames_of(
     own_clock = [j for j, caller in enumerate(scenario.callers) if caller.calls is not None]
     emissions = partial(_emissions, world, radii=radii, config=config, beam=beam, medium=medium)
     heard = _calls_heard(world, calls, emissions, medium.speed_of_sound)
-    span = setup.steps_per_frame * setup.step - config.emitter.pulse
+    span = setup.steps_per_frame * setup.step - config.emitter.call_duration
     last = np.array([one.time + one.sounds[0].delay.max() for one in heard])
     first = np.array([one.time for one in heard])
     steps = np.searchsorted(world.time, begin)
@@ -253,7 +253,7 @@ def listen(
     purpose = "noise" if setup.vehicle == 1 else f"noise of {setup.vehicle}"
     recorded = rig.in_bands if settled.banded else rig.blocks
     beams: tuple[list[FrameMeasurements], ...] = tuple([] for _ in radii)
-    beam = beam or partial(through_piston, off_axis=config.emitter.off_axis)
+    beam = beam or partial(through_piston, off_axis=config.emitter.directivity_law)
     calls: dict[int, tuple[CallHeard, list[list[Detections]]]] = {}
     for number, frame in enumerate(frames_of(scenario, radii, config, beam, medium), start=1):
         key = stream_key(config.seed, iteration, purpose, number)
@@ -344,7 +344,7 @@ class _Rig:
             arrivals,
             self.layout,
             config.matching,
-            pulse=config.emitter.pulse,
+            pulse=config.emitter.call_duration,
             faintest_db=self.faintest_db,
         )
         detections = with_edge_floor(detections, config)

@@ -168,7 +168,7 @@ class SoundRecorder:
             "medium": {"name": config.scenario.medium, **medium},
             "call": {
                 "frequency": own.frequency,
-                "duration": config.emitter.pulse,
+                "duration": config.emitter.call_duration,
                 "level_db": own.level_db,
             }
             | _told(own),

@@ -296,7 +296,7 @@ def drive_bound(
         path if parted.truth.path is None else parted.truth.path,
         landmarks,
         scans,
-        parted.truth.callers if config.listening.timing else NO_ROUTES,
+        parted.truth.callers if config.listening.excess_paths else NO_ROUTES,
         (settings.caller_speed_std, settings.caller_walk_std),
     )[steps]
 

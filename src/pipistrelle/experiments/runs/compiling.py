@@ -11,7 +11,6 @@ import numpy as np
 
 from pipistrelle.config import (
     STRATEGIES,
-    AssociationConfig,
     Config,
     ListeningConfig,
     ScenarioConfig,
@@ -47,14 +46,14 @@ def compile_kernels(
 ) -> None:
     """Compile the kernels of estimators, or load them from the cache, by running tiny missions.
 
-    `timings` are values of ``listening.timing``, `associations` of ``association.method``.
+    `timings` are values of ``listening.excess_paths``, `associations` of ``association.method``.
     Estimators outside the catalogue are skipped.
     """
     there = [name for name in filters if name in CATALOGUE]
     tiny = ScenarioConfig(steps=8, landmarks=4, radius=10.0)
     for timing, method in product(timings, associations):
-        listening, association = ListeningConfig(timing=timing), AssociationConfig(method=method)
-        config = Config(scenario=tiny, listening=listening, association=association)
+        about = {"listening": {"excess_paths": timing}, "association": {"method": method}}
+        config = Config.model_validate({"scenario": tiny, **about})
         run_mission(config, STRATEGIES, there)
 
 
@@ -62,7 +61,7 @@ def compile_all() -> None:
     """Compile or load the kernels of all estimators, with and without known labels."""
     compile_kernels(associations=(KNOWN, *METHODS))
     for timing in (False, True):
-        compile_filters(Config(listening=ListeningConfig(timing=timing)), CATALOGUE)
+        compile_filters(Config(listening=ListeningConfig(excess_paths=timing)), CATALOGUE)
 
 
 @contextmanager
@@ -118,7 +117,7 @@ def compile_filters(config: Config, filters: Iterable[str]) -> None:
     for own, names in each_its_own(config, [name for name in filters if name in CATALOGUE]):
         drive = drive_of(checked_scenario(own), own)
         scans = [
-            _true_scan(drive, each * k, int(k > _HEARD), timing=own.listening.timing)
+            _true_scan(drive, each * k, int(k > _HEARD), timing=own.listening.excess_paths)
             for k in range(1, _FRAMES + 1)
         ]
         for name in names:

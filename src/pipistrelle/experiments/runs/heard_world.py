@@ -89,7 +89,7 @@ def scans_of(
         without_hidden(
             frame.rows if known else _unlabelled(frame),
             config.filter,
-            timing=config.listening.timing,
+            timing=config.listening.excess_paths,
             known=known,
         )
         for frame in heard

@@ -5,6 +5,7 @@ sums and options (`log_entry`), but no belief of every frame.
 """
 
 import math
+import warnings
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import replace
 from hashlib import file_digest
@@ -231,7 +232,7 @@ def without_unused(scan: Scan, config: Config) -> Scan:
     """Remove from a recorded scan the labels, noise and excess paths that the settings exclude."""
     known = config.association.method == KNOWN
     rows = scan if known or scan.direct.size else without_labels(scan, scan.callers)
-    timing = config.listening.timing
+    timing = config.listening.excess_paths
     return without_hidden(rows, config.filter, timing=timing, known=known)
 
 
@@ -296,7 +297,8 @@ def rerun(
 
     for run in summary.runs:
         trust(f"{folder / SUMMARY}: runs.filter", run.filter, CATALOGUE, "filter", "filters")
-    config = resolve(from_file(folder / "config.toml"))
+    with warnings.catch_warnings(action="ignore", category=FutureWarning):
+        config = resolve(from_file(folder / "config.toml"))  # old names need no change there
     place, method = f"{folder / 'config.toml'}: association.method", config.association.method
     trust(place, method, (KNOWN, *METHODS), "association.method", "association")
     strategies = list(dict.fromkeys(run.strategy for run in summary.runs))

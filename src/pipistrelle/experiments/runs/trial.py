@@ -185,7 +185,7 @@ def run_trial(
     strategy, name, heard, estimator = case.strategy, case.filter, tuple(scans), entry(case.filter)
     stated = (max(scan.landmark.max(initial=0), scan.callers.max(initial=0)) for scan in scans)
     association = association or association_of(config, int(max(stated, default=0)))
-    follows = estimator.follows and config.listening.timing
+    follows = estimator.follows and config.listening.excess_paths
     scans = with_moving(scans, drive, follows=follows, known=association is None)
 
     used: list[Scan] = []

@@ -30,13 +30,13 @@ def check_filters(
     `moving`: names of the moving callers.
     """
     check_distinct(filters)
-    known = association_of(config) is None or not config.listening.timing
+    known = association_of(config) is None or not config.listening.excess_paths
     roving, asked = "" if known else ", ".join(moving), ", ".join(config.filter.calibrate)
     for name in filters:
         if roving and not entry(name).follows:
             able = ", ".join(one.name for one in CATALOGUE.values() if one.follows)
             why = f"found callers that move ({roving}) with the filter {name}, which follows none"
-            fix = f"take {able}, or add --listening.timing false"
+            fix = f"take {able}, or add --listening.excess-paths false"
             raise InputError(f"association.method: {why}; {fix}")
         if name in CATALOGUE and asked and not CATALOGUE[name].calibrates:
             able = ", ".join(one.name for one in CATALOGUE.values() if one.calibrates)
@@ -191,15 +191,16 @@ def _of_the_other_medium(config: Config) -> list[str]:
 
 def _left_from_air(config: Config) -> list[str]:
     """Return warnings about call duration and microphone spacing in water that suit only air."""
-    pulse, spacing, c = config.emitter.pulse, config.receiver.spacing, config.medium.sound_speed
+    pulse, c = config.emitter.call_duration, config.medium.sound_speed
     nearest, deaf = config.rays.range_bounds[0], 0.5 * c * pulse
     wave, warnings = c / config.emitter.centre, []
     if deaf > nearest:
         warnings.append(
-            f"emitter.pulse: nothing nearer than {deaf:.2g} m is heard, for a call of {pulse:g} s "
-            f"is that long in water; rays.range_bounds begin at {nearest:g} m: expected a shorter "
-            "call, or a greater range"
+            f"emitter.call_duration: a call of {pulse:g} s in water hides echoes from less than "
+            f"{deaf:.2g} m; rays.range_bounds begin at {nearest:g} m: expected a shorter call, or "
+            "a greater range"
         )
+    spacing = config.receiver.spacing
     if config.receiver.array == SQUARE and spacing < CLOSEST * wave:
         warnings.append(
             f"receiver.spacing: {spacing:g} m is {spacing / wave:.2f} of a wave in water at "

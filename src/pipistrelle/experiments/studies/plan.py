@@ -9,7 +9,7 @@ the piston with that beamwidth, so both forms describe the same study.
 
 import json
 import re
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
 from decimal import ROUND_FLOOR, Context
@@ -27,7 +27,7 @@ from pydantic_core import PydanticCustomError
 from pipistrelle.acoustics.call import with_calls
 from pipistrelle.arrays.layout import with_array
 from pipistrelle.config import STRATEGIES, Config, InputError, Section, Strategy
-from pipistrelle.estimation.catalogue import CATALOGUE, PAPERS, SECTIONS, check_distinct, check_name
+from pipistrelle.estimation.catalogue import CATALOGUE, PAPERS, check_distinct, check_name
 from pipistrelle.experiments.hearing.caller_paths import with_routes
 from pipistrelle.experiments.hearing.scenario import ALL_DRAWN, World
 from pipistrelle.experiments.hearing.world_folder import (
@@ -39,13 +39,14 @@ from pipistrelle.experiments.hearing.world_folder import (
 from pipistrelle.experiments.named_settings import (
     PLANS,
     Case,
+    check_own,
     laid,
     over_named,
     parted,
     with_settings,
 )
 from pipistrelle.files import check_ordinary, text_of
-from pipistrelle.refusals import meant, refusal, shown, table_refusal
+from pipistrelle.refusals import refusal, shown, table_refusal
 from pipistrelle.settings import (
     ARRAY_KEY,
     CALLERS,
@@ -58,10 +59,12 @@ from pipistrelle.settings import (
     Layer,
     derived,
     from_flags,
+    from_table,
     known_settings,
     leaves,
     read_toml,
     resolve,
+    spread,
     with_places,
 )
 
@@ -140,13 +143,7 @@ def _dotted(values: Mapping[str, Any], prefix: str) -> Layer:
 
 
 def common(plan: Plan, values: Mapping[str, Any]) -> Config:
-    """Return a plan's common settings for given values of its varied settings.
-
-    >>> ways = {"strategies": ("fused",), "filters": ("ekf",), "config": Config()}
-    >>> plan = Plan(name="one", iterations=1, grid={"filter.gate": (0.9,)}, **ways)
-    >>> common(plan, {"filter.gate": 0.9}).filter.gate
-    0.9
-    """
+    """Return a plan's common settings for given values of its varied settings."""
     settled = from_flags(plan.config.model_dump(mode="json"))
     grid = {name: (one,) for name, one in values.items()}
     ((_, config),) = combinations(settled, grid, "grid.", plan.worlds)
@@ -323,18 +320,25 @@ def plan_of(
     layer = _laid(path, tables["config"], over, worlds)
     radii = with_radii(f"{path}: grid", tables["grid"], file.strategies, layer)
     asked = [
-        (key, name, _read(path, key, values, worlds))
-        for key, name, values in _settings(path, "grid", radii)
+        (key, ".".join(key), _read(path, key, given.value, worlds))
+        for key, given in from_table(spread(radii, "."), f"{path}: ", "grid.", (BEAMWIDTH,)).items()
     ]
     varied = {key for key, _, _ in asked}
     named = {k: given for k, given in named.items() if not {k, k[2:]} & varied}
-    layer, own = parted(laid(named, layer))
+    own_layer = from_table({"own": tables["own"]}, f"{path}: ")
+    if others := [key[1] for key in own_layer if key[1] not in file.filters]:
+        expected = f"expected one of {', '.join(file.filters)}"
+        raise InputError(f"{path}: own.{others[0]}: no filter of this plan; {expected}")
+    check_own(own_layer)
+    layer, own = parted(laid(named, layer, own_layer))
     lengths = [len(values) for _, _, values in asked if isinstance(values, list)]
     most = prod(lengths) * len(file.strategies) * len(file.filters)
     if most > MOST_CASES:
         raise InputError(f"{path}: grid: found {most} cases, expected at most {MOST_CASES}")
     grid = {name: _values(path, name, key, values, layer) for key, name, values in asked}
     _check_unvaried(path, layer, grid, over, BEAMWIDTH in tables["grid"])
+    if twice := [one.where for key, one in own_layer.items() if ".".join(key[2:]) in grid]:
+        raise InputError(f"{twice[0]}: the plan varies this setting; take it out")
     own = {name: own[name] for name in file.filters if name in own}
     plan = Plan(
         name=file.name,
@@ -344,11 +348,12 @@ def plan_of(
         filters=file.filters,
         config=resolve(layer),
         grid=grid,
-        own=_own(path, tables["own"], own, file.filters, grid, layer, worlds),
+        own=_own_values(own, layer),
         worlds=worlds,
     )
-    for _ in combinations(layer, grid, f"{path}: grid.", worlds):
-        pass
+    for given in ({}, *own.values()):
+        for _ in combinations(layer | given, grid, f"{path}: grid.", worlds):
+            pass
     return plan
 
 
@@ -375,10 +380,7 @@ def _beneath(path: Path, table: Mapping[str, Any], over: Layer) -> tuple[Layer, 
 
 def _laid(path: Path, table: Mapping[str, Any], over: Layer, worlds: dict[str, World]) -> Layer:
     """Merge the settings of a world, a plan and the caller (`over`), in rising priority."""
-    layer: Layer = {
-        key: Given(value, f"{path}: config.{name}")
-        for key, name, value in _settings(path, "config", table)
-    }
+    layer = from_table(spread(table, "."), f"{path}: ", "config.")
     layer = with_array(with_calls(with_routes(with_places(path, layer) | over)))
     world = named_world(layer)
     if world is None:
@@ -412,40 +414,13 @@ def _worlds(path: Path, folders: Any, worlds: dict[str, World]) -> Any:
     return names
 
 
-def _own(
-    path: Path,
-    tables: Mapping[str, Mapping[str, Any]],
-    named: Mapping[str, Layer],
-    filters: Sequence[str],
-    grid: Mapping[str, Any],
-    layer: Layer,
-    worlds: Mapping[str, World],
-) -> dict[str, dict[str, Any]]:
-    """Merge filter-specific settings; raise if they would change the simulated measurements.
-
-    `tables` are the plan's; `named` are the preset's, with lower priority.
-    """
-    own: dict[str, dict[str, Any]] = {}
-    for name in dict.fromkeys((*tables, *named)):
-        where = f"{path}: own.{name}"
-        if name not in filters:
-            raise InputError(f"{where}: no filter of this plan; {_meant(name, filters)}")
-        given = dict(named.get(name, {}))
-        for key, setting, value in _settings(path, f"own.{name}", tables.get(name, {})):
-            if key[0] not in SECTIONS:
-                sections = ", ".join(SECTIONS)
-                why = f"this setting changes what is heard; expected one of the sections {sections}"
-                raise InputError(f"{where}.{setting}: {why}")
-            if setting in grid:
-                raise InputError(f"{where}.{setting}: the plan varies this setting; take it out")
-            given[key] = Given(value, f"{where}.{setting}")
-        if not given:
-            continue
-        for _ in combinations(layer | given, grid, f"{path}: grid.", worlds):
-            pass
+def _own_values(own: Mapping[str, Layer], layer: Layer) -> dict[str, dict[str, Any]]:
+    """Return filter-specific settings, valid with the common ones, by filter and dotted name."""
+    values = {}
+    for name, given in own.items():
         settled: Any = resolve(layer | given).model_dump(mode="json")
-        own[name] = {".".join(key): settled[key[0]][key[1]] for key in given}
-    return own
+        values[name] = {".".join(key): settled[key[0]][key[1]] for key in given}
+    return values
 
 
 def plan_text(plan: Plan) -> str:
@@ -525,20 +500,6 @@ def _plan_file(path: Path, table: Mapping[str, Any], iterations: int | None) -> 
     return file
 
 
-def _settings(
-    path: Path, table: str, settings: Mapping[str, Any]
-) -> Iterator[tuple[Key, str, Any]]:
-    """Yield key, dotted name and value of each setting in a table; raise for unknown names."""
-    keys_by_name = {".".join(key): key for key in known_settings()}
-    for key, value in leaves(settings, (CALLERS,)):
-        name = ".".join(key)
-        if name in keys_by_name:
-            yield keys_by_name[name], name, value
-        elif value != {} or not any(other.startswith(f"{name}.") for other in keys_by_name):
-            names = [*keys_by_name, BEAMWIDTH] if table == "grid" else keys_by_name
-            raise InputError(f"{path}: {table}.{name}: no such setting; {_meant(name, names)}")
-
-
 def _values(path: Path, name: str, key: Key, values: Any, layer: Layer) -> tuple[Any, ...]:
     """Validate and return the values that a plan's grid lists for a setting."""
     where = f"{path}: grid.{name}"
@@ -561,17 +522,7 @@ def _values(path: Path, name: str, key: Key, values: Any, layer: Layer) -> tuple
 
 def _check_distinct(where: str, values: Sequence[Any]) -> None:
     """Raise if a list contains the same value twice."""
-    seen = set()
-    for value in values:
-        before = len(seen)
-        seen.add(json.dumps(value) if isinstance(value, list) else value)
-        if len(seen) == before:
+    seen = [json.dumps(value) if isinstance(value, list) else value for value in values]
+    for i, value in enumerate(values):
+        if seen[i] in seen[:i]:
             raise InputError(f"{where}: found {shown(value)} twice, expected each value once")
-
-
-def _meant(name: str, names: Iterable[str]) -> str:
-    """Return a hint for an unknown name: the most similar name, else the allowed names."""
-    names = list(names)
-    near = meant(name, names)
-    listed = ", ".join(names) if len(names) < 10 else "those of `pipistrelle config show`"
-    return f"did you mean {near}?" if near else f"expected one of {listed}"

@@ -11,6 +11,7 @@ Its folder has the plan, and per world and table a file that is complete or miss
 import os
 import signal
 import threading
+import warnings
 from collections import Counter, deque
 from collections.abc import Callable, Generator, Iterator, Sequence
 from concurrent.futures import (
@@ -89,7 +90,7 @@ def open_store(folder: Path, plan: Plan) -> None:
         folder.mkdir(parents=True, exist_ok=True)
         # Listed before the plan is read, as other processes that start now write their plan first.
         seen = list(folder.iterdir())
-        there = read_plan(kept) if kept.exists() else None
+        there = _kept_plan(folder) if kept.exists() else None
         left = [path for path in seen if whole_name(path.name) in _FILES]
         kept_first = [folder / "worlds"]  # a plan needs its worlds first
         strange = [path.name for path in seen if path not in [*left, *kept_first]]
@@ -161,7 +162,7 @@ def load_study(folder: Path) -> StoredStudy:
 
     if not (folder / "plan.toml").is_file():
         raise wrong_kind(folder, "the folder of a study", "plan.toml")
-    plan = read_plan(folder / "plan.toml")
+    plan = _kept_plan(folder)
     worlds = sorted(done_worlds(folder))
     # The files contain their columns, also if an external estimator is not installed.
     frames = {
@@ -180,6 +181,12 @@ def load_study(folder: Path) -> StoredStudy:
     none = [pl.lit(None, pl.Float64).alias(n) for n in OF_ASSOCIATION if n not in there]
     frames["trials"] = frames["trials"].with_columns(none)
     return StoredStudy(plan=plan, **frames)
+
+
+def _kept_plan(folder: Path) -> Plan:
+    """Read the plan of a study's folder; old names of settings in it need no change."""
+    with warnings.catch_warnings(action="ignore", category=FutureWarning):
+        return read_plan(folder / "plan.toml")
 
 
 def load_finished(folder: Path) -> StoredStudy:
@@ -250,7 +257,8 @@ def run_study(
     show = progress or (lambda _: None)
     show(so_far)
     place, here = folder.absolute(), Path.cwd()
-    task, give_up = partial(_work, place, plan, here), partial(_give_up, place, plan)
+    task = partial(_work, place, plan, here)
+    give_up = partial(_kept, place, plan, records=failed_records(plan, KILLED))
     found: Results
     if executor is not None:
         found = (future.result() for _, future in ended(executor, task, waiting, AHEAD))
@@ -340,11 +348,6 @@ def _work(folder: Path, plan: Plan, here: Path, iteration: int) -> list[Outcome]
     if not CATALOGUE.keys() >= set(plan.filters):
         look_in(here)
     return _kept(folder, plan, iteration, run_world(plan, iteration))
-
-
-def _give_up(folder: Path, plan: Plan, iteration: int) -> list[Outcome]:
-    """Record all trials of a world as failed because its process died."""
-    return _kept(folder, plan, iteration, failed_records(plan, KILLED))
 
 
 def _kept(

@@ -50,7 +50,7 @@ from pipistrelle.files import (
     whole_name,
     write_down,
 )
-from pipistrelle.settings import RADIUS_KEY
+from pipistrelle.settings import RADIUS_KEY, RENAMED
 
 if TYPE_CHECKING:
     import polars as pl
@@ -401,15 +401,21 @@ def sweep(folder: Path, iterations: Iterable[int]) -> None:
 
 
 def _plan_sum(plan: Plan) -> str:
-    """Return the SHA-256 of a plan's settings that affect its worlds, without default values."""
+    """Return the SHA-256 of a plan's settings that affect its worlds, without default values.
+
+    Settings have their first names (`RENAMED`), so that the sums of older studies remain valid.
+    """
+    names = {new: old for old, new in RENAMED.items()}
+    names |= {new.split(".")[1]: old.split(".")[1] for old, new in RENAMED.items()}
     config = plan.config.model_dump(mode="json", exclude_defaults=True)
     medium = config.pop(plan.config.scenario.medium, {})
     medium["speed_of_sound"] = plan.config.medium.sound_speed  # also if it is derived
     grid = {name: list(values) for name, values in plan.grid.items()}
     own = {name: dict(settings) for name, settings in plan.own.items()}
     parts = [plan.strategies, plan.filters, config, medium, grid, *([own] if own else [])]
-    text = json.dumps(parts, sort_keys=True)
-    return sha256(text.encode()).hexdigest()
+    hook = lambda pairs: {names.get(name, name): value for name, value in pairs}  # noqa: E731
+    parts = json.loads(json.dumps(parts), object_pairs_hook=hook)
+    return sha256(json.dumps(parts, sort_keys=True).encode()).hexdigest()
 
 
 def read_outcomes(folder: Path, plan: Plan, iteration: int) -> list[Outcome]:
@@ -482,9 +488,11 @@ def scan_tables(folder: Path, table: str, worlds: Sequence[int]) -> "pl.LazyFram
         check_ordinary(path)
     try:
         os.fspath(folder.absolute()).encode()
+        frame = pl.scan_parquet(paths, glob=False)
     except UnicodeEncodeError:  # Polars needs paths that are valid text
-        return pl.scan_parquet([read_file(path) for path in paths])
-    return pl.scan_parquet(paths, glob=False)
+        frame = pl.scan_parquet([read_file(path) for path in paths])
+    # Studies of older versions have columns with the old names of settings.
+    return frame.rename(RENAMED, strict=False)
 
 
 def unusable(folder: Path, error: OSError) -> InputError:
