@@ -9,6 +9,7 @@ the piston with that beamwidth, so both forms describe the same study.
 
 import json
 import re
+import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
@@ -296,6 +297,12 @@ def read_plan(path: Path, over: Layer | None = None, iterations: int | None = No
     (115, 50)
     """
     return plan_of(read_toml(path), path, over, iterations)
+
+
+def kept_plan(folder: Path) -> Plan:
+    """Read the plan of a study's folder; old names of settings in it need no change."""
+    with warnings.catch_warnings(action="ignore", category=FutureWarning):
+        return read_plan(folder / "plan.toml")
 
 
 def plan_of(

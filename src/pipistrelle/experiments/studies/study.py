@@ -11,7 +11,6 @@ Its folder has the plan, and per world and table a file that is complete or miss
 import os
 import signal
 import threading
-import warnings
 from collections import Counter, deque
 from collections.abc import Callable, Generator, Iterator, Sequence
 from concurrent.futures import (
@@ -43,8 +42,8 @@ from pipistrelle.experiments.studies.plan import (
     PlannedCase,
     cases_of,
     changed_settings,
+    kept_plan,
     plan_text,
-    read_plan,
 )
 from pipistrelle.experiments.studies.world import (
     TABLES,
@@ -90,7 +89,7 @@ def open_store(folder: Path, plan: Plan) -> None:
         folder.mkdir(parents=True, exist_ok=True)
         # Listed before the plan is read, as other processes that start now write their plan first.
         seen = list(folder.iterdir())
-        there = _kept_plan(folder) if kept.exists() else None
+        there = kept_plan(folder) if kept.exists() else None
         left = [path for path in seen if whole_name(path.name) in _FILES]
         kept_first = [folder / "worlds"]  # a plan needs its worlds first
         strange = [path.name for path in seen if path not in [*left, *kept_first]]
@@ -162,7 +161,7 @@ def load_study(folder: Path) -> StoredStudy:
 
     if not (folder / "plan.toml").is_file():
         raise wrong_kind(folder, "the folder of a study", "plan.toml")
-    plan = _kept_plan(folder)
+    plan = kept_plan(folder)
     worlds = sorted(done_worlds(folder))
     # The files contain their columns, also if an external estimator is not installed.
     frames = {
@@ -181,12 +180,6 @@ def load_study(folder: Path) -> StoredStudy:
     none = [pl.lit(None, pl.Float64).alias(n) for n in OF_ASSOCIATION if n not in there]
     frames["trials"] = frames["trials"].with_columns(none)
     return StoredStudy(plan=plan, **frames)
-
-
-def _kept_plan(folder: Path) -> Plan:
-    """Read the plan of a study's folder; old names of settings in it need no change."""
-    with warnings.catch_warnings(action="ignore", category=FutureWarning):
-        return read_plan(folder / "plan.toml")
 
 
 def load_finished(folder: Path) -> StoredStudy:

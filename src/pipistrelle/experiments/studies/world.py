@@ -40,7 +40,7 @@ from pipistrelle.experiments.results.writing import calibration_of
 from pipistrelle.experiments.runs.heard_world import HeardWorld, drive_of
 from pipistrelle.experiments.runs.trial import run_trial
 from pipistrelle.experiments.runs.validate import failure_text, first_belief
-from pipistrelle.experiments.studies.plan import Plan, PlannedCase, cases_of, read_plan
+from pipistrelle.experiments.studies.plan import Plan, PlannedCase, cases_of, kept_plan
 from pipistrelle.files import (
     check_ordinary,
     held,
@@ -318,7 +318,7 @@ def write_world(folder: Path, plan: Plan, iteration: int, records: Sequence[Tria
     files = with_sums(world_tables(plan, iteration, records), plan, iteration)
     try:
         with held(folder) as place:
-            if _plan_sum(read_plan(place / "plan.toml")) != _plan_sum(plan):
+            if _plan_sum(kept_plan(place)) != _plan_sum(plan):
                 raise InputError(
                     f"{folder}: found the folder of another study, which took the place of this "
                     "one meanwhile; nothing in it is replaced; move it away and run the study again"
