@@ -50,5 +50,5 @@ def test_values_are_counted_where_their_number_is_the_fault_and_only_there():
 def test_a_suggestion_has_similar_spelling_or_the_same_ending():
     known = ["rays.exponent", "rays.prune_threshold", "air.pressure_kpa"]
     assert meant("rays.powr", known) == "rays.exponent"
-    assert meant("scenario.association.prune", known) == "rays.prune_threshold"
+    assert meant("scenario.association.prune_threshold", known) == "rays.prune_threshold"
     assert meant("zzz", known) is None
