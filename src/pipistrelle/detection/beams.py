@@ -45,6 +45,17 @@ the second of a sweep, with its delay error by an unknown Doppler shift: the ech
 direction, to a vehicle at the speed v of the settings, and the mean square cosine of a direction is
 a half. No delay is corrected for it.
 
+**Beginning of a sweep.** An echo soon after a caller's direct call displaces its peak, or is itself
+the peak. So two calls are fitted to the beam's output z about the peak, by greatest likelihood:
+
+.. math:: \ln p(\tau_1, \tau_2) = y^H G^{-1} y + \text{const}, \quad
+          y = (z(\tau_1), z(\tau_2))^T, \quad
+          G = \begin{bmatrix} 1 & r(\tau_1 - \tau_2) \\ r(\tau_2 - \tau_1) & 1 \end{bmatrix} ,
+
+with the call's autocorrelation r, which is both the shape of an arrival and the covariance of the
+noise. Where two explain more than one by the threshold of a detection, the direct call begins at
+:math:`\tau_1`, with the variance of this likelihood's curvature at its best :math:`\tau_2`.
+
 **Ambiguous bearings.** If other lobes of the scan are nearly as loud as the loudest, as the mirror
 image for a line of microphones, or for spacings above half a wave, the call may have come from
 there. With a flat prior the odds are the likelihood ratios, and the stated variance is
@@ -111,6 +122,8 @@ CLIMBS = 4
 """Steps of the climb to the top of a lobe, each by a parabola, a quarter as wide as the last."""
 DIVISIONS = 8
 """Divisions of a lag in the search for the start of a tone."""
+PAIR_STEP = 0.2
+"""Step of the search for two calls that overlap, in the inverse of the band's spread [rad]."""
 FINEST = 1e-4
 """Smallest step of the search, in lags."""
 RARE = 20.0
@@ -192,6 +205,8 @@ class Wide(NamedTuple):
     """Largest share of its power that a call leaves at each distance from its peak, in lags."""
     cut_lobes: Float[np.ndarray, "s l"]
     """The `lobes` of calls only partly in the record, a row for each missing share."""
+    alike: Complex[np.ndarray, " a"]
+    """Autocorrelation of a sweep, from 0 to 2 pi in steps of `PAIR_STEP`; empty for a tone."""
 
 
 def wide_of(config: Config, layout: Layout | Scattered, group: int, call: Call, step: int) -> Wide:
@@ -231,9 +246,12 @@ def wide_of(config: Config, layout: Layout | Scattered, group: int, call: Call, 
         **_sectors_of(call, beams, carrier, interval, rate),
         lobes=np.append(np.ones(pulse // 2 + round(2.0 * _lead(beams, interval)) + 1), 0.0),
         cut_lobes=np.ones((1, 1)),
+        alike=np.empty(0, dtype=np.complex128),
     )
     if tone:
         return wide
+    apart = np.arange(0.0, 2.0 * math.pi, PAIR_STEP) / band.spread
+    wide = wide._replace(alike=_alike(call, rate, carrier, apart))
     lobes, cut = _lobes_of(call, wide, step, rate), _cut_lobes_of(call, wide, step, rate)
     return wide._replace(lobes=lobes, cut_lobes=cut)
 
@@ -244,23 +262,30 @@ def _leads(beams: Beams, bearing: Float[np.ndarray, " n"]) -> Float[np.ndarray, 
     return toward @ beams.position.T / beams.speed_of_sound
 
 
+def _alike(
+    call: Call, rate: float, carrier: float, delay: Float[np.ndarray, " t"]
+) -> Complex[np.ndarray, " t"]:
+    """Return the autocorrelation of a call's envelope at given delays [s], 1 at 0."""
+    band, sent = band_of(call, rate), replica(call, rate)
+    frequency = np.arange(2 * sent.size) * rate / (2 * sent.size)
+    inside = (frequency >= band.low) & (frequency <= band.high)
+    power = np.abs(np.fft.fft(sent, frequency.size)[inside]) ** 2
+    turn = 2.0 * np.pi * (frequency[inside] - carrier)
+    return np.exp(1j * np.outer(delay, turn)) @ (power / np.sum(power))
+
+
 def _sectors_of(
     call: Call, beams: Beams, carrier: float, interval: float, rate: float
 ) -> dict[str, Any]:
     """Divide a call's beams into sectors within which no delay differs by half a lag."""
-    band, sent = band_of(call, rate), replica(call, rate)
     early, begin = _leads(beams, beams.bearing), [0]
     for n in range(len(early)):
         if np.ptp(early[begin[-1] : n + 1], axis=0).max() > 0.5 * interval:
             begin.append(n)
     size = np.diff([*begin, len(early)])
     late = -np.rint(2.0 * np.add.reduceat(early, begin) / interval / size[:, np.newaxis])
-    frequency = np.arange(2 * sent.size) * rate / (2 * sent.size)
-    inside = (frequency >= band.low) & (frequency <= band.high)
-    power = np.abs(np.fft.fft(sent, frequency.size)[inside]) ** 2
     off = np.linspace(-2.0, 2.0, 4 * PARTS + 1)
-    turn = 2.0 * np.pi * (frequency[inside] - carrier) * interval
-    alike = np.exp(1j * np.outer(off, turn)) @ (power / np.sum(power))
+    alike = _alike(call, rate, carrier, interval * off)
     between = 0.5 * (np.interp(off - 0.5, off, alike) + np.interp(off + 0.5, off, alike))
     odd, sector = late % 2.0 != 0.0, np.repeat(np.arange(size.size), size)
     share = np.where(odd, 0.5 * (1.0 + np.interp(1.0, off, alike).real), 1.0)
@@ -303,18 +328,48 @@ def loudest_by_chance(chance: float, looks: float, microphones: int) -> float:
 def edge_around(
     matched: Complex[np.ndarray, "k l"], wide: Wide, b: int, bearing: float
 ) -> tuple[float, float]:
-    """Return start and std of a tone [lags] in the beam to a detection's bearing (`front_edge`)."""
-    pulse, more = wide.call.pulse, wide.margin + TAPS
-    low, bearing = max(b - 3 * pulse, 0), bearing - wide.normal
-    beam = np.empty(min(b + pulse, matched.shape[1]) - low, dtype=np.complex128)
-    sound = np.empty((len(matched), beam.size + 2 * more), dtype=np.complex64)
+    """Return start and std of a direct call [lags] in the beam to its bearing; NaN if not found.
+
+    Of a tone by `front_edge`; of a sweep by two calls, if they fit better than one.
+    """
+    pulse, more, bearing = wide.call.pulse, wide.margin + TAPS, bearing - wide.normal
+    step, reach = 1.0, 3 * pulse
+    if not wide.call.tone:
+        step = PAIR_STEP / (wide.band.spread * wide.call.interval)
+        reach = math.ceil(step * wide.alike.size)
+    low, last = max(b - reach, 0), matched.shape[1] - 1
+    high = min(b + (pulse - 1 if wide.call.tone else reach), last)
+    sound = np.empty((len(matched), high - low + 1 + 2 * more), dtype=np.complex64)
     _cut_out(np.ascontiguousarray(matched, dtype=np.complex64), low - more, sound)
+    beam = np.empty(int((high - low) / step) + 1, dtype=np.complex128)
     for k in range(beam.size):
-        z, _, noise = _output(sound, float(more + k), bearing, wide.beams, wide.call)
+        z, _, noise = _output(sound, more + k * step, bearing, wide.beams, wide.call)
         beam[k] = z / math.sqrt(noise)
+    if not wide.call.tone:
+        first, std = _first_of_two(beam, wide.alike, wide.threshold)
+        return low + step * first, math.hypot(step * std, wide.doppler_std / wide.call.interval)
     alone = beam[:, np.newaxis, np.newaxis, np.newaxis]
     lag, std = front_edge(alone, b - low, 0, 0, pulse, MIN_EDGE_ENERGY_OF_BEAM)
     return low + lag, std
+
+
+@kernel
+def _first_of_two(
+    beam: Complex[np.ndarray, " n"], alike: Complex[np.ndarray, " a"], threshold: float
+) -> tuple[float, float]:
+    """Return place and std of the first of two calls in a beam, in its steps; NaN if one fits."""
+    fit, single, best = np.zeros(beam.size), 0.0, 0
+    for i in range(beam.size):
+        single = max(single, abs(beam[i]) ** 2)
+        for j in range(i + 1, min(i + alike.size, beam.size)):
+            common = (beam[i].conjugate() * alike[j - i].conjugate() * beam[j]).real
+            both = abs(beam[i]) ** 2 + abs(beam[j]) ** 2 - 2.0 * common
+            fit[i] = max(fit[i], both / (1.0 - abs(alike[j - i]) ** 2))
+        best = i if fit[i] > fit[best] else best
+    if fit[best] < single + threshold or not 0 < best < beam.size - 2:
+        return math.nan, math.nan
+    before, here, after = fit[best - 1], fit[best], fit[best + 1]
+    return best + _moved(before, here, after), 1.0 / math.sqrt(2.0 * here - before - after)
 
 
 def find_wide(

@@ -568,8 +568,6 @@ def _direct_of(
         if b >= len(matched):
             return math.nan, math.nan
         if isinstance(finder.detector, Wide):
-            if not finder.detector.call.tone:
-                return math.nan, math.nan
             outputs = _of_call(matched, finder)
             return edge_around(outputs, finder.detector, b, float(found.bearing[d]))
         number = int(np.searchsorted(finder.callers, p))
