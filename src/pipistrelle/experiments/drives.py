@@ -6,7 +6,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from jaxtyping import Float, Int
 
-from pipistrelle.detection.scans import NO_CALLERS
+from pipistrelle.detection.scans import NO_CALLERS, Scan
 from pipistrelle.estimation.beliefs import Gaussian, Landmarks, Track, no_landmarks
 from pipistrelle.estimation.motion import Motion, relative_motions
 from pipistrelle.geometry import path_at, points_at, wrap
@@ -90,6 +90,12 @@ def split_at(drive: Drive, times: Sequence[float]) -> tuple[Drive, Int[np.ndarra
     parts = np.column_stack((moved, spread[:, rows, columns]))
     split = replace(drive, motion=motion, time=fine, controls=parts, truth=truth)
     return split, np.searchsorted(fine, time)
+
+
+def at_step_ends(drive: Drive, scans: Sequence[Scan]) -> tuple[Scan, ...]:
+    """Date each scan at the end of its control step."""
+    ends = drive.time[np.searchsorted(drive.time, [scan.time for scan in scans])].tolist()
+    return tuple(replace(scan, time=end) for scan, end in zip(scans, ends, strict=True))
 
 
 def at_sensor(drive: Drive) -> Drive:

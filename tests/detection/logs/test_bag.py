@@ -148,7 +148,7 @@ def test_detections_are_travel_times_by_angles_to_starboard(tmp_path, definition
     assert row.bearing[0] == pytest.approx(-0.3, abs=1e-6)
     assert row.range[0] == pytest.approx(7.5, rel=1e-6)
     assert row.bearing_std[0] == pytest.approx(0.12 / math.sqrt(12.0), rel=1e-6)
-    assert row.time == pytest.approx(0.3)  # sent at 0.25 s, in the step that ends at 0.3 s
+    assert row.time == pytest.approx(0.25)
     assert log.ignored_rows == {"flagged": 1, "nothing_heard": 1}
     assert any("starboard" in note for note in log.notes)
     assert any("delays, up to 0.05 s" in note for note in log.notes)

@@ -114,21 +114,20 @@ def test_rows_of_one_time_are_one_scan_and_an_empty_range_is_passive(folder):
     assert first.bearing.tolist() == [0.5, -0.5]
     assert first.range[0] == 4.0
     assert np.isnan(first.range[1])
-    assert (first.time, second.time) == (0.1, 0.3)
+    assert (first.time, second.time) == (0.1, 0.25)
     assert first.landmark.dtype.kind == "i"
 
 
-def test_a_measurement_is_used_at_the_end_of_the_step_that_holds_it(tmp_path):
+def test_scans_keep_their_times_inside_steps(tmp_path):
     after = np.nextafter(0.1, 1.0).item()
-    rows = ["0.0,1,0,1", "1e-300,2,0,1", "0.1,3,0,1", f"{after!r},4,0,1", "0.3,5,0,1", "0.4,6,0,1"]
-    scans = read_log(recorded(tmp_path, measurements=measured(*rows))).scans
-    used = {int(scan.landmark[0]): scan.time for scan in scans}
-    assert used == {1: 0.0, 2: 0.1, 3: 0.1, 4: 0.3, 5: 0.3, 6: 0.4}
+    times = [0.0, 1e-300, 0.1, after, 0.3, 0.4]
+    rows = measured(*(f"{time!r},{k},0,1" for k, time in enumerate(times)))
+    assert [scan.time for scan in read_log(recorded(tmp_path, measurements=rows)).scans] == times
 
 
 def test_several_times_in_one_step_are_several_scans_in_order(tmp_path):
     scans = read_log(recorded(tmp_path, measurements=measured("0.12,8,0,2", "0.2,8,0,1"))).scans
-    assert [scan.time for scan in scans] == [0.3, 0.3]
+    assert [scan.time for scan in scans] == [0.12, 0.2]
     assert [scan.range.tolist() for scan in scans] == [[2.0], [1.0]]
 
 
@@ -227,13 +226,12 @@ def test_times_and_the_ends_of_merged_steps_are_compared_to_a_microsecond(tmp_pa
     rows = measured("0.1000001,1,0,1", "0.100002,2,0,1", "0.2,3,0,1")
     log = merged(tmp_path, 0.1, odometry, rows)
     assert len(log.dt) == 3
-    used = [np.flatnonzero(log.time == scan.time).item() for scan in log.scans]
-    assert used == [1, 2, 2]
+    assert [scan.time for scan in log.scans] == [log.time[1], 0.100002, log.time[2]]
 
 
-def test_a_measurement_at_the_first_rows_time_is_used_at_the_start_of_merged_steps(tmp_path):
+def test_a_measurement_at_the_first_rows_time_is_at_the_start_of_merged_steps(tmp_path):
     log = merged(tmp_path, 0.2, measurements=measured("0.0,1,0,1", "0.01,1,0,1"))
-    assert [scan.time for scan in log.scans] == [0.0, 0.2]
+    assert [scan.time for scan in log.scans] == [0.0, 0.01]
 
 
 # What is dropped, with a count
@@ -247,16 +245,18 @@ def test_measurements_outside_the_odometry_are_dropped_and_counted(tmp_path):
     assert [scan.time for scan in log.scans] == [0.0, 1.0]
 
 
-@pytest.mark.parametrize(("late", "used"), [(0.05, [0.1, 0.1, 0.3]), (-0.05, [0.1, 0.3, 0.3])])
+@pytest.mark.parametrize(
+    ("late", "used"), [(0.05, [0.04, 0.05, 0.15]), (-0.05, [0.09, 0.15, 0.25])]
+)
 def test_a_sensors_clock_offset_is_corrected_to_the_odometrys_clock(tmp_path, late, used):
     settings = UNICYCLE.replace("range_std", f"time_offset = {late}\nrange_std", 1)
     times = (0.04 + max(late, 0.0), 0.1, 0.2)
     rows = measured(*(f"{time},{label},0,1" for label, time in enumerate(times)))
     log = read_log(recorded(tmp_path, settings, measurements=rows))
-    assert [scan.time for scan in log.scans] == used
+    assert [scan.time for scan in log.scans] == pytest.approx(used)
     write_log(tmp_path / "again", log)
     again = read_log(tmp_path / "again")
-    assert [scan.time for scan in again.scans] == used
+    assert [scan.time for scan in again.scans] == [scan.time for scan in log.scans]
 
 
 def test_of_odometry_rows_with_one_time_the_last_wins_and_the_others_are_counted(tmp_path):
@@ -485,7 +485,7 @@ def written_log(kind, folder):
         log = read_log(
             recorded(folder, measurements=measured(*(f"{t},8,0.1,{r}" for t, r in ranges)))
         )
-        assert [scan.time for scan in log.scans] == [0.0, 0.3, 0.3, 0.3, 0.4]
+        assert [scan.time for scan in log.scans] == [time for time, _ in ranges]
         return log
     rows = ("0.1,7,0.5,4.0,3.25,0.01,mate", "0.1,7,,,6.5,,boat", "0.25,8,0.1,2.0,,,")
     settings = UNICYCLE + "excess_path_std = 0.05\n" + CALLERS + "\n[[callers]]\nname = 'c'\n"
@@ -701,11 +701,12 @@ def drives(draw):
     controls = np.array(draw(st.lists(st.tuples(NUMBER, NUMBER), min_size=steps, max_size=steps)))
     scans = []
     for k in sorted(draw(st.sets(st.integers(0, steps), min_size=1))):
-        for _ in range(draw(st.integers(1, 1 if k == 0 else 3))):
+        parts = 1 if k == 0 else draw(st.integers(1, 3))
+        for at in np.linspace(time[k], time[max(k - 1, 0)], parts, endpoint=False)[::-1].tolist():
             rows = draw(st.dictionaries(LABEL, ROW, min_size=1))
             bearing, distance, *stds = np.array(list(rows.values())).T
             said = dict(zip(("range_std", "bearing_std"), stds, strict=True))
-            scans.append(scan_with(list(rows), bearing, distance, time=time[k].item(), **said))
+            scans.append(scan_with(list(rows), bearing, distance, time=at, **said))
     return replace(
         read_log(DATA / "unicycle_log"),
         time=time,

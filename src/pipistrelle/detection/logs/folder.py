@@ -228,15 +228,9 @@ def _odometry_columns(log: Log) -> dict[str, np.ndarray]:
 
 
 def _measurement_columns(log: Log) -> dict[str, np.ndarray]:
-    """Return the columns of ``measurements.csv``; scans of one step are spread evenly over it."""
-    used = np.array([scan.time for scan in log.scans])
-    index = np.searchsorted(log.time, used)
-    start = log.time[np.maximum(index - 1, 0)]
-    rank = np.arange(len(used)) - np.searchsorted(used, used)
-    count = np.searchsorted(used, used, side="right") - np.searchsorted(used, used)
-    stamp = np.where(rank + 1 == count, used, start + (used - start) * (rank + 1) / count)
+    """Return the columns of ``measurements.csv``."""
     sizes = [len(scan.landmark) for scan in log.scans]
-    column = {"time": np.repeat(stamp, sizes)}
+    column = {"time": np.repeat([scan.time for scan in log.scans], sizes)}
     required = MEASUREMENTS.columns[1:]
     for name in (*required, *STATED):
         fields = [as_logged(scan, name) for scan in log.scans]

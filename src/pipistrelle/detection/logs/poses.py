@@ -26,7 +26,7 @@ POSE = ("x", "y", "heading")
 MOTION_COVARIANCE = ("motion_xx", "motion_xy", "motion_xh", "motion_yy", "motion_yh", "motion_hh")
 """Optional columns: covariance of the motion since the row before, in the vehicle's axes there."""
 
-_RESOLUTION = 1e-6  # [s], within which a step ends with a row
+RESOLUTION = 1e-6  # [s], within which a step ends with a row
 _INDEFINITE = 1e-6  # largest negative eigenvalue, relative, by rounding of a file's numbers
 _FULL = ([0, 0, 0, 1, 1, 2], [0, 1, 2, 1, 2, 2])
 _JUMP_RATIO = 10.0  # ratio to the usual speed
@@ -117,7 +117,7 @@ def _at_rows(
     """Replace each time by the nearest row's time if the difference is at most 1e-6 s."""
     after = np.clip(np.searchsorted(rows, time), 1, len(rows) - 1)
     nearest = np.where(time - rows[after - 1] < rows[after] - time, rows[after - 1], rows[after])
-    return np.where(np.abs(nearest - time) <= _RESOLUTION, nearest, time)
+    return np.where(np.abs(nearest - time) <= RESOLUTION, nearest, time)
 
 
 def _poses_at(

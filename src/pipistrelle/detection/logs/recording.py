@@ -1,10 +1,9 @@
 """A recorded drive: rows of odometry become steps, measurements become scans.
 
 A row of odometry holds from its time to the next row's; the last row only ends the log. A row of
-poses gives the vehicle's position and heading, and a step is the motion between two (`poses`). A
-measurement is used at the end of the step (t[i-1], t[i]] that contains it, and at the start if its
-time is the first row's. Irregular rows that sound logs contain are dropped and counted. All formats
-are converted here.
+poses gives the vehicle's position and heading, and a step is the motion between two (`poses`). Rows
+of one time are a scan, perhaps inside a step. Irregular rows that sound logs contain are dropped
+and counted. All formats are converted here.
 """
 
 import math
@@ -20,7 +19,7 @@ from jaxtyping import Float, Int
 from pydantic import AfterValidator, ConfigDict, Field, ValidationInfo, field_validator
 
 from pipistrelle.config import LONGEST_STEP, NonNegative, Real, Section
-from pipistrelle.detection.logs.poses import motions_between
+from pipistrelle.detection.logs.poses import RESOLUTION, motions_between
 from pipistrelle.detection.scans import NO_CALLERS, OWN, UNLABELLED, Scan, make_scan, with_columns
 from pipistrelle.geometry import wrap
 from pipistrelle.refusals import refusal
@@ -42,7 +41,6 @@ MEASUREMENTS = Schema(
 MAX_TIME = 1e11
 """Latest time [s]: beyond the year 5000, if counted from 1970."""
 
-_RESOLUTION = 1e-6  # [s], of the boundaries of merged steps
 _MAX_STEPS = 10_000_000
 _MAX_GAP = 10.0  # [s], median gap between rows of odometry or of the truth
 _LONG_GAP = 1000.0  # ratio to the median gap: a recording that drops one row in ten, each by
@@ -214,7 +212,7 @@ def assemble(
         controls=controls,
         dt=np.diff(time),
         scans=_scans(
-            time, measured, 0.0 if step is None else _RESOLUTION, callers, bool(told.all())
+            time, measured, 0.0 if step is None else RESOLUTION, callers, bool(told.all())
         ),
         ignored_rows={reason: count for reason, count in ignored.items() if count},
         doubts=doubts,
@@ -277,7 +275,7 @@ def _step_times(odometry: Table, time: np.ndarray, step: float | None) -> np.nda
             fix = "part the log there, or merge rows into steps by `step` in log.toml"
             raise refusal(place_of(odometry, row), found, expected, fix)
         return time
-    count = max(1.0, np.ceil((time[-1] - time[0] - _RESOLUTION) / step))
+    count = max(1.0, np.ceil((time[-1] - time[0] - RESOLUTION) / step))
     if count > _MAX_STEPS:
         gap, start, end, _ = _widest_gap(time)
         found = (
@@ -370,12 +368,13 @@ def _scans(
     callers: tuple[LogCaller, ...],
     known: bool,
 ) -> tuple[Scan, ...]:
-    """Return a scan per time of the sorted measurements, dated at the end of its control step."""
+    """Return a scan per time of the sorted measurements; just before a step's end, at that end."""
     labels = np.array([UNLABELLED, *(caller.landmark for caller in callers)])
     stamp, bearing, landmark = measured["time"], measured["bearing"], measured["landmark"]
+    end = time[np.searchsorted(time, stamp - resolution)]
     said = measured | {
         "landmark": np.maximum(landmark, UNLABELLED),
-        "time": time[np.searchsorted(time, stamp - resolution)],
+        "time": np.where(end - stamp > resolution, stamp, end),
         "bearing": np.where(~(np.abs(bearing) >= np.pi), bearing, wrap(bearing)),
     }
     cuts = np.flatnonzero(np.diff(stamp)) + 1

@@ -283,10 +283,13 @@ def _bend(dx: float, dy: float, xx: float, xy: float, yy: float) -> float:
 
 
 @no_alloc
-def _expected(
-    joint: Joint, size: Whole, i: Whole, ib: Whole, w: Float[np.ndarray, " m"]
+def _innovation(
+    joint: Joint, size: Whole, i: Whole, ib: Whole, row: tuple, w: Float[np.ndarray, " m"]
 ) -> tuple[float, float]:
-    """Predict an excess path via point i from the caller at ib; return it and its variance."""
+    """Return innovation and its variance of an excess path via point i from the caller at ib.
+
+    ``row``: excess path and its variance.
+    """
     mean = joint.mean
     excess_path, lx, ly, bx, by = excess_path_slopes(
         mean[0], mean[1], mean[i], mean[i + 1], mean[ib], mean[ib + 1]
@@ -298,7 +301,8 @@ def _expected(
     for a in range(size):
         w[a] = px * p0[a] + py * p1[a] + lx * li[a] + ly * lj[a] + bx * bi[a] + by * bj[a]
     variance = px * w[0] + py * w[1] + lx * w[i] + ly * w[i + 1] + bx * w[ib] + by * w[ib + 1]
-    return excess_path, variance
+    longer, wider = _bends(joint, size, i, ib)
+    return row[0] - excess_path - longer, variance + wider + row[1]
 
 
 @no_alloc
@@ -329,18 +333,18 @@ def correct_excess_path(
     size: Whole,
     i: Whole,
     ib: Whole,
-    excess_path: float,
-    variance: float,
+    row: tuple[float, float],
     bound: float,
     loss: Whole,
 ) -> Whole:
-    """Update the state by an excess path via point i, caller at ib; return GATED or APPLIED."""
+    """Update the state by an excess path and its variance; return GATED or APPLIED.
+
+    Its landmark is the point at index i, its caller at ib.
+    """
     if joint.taken[WAITING] == MAX_WAITING:
         flush(joint, size)
     w = joint.W[joint.taken[WAITING]]
-    expected, spread = _expected(joint, size, i, ib, w)
-    longer, wider = _bends(joint, size, i, ib)
-    innovation, S = excess_path - expected - longer, spread + wider + variance
+    innovation, S = _innovation(joint, size, i, ib, row, w)
     S *= robust_loss(innovation * innovation / S, loss)[0]
     return GATED if corrected_by(joint, size, w, innovation, S, bound) == BEYOND else APPLIED
 
@@ -355,12 +359,10 @@ def correct_by_excess_path(
     """
     member, caller = single(state, paths.landmark[d]), single(state, paths.caller[d])
     joint, size, likelihood = state.joint, 3 + 2 * state.members[0], scratch.likelihood
-    excess_path, variance = paths.excess_path[d], paths.variance[d]
+    row = paths.excess_path[d], paths.variance[d]
     if member >= 0 and caller >= 0:
         i, ib = 3 + 2 * member, 3 + 2 * caller
-        return correct_excess_path(
-            joint, size, i, ib, excess_path, variance, params.passive_bound, params.loss
-        )
+        return correct_excess_path(joint, size, i, ib, row, params.passive_bound, params.loss)
     label = paths.landmark[d] if caller >= 0 else paths.caller[d]
     first, count = members_of(state.landmark, state.members[0], label)
     if (member < 0 and caller < 0) or count == 0 or state.weight[first] <= WAITING_WEIGHT:
@@ -371,10 +373,7 @@ def correct_by_excess_path(
     for j in range(count):
         ix = 3 + 2 * (first + j)
         i, ib = (ix, 3 + 2 * caller) if caller >= 0 else (3 + 2 * member, ix)
-        expected, spread = _expected(joint, size, i, ib, w)
-        longer, wider = _bends(joint, size, i, ib)
-        off, S = excess_path - expected - longer, spread + wider + variance
-        likelihood[j] = log_likelihood(off, S, False)
+        likelihood[j] = log_likelihood(*_innovation(joint, size, i, ib, row, w), False)
     weight = state.weight[first:]
     weigh_and_share(likelihood, weight, count, params.power, params.aggregated, scratch.share)
     if survivors(weight, count, params.prune, scratch.keep) < count:

@@ -38,8 +38,9 @@ from pipistrelle.estimation.beliefs import (
 from pipistrelle.estimation.catalogue import CATALOGUE, entry, short_name
 from pipistrelle.estimation.data_association.sequential import association_of
 from pipistrelle.estimation.session import Session, check_poses
+from pipistrelle.estimation.smoother.preintegration import OF_ODOMETRY
 from pipistrelle.evaluation.association import Causes, associated, matched, renamed
-from pipistrelle.experiments.drives import Drive, at_sensor, at_vehicle, split_at
+from pipistrelle.experiments.drives import Drive, at_sensor, at_step_ends, at_vehicle, split_at
 from pipistrelle.experiments.hearing.listening import Keep, Progress, listen
 from pipistrelle.experiments.hearing.scenario import ALL_DRAWN, World, standing_landmarks
 from pipistrelle.experiments.machine import check_memory
@@ -195,6 +196,8 @@ def run_trial(
         if watch:
             watch(strategy, name, scan, belief)
 
+    if name not in CATALOGUE or {*config.filter.calibrate} & {*OF_ODOMETRY}:  # need its controls
+        scans = at_step_ends(drive, scans)
     began = jit.wall_s()
     parted, steps = split_at(drive, [scan.time for scan in scans])
     parted = at_sensor(parted)
