@@ -19,7 +19,7 @@ from pipistrelle.arrays.layout import Layout, Scattered, microphones_of, scatter
 from pipistrelle.arrays.receiver import add_echo_blocks, noise_blocks
 from pipistrelle.arrays.sampling import BLOCK, blocks_to_hear, sampling
 from pipistrelle.config import Config, DetectionConfig, InputError
-from pipistrelle.detection.beams import _loudness, find_wide, wide_of
+from pipistrelle.detection.beams import _loudness, edge_around, find_wide, wide_of
 from pipistrelle.detection.direct import Lags
 from pipistrelle.detection.front_end import find_calls, front_end
 from pipistrelle.detection.matched import BandFilters
@@ -512,6 +512,22 @@ def test_two_echoes_separated_by_a_few_lags_are_two_detections(name):
     pair = sweeps([4.0e-3, 4.0e-3 + apart], [0.3, 0.3], [30.0, 29.0], settled)
     found = swept_in(pair, "circle", name)
     assert np.sort(found.delay) == pytest.approx([4.0e-3, 4.0e-3 + apart], abs=3e-6)
+
+
+@pytest.mark.parametrize("name", ["linear", "hyperbolic", "narrow"])
+@pytest.mark.parametrize("louder", [-6.0, 0.0, 3.0])
+def test_an_echo_just_after_a_direct_call_does_not_shift_its_beginning(name, louder):
+    rng, off, (_, settled, _) = np.random.default_rng(7), [], setting(name)
+    wide = finder("circle", name).finders[0].detector
+    for late in np.linspace(0.6, 4.0, 40) / wide.band.spread:
+        delay = rng.uniform(4e-3, 5e-3)
+        pair = sweeps([delay, delay + late], [0.3, 0.4], [35.0, 35.0 + louder], settled)
+        matched, lags, _ = heard(pair, CIRCLE, name, rng)
+        near = round((delay + 0.5 * late - lags.start) / lags.interval)
+        lag, std = edge_around(matched[:, 0, 0].T, wide, near, 0.3)
+        off.append((lag - (delay - lags.start) / lags.interval) / std)
+    assert np.abs(off).max() < 5.0
+    assert np.sqrt(np.mean(np.square(off))) < 1.5
 
 
 def test_a_tone_and_a_sweep_are_heard_side_by_side_and_leave_little_in_each_other():

@@ -153,7 +153,10 @@ def arrivals_of_emissions(
         parts.append(_sounds_of(j, surface, callers[j], medium, strength_db))
         emissions.append(np.repeat(np.arange(len(poses)), paths.homeward.shape[1]))
         if (heading := callers[j].heading) is not None:
-            departure = _departures(j, surface, heading)
+            itself = surface.landmarks + j - 1
+            way = surface.target - surface.target[:, itself : itself + 1]
+            way[:, itself] = -surface.offset[:, itself]  # the direct call goes to the vehicle
+            departure = wrap(np.arctan2(way[..., 1], way[..., 0]) - heading[:, np.newaxis]).ravel()
             sent = in_front(departure)
             parts[-1] = arrivals_at(replace(parts[-1], departure=departure), sent)
             emissions[-1] = emissions[-1][sent]
@@ -283,16 +286,6 @@ def _sounds_of(
         caller=np.full(path.size, j, dtype=np.int8),
         landmark=np.tile(np.arange(1, targets + 1), emissions),
     )
-
-
-def _departures(
-    j: int, paths: SoundPaths, heading: Float[np.ndarray, " k"]
-) -> Float[np.ndarray, " a"]:
-    """Return departure angles of another vehicle's sound to each target, off its heading [rad]."""
-    itself = paths.landmarks + j - 1
-    way = paths.target - paths.target[:, itself : itself + 1]
-    way[:, itself] = -paths.offset[:, itself]  # the direct call goes to the vehicle
-    return wrap(np.arctan2(way[..., 1], way[..., 0]) - heading[:, np.newaxis]).ravel()
 
 
 def through_pistons(

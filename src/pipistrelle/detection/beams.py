@@ -54,7 +54,7 @@ the peak. So two calls are fitted to the beam's output z about the peak, by grea
 
 with the call's autocorrelation r, which is both the shape of an arrival and the covariance of the
 noise. Where two explain more than one by the threshold of a detection, the direct call begins at
-:math:`\tau_1`, with the variance of this likelihood's curvature at its best :math:`\tau_2`.
+:math:`\tau_1`, with the variance by this likelihood's curvature and that of the search grid.
 
 **Ambiguous bearings.** If other lobes of the scan are nearly as loud as the loudest, as the mirror
 image for a line of microphones, or for spacings above half a wave, the call may have come from
@@ -369,7 +369,8 @@ def _first_of_two(
     if fit[best] < single + threshold or not 0 < best < beam.size - 2:
         return math.nan, math.nan
     before, here, after = fit[best - 1], fit[best], fit[best + 1]
-    return best + _moved(before, here, after), 1.0 / math.sqrt(2.0 * here - before - after)
+    variance = 1.0 / (2.0 * here - before - after) + 1.0 / 12.0  # the second is between two steps
+    return best + _moved(before, here, after), math.sqrt(variance)
 
 
 def find_wide(

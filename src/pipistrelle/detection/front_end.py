@@ -451,7 +451,10 @@ def find_calls(
     parts, whole = zip(*(_found(matched, end, one, lags, cut) for one in end.finders), strict=True)
     matched = matched[cut : len(matched) - cut]
     found = joined(parts)
-    found = detections_at(found, np.concatenate(whole) & ~_cross_talk_in(found, end, lags))
+    near = np.abs(found.delay[:, np.newaxis] - found.delay) <= pulse * interval
+    share = end.talk[found.caller[:, np.newaxis], found.caller]
+    leaked = np.where(near, MARGIN * share * found.power, 0.0).max(axis=1, initial=0.0)
+    found = detections_at(found, np.concatenate(whole) & (found.power > leaked))
     return replace(found, direct=_direct_of(matched, end, found, lags))
 
 
@@ -542,14 +545,6 @@ def _found(
 def _of_call(matched: Complex[np.ndarray, "l f c e"], finder: Finder) -> Complex[np.ndarray, "k l"]:
     """Select the matched-filter outputs of a detector's only call."""
     return matched[:, finder.faces, finder.callers[0]].transpose(1, 2, 0)[0][finder.members]
-
-
-def _cross_talk_in(found: Detections, end: Finders, lags: Lags) -> Bool[np.ndarray, " m"]:
-    """Return a mask of the detections that may be leakage of a louder call of another caller."""
-    near = np.abs(found.delay[:, np.newaxis] - found.delay) <= lags.pulse * lags.interval
-    share = end.talk[found.caller[:, np.newaxis], found.caller]
-    left = np.where(near, MARGIN * share * found.power, 0.0)
-    return found.power <= left.max(axis=1, initial=0.0)
 
 
 def _direct_of(

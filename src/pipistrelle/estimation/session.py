@@ -10,7 +10,7 @@ from dataclasses import replace
 from typing import Any, Generic, NamedTuple
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Int
 
 from pipistrelle.config import InputError
 from pipistrelle.detection.noise import ConstantNoise
@@ -233,8 +233,10 @@ class Session(Generic[B]):
             self.belief, self._rng.bit_generator.state = self._open
             before, took = self._legs.pop()
             width = max(before.shape[1], controls.shape[1])
-            steps = [_with_columns(part, width) for part in (before, controls)]
-            self._legs.append((np.concatenate(steps), np.concatenate((took, dt))))
+            steps = np.full((len(took) + len(dt), width), np.nan)  # unknown covariances
+            steps[: len(took), : before.shape[1]] = before
+            steps[len(took) :, : controls.shape[1]] = controls
+            self._legs.append((steps, np.concatenate((took, dt))))
         else:
             self._open = self.belief, self._rng.bit_generator.state
             self._legs.append((controls, dt))
@@ -340,12 +342,6 @@ class Session(Generic[B]):
         scan = self._noise.hidden(stored.original, stored.scan) if self._noise else stored.scan
         merged = labelled(scan, stored.label)
         return self._update(self._noise(merged) if self._noise else merged)
-
-
-def _with_columns(controls: Controls, width: int) -> Float[np.ndarray, "k w"]:
-    """Return control steps widened to a number of columns, with NaN for unknown covariances."""
-    missing = np.full((len(controls), width - controls.shape[1]), np.nan)
-    return np.hstack((controls, missing))
 
 
 def _present(belief: Any, labels: Sequence[int]) -> list[int]:

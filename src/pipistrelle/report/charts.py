@@ -558,7 +558,12 @@ def _anees_chart(selection: Selection, name: str, title: str) -> Chart:
         for i in own_cases(study.trials[way]).tolist()
     ]
     runs = min(filter(None, counts), default=0)
-    alike = _drives_alike(study)
+    frames = next(iter(study.trials.values())).nees.shape[2]
+    drives = {
+        (lap_time(study, i), *frame_time(study, frames, i)[-1:].tolist(), config.scenario.steps)
+        for i, config in enumerate(study.configs)
+    }
+    alike = len(drives) == 1
     if runs and alike:
         for way, of_way in lines.items():
             of_way.insert(0, _ideal(study, way, runs))
@@ -603,16 +608,6 @@ def _anees_caption(study: Study, runs: int, *, alike: bool) -> str:
         clauses.append("dotted: the vehicle is back at its start")
     words = "; ".join(clauses)
     return words[:1].upper() + words[1:]
-
-
-def _drives_alike(study: Study) -> bool:
-    """Return whether the drives of all combinations of variables have equal laps and times."""
-    frames = next(iter(study.trials.values())).nees.shape[2]
-    drives = {
-        (lap_time(study, i), *frame_time(study, frames, i)[-1:].tolist(), config.scenario.steps)
-        for i, config in enumerate(study.configs)
-    }
-    return len(drives) == 1
 
 
 def _ideal(study: Study, way: Way, runs: int) -> Series:

@@ -125,12 +125,6 @@ def test_scans_keep_their_times_inside_steps(tmp_path):
     assert [scan.time for scan in read_log(recorded(tmp_path, measurements=rows)).scans] == times
 
 
-def test_several_times_in_one_step_are_several_scans_in_order(tmp_path):
-    scans = read_log(recorded(tmp_path, measurements=measured("0.12,8,0,2", "0.2,8,0,1"))).scans
-    assert [scan.time for scan in scans] == [0.12, 0.2]
-    assert [scan.range.tolist() for scan in scans] == [[2.0], [1.0]]
-
-
 def test_bearings_are_wrapped_below_pi(tmp_path):
     rows = [f"0.1,1,{np.pi!r},1", f"0.1,2,{-np.pi!r},1", "0.1,3,4.0,1", "0.1,4,-9.0,1"]
     bearing = read_log(recorded(tmp_path, measurements=measured(*rows))).scans[0].bearing
@@ -227,11 +221,6 @@ def test_times_and_the_ends_of_merged_steps_are_compared_to_a_microsecond(tmp_pa
     log = merged(tmp_path, 0.1, odometry, rows)
     assert len(log.dt) == 3
     assert [scan.time for scan in log.scans] == [log.time[1], 0.100002, log.time[2]]
-
-
-def test_a_measurement_at_the_first_rows_time_is_at_the_start_of_merged_steps(tmp_path):
-    log = merged(tmp_path, 0.2, measurements=measured("0.0,1,0,1", "0.01,1,0,1"))
-    assert [scan.time for scan in log.scans] == [0.0, 0.01]
 
 
 # What is dropped, with a count
@@ -480,13 +469,6 @@ def written_log(kind, folder):
         assert (log.motion, log.wheelbase, log.speed_offset) == ("ackermann", 0.3, -0.1)
         assert log.controls[1].tolist() == [2.0, -1.0]
         return log
-    if kind == "scans that share a step":
-        ranges = ((0.0, 5), (0.11, 4), (0.12, ""), (0.13, 2), (0.35, 1))
-        log = read_log(
-            recorded(folder, measurements=measured(*(f"{t},8,0.1,{r}" for t, r in ranges)))
-        )
-        assert [scan.time for scan in log.scans] == [time for time, _ in ranges]
-        return log
     rows = ("0.1,7,0.5,4.0,3.25,0.01,mate", "0.1,7,,,6.5,,boat", "0.25,8,0.1,2.0,,,")
     settings = UNICYCLE + "excess_path_std = 0.05\n" + CALLERS + "\n[[callers]]\nname = 'c'\n"
     log = read_log(timed(folder, *rows, settings=settings + "landmark = 9\nmoves = true\n"))
@@ -496,7 +478,7 @@ def written_log(kind, folder):
 
 @pytest.mark.parametrize(
     "kind",
-    ["unicycle_log", "bicycle_log", "every setting", "a car", "scans that share a step", "callers"],
+    ["unicycle_log", "bicycle_log", "every setting", "a car", "callers"],
 )
 def test_a_log_survives_being_written(tmp_path, kind):
     log = written_log(kind, tmp_path / "drive")

@@ -46,8 +46,11 @@ def motions_between(odometry: Table, time: Float[np.ndarray, " t"]) -> Float[np.
     _check_ways(odometry, poses)
     stated = _covariances(odometry)
     last = np.append(np.diff(stamp) > 0.0, True)
-    ends = _at_rows(time, stamp[last])
-    there = _poses_at(ends, stamp[last], poses[last])
+    rows = stamp[last]
+    after = np.clip(np.searchsorted(rows, time), 1, len(rows) - 1)
+    nearest = np.where(time - rows[after - 1] < rows[after] - time, rows[after - 1], rows[after])
+    ends = np.where(np.abs(nearest - time) <= RESOLUTION, nearest, time)
+    there = _poses_at(ends, rows, poses[last])
     moved = relative_motions(there)
     if np.isnan(stated[1:]).all():
         return moved
@@ -109,15 +112,6 @@ def _turned(
     """Rotate each point in the plane by its angle [rad]."""
     c, s, (x, y) = np.cos(angle), np.sin(angle), points.T
     return np.column_stack([c * x - s * y, s * x + c * y])
-
-
-def _at_rows(
-    time: Float[np.ndarray, " t"], rows: Float[np.ndarray, " n"]
-) -> Float[np.ndarray, " t"]:
-    """Replace each time by the nearest row's time if the difference is at most 1e-6 s."""
-    after = np.clip(np.searchsorted(rows, time), 1, len(rows) - 1)
-    nearest = np.where(time - rows[after - 1] < rows[after] - time, rows[after - 1], rows[after])
-    return np.where(np.abs(nearest - time) <= RESOLUTION, nearest, time)
 
 
 def _poses_at(

@@ -42,7 +42,10 @@ class Stack:
         arrays, written, size = self.arrays, self.written, self.size + count
         if written[0] != self.size or size > len(arrays[0]):
             room = max(ROOM, len(arrays[0]), 2 * size if size > len(arrays[0]) else 0)
-            arrays = tuple(_copied(array, self.size, room) for array in arrays)
+            spare = (np.zeros((room - self.size, *a.shape[1:]), a.dtype) for a in arrays)
+            arrays = tuple(
+                np.concatenate((a[: self.size], b)) for a, b in zip(arrays, spare, strict=True)
+            )
             written = [0]
         written[0] = size
         return type(self)(arrays, size, written)
@@ -50,13 +53,6 @@ class Stack:
     def entries(self, number: int) -> np.ndarray:
         """Return the used entries of the array at index ``number``, without spare capacity."""
         return self.arrays[number][: self.size]
-
-
-def _copied(array: np.ndarray, size: int, room: int) -> np.ndarray:
-    """Copy the first entries of an array into a new, larger array of zeros."""
-    copied = np.zeros((room, *array.shape[1:]), array.dtype)
-    copied[:size] = array[:size]
-    return copied
 
 
 @no_alloc

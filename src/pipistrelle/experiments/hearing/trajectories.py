@@ -116,8 +116,11 @@ def driven(
 
     Bradley & Abaid, Eq. (5).
     """
-    if not isinstance(course, np.ndarray):
-        _check_length(course, setup)
+    short = setup.steps * setup.step - TIME_TOLERANCE
+    if not isinstance(course, np.ndarray) and course.time[-1] < short:
+        most = f"{steps_of(course, setup)} steps of {setup.step:g} s; expected as many, or fewer"
+        but = f"but the path of {setup.world} ends after {most}"
+        raise InputError(f"scenario.steps: found {setup.steps}, {but}")
     time = np.arange(setup.steps + 1) * setup.step
     if isinstance(course, Poses):
         path = path_at(time, course.time, course.path)
@@ -216,11 +219,3 @@ def _check_speed(setup: ScenarioConfig) -> None:
     if setup.speed <= 0.0:
         found, expected = f"{setup.speed:g} m/s", "more than 0 to drive between way-points"
         raise refusal("scenario.speed", found, expected, "correct it")
-
-
-def _check_length(course: Commands | Poses, setup: ScenarioConfig) -> None:
-    """Raise if a course of commands or poses ends before the drive does."""
-    if course.time[-1] < setup.steps * setup.step - TIME_TOLERANCE:
-        most = f"{steps_of(course, setup)} steps of {setup.step:g} s; expected as many, or fewer"
-        but = f"but the path of {setup.world} ends after {most}"
-        raise InputError(f"scenario.steps: found {setup.steps}, {but}")

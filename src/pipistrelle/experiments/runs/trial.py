@@ -305,7 +305,10 @@ def run_filter(
     """
     time = drive.time
     steps = _steps_of(scans, time)
-    _check_known(drive, scans)
+    moving = {*drive.moving, *(label for scan in scans for label in scan.moving.tolist())}
+    if roving := sorted(moving.intersection(drive.known.landmark.tolist())):
+        found = f"found {roving}, which move; expected some that stand"
+        raise InputError(f"landmarks known beforehand: {found}")
     session = Session(
         estimator, drive.start, rng, known=drive.known, callers=drive.callers,
         association=association, noise=noise,
@@ -345,14 +348,6 @@ def _steps_of(scans: Sequence[Scan], time: Float[np.ndarray, " t"]) -> list[int]
         late = f"scan at {scans[late + 1].time} s: follows one at {scans[late].time} s"
         raise InputError(f"{late}; expected scans in the order of time")
     return steps.tolist()
-
-
-def _check_known(drive: Drive, scans: Sequence[Scan]) -> None:
-    """Raise if a landmark with a position known beforehand is a moving caller."""
-    moving = {*drive.moving, *(label for scan in scans for label in scan.moving.tolist())}
-    if roving := sorted(moving.intersection(drive.known.landmark.tolist())):
-        found = f"found {roving}, which move; expected some that stand"
-        raise InputError(f"landmarks known beforehand: {found}")
 
 
 def _move(session: Session[B], drive: Drive, first: int, last: int, path: Gaussian) -> None:

@@ -335,7 +335,10 @@ def _write_held(folder: Path, iteration: int, files: dict[str, bytes]) -> None:
     try:
         for path, partial in partials.items():
             write_down(partial, files[path.parent.name])
-        _make_way(folder, iteration, files)
+        for path in paths[:-1]:  # without its trials, a world is unfinished
+            with contextlib.suppress(FileNotFoundError):
+                if read_file(path) != files[path.parent.name]:
+                    paths[-1].unlink(missing_ok=True)
         for path, partial in partials.items():
             put_in_place(partial, path)
     finally:
@@ -380,15 +383,6 @@ def _parquet(table: "pl.DataFrame", metadata: dict[str, str] | None = None) -> b
     buffer = io.BytesIO()
     table.write_parquet(buffer, metadata=metadata)
     return buffer.getvalue()
-
-
-def _make_way(folder: Path, iteration: int, files: dict[str, bytes]) -> None:
-    """Mark a world as unfinished (delete its trials) if its other tables will change."""
-    trials = world_file(folder, "trials", iteration)
-    for name in TABLES[:-1]:
-        with contextlib.suppress(FileNotFoundError):
-            if read_file(world_file(folder, name, iteration)) != files[name]:
-                trials.unlink(missing_ok=True)
 
 
 def sweep(folder: Path, iterations: Iterable[int]) -> None:
