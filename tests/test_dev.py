@@ -1,5 +1,6 @@
 """The set-up script: two who start at once make one environment, and help costs none."""
 
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -34,18 +35,27 @@ dev.set_up()
 
 def test_only_one_of_several_starters_makes_the_environment(tmp_path):
     command = [sys.executable, "-c", START, str(DEV), str(tmp_path)]
-    started = [
-        subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
-        for _ in range(4)
-    ]
+    pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE}
+    started = [subprocess.Popen(command, text=True, **pipes) for _ in range(4)]
     ended = [process.communicate(timeout=60) for process in started]
     assert [process.returncode for process in started] == [0] * 4
     assert sorted(told for told, _ in ended) == ["", "", "", "made\n"]
 
 
-def test_the_help_names_the_verbs_help():
-    for asked in ("help", "--help"):
-        done = subprocess.run([sys.executable, DEV, asked], capture_output=True, text=True)
+def test_a_link_is_refused_as_the_environment(tmp_path):
+    (tmp_path / ".venv").symlink_to(tmp_path)
+    command = [sys.executable, "-c", START, str(DEV), str(tmp_path)]
+    done = subprocess.run(command, capture_output=True, text=True)
+    assert (done.returncode, "found a symbolic link" in done.stderr) == (1, True)
+
+
+def test_help_sets_up_no_environment(tmp_path):
+    dev = Path(shutil.copy(DEV, tmp_path))
+    for asked in ("help", "--help", "run --help", "lowest -h"):
+        command = [sys.executable, dev, *asked.split()]
+        done = subprocess.run(command, capture_output=True, text=True)
         assert done.returncode == 0
         assert "`pipistrelle --help`" in done.stdout
         assert "`pipistrelle VERB --help`" in done.stdout
+        assert ("`./dev doctor`" in done.stdout) is ("run" in asked)
+    assert [*tmp_path.iterdir()] == [dev]
