@@ -11,7 +11,8 @@ from pipistrelle.experiments.hearing.world_folder import LANDMARKS as BODIES
 from pipistrelle.experiments.runs.truth_files import LANDMARKS, TRUTH
 from pipistrelle.text_tables import TEXT_COLUMNS
 
-MARK = re.compile(r"<!-- columns of (.+) -->")
+MARK = re.compile(r"`(.+)` <!-- columns of (.+) -->")
+"""The header of a table, which a reader of the raw page sees, and the name of its schema."""
 SCHEMAS = {
     **{f"the odometry of a {name}": ODOMETRY[name] for name in ("unicycle", "bicycle")},
     "the odometry of poses": ODOMETRY["poses"],
@@ -26,7 +27,7 @@ SCHEMAS = {
 
 def add_columns(app, docname, content):
     """Replace each mark on a page by the columns of its table."""
-    content[0] = MARK.sub(lambda mark: markdown(SCHEMAS[mark[1]]), content[0])
+    content[0] = MARK.sub(lambda mark: markdown(SCHEMAS[mark[2]]), content[0])
 
 
 def markdown(schema):

@@ -3,7 +3,7 @@ Your own log
 ============
 
 Recorded drives need no simulator. The estimators need the approximate motion of a vehicle, and
-bearings, with or without ranges, of landmarks with labels. This drive is made in plain NumPy,
+bearings, ranges or both of landmarks with labels. This drive is made in plain NumPy,
 without Pipistrelle, and written as a log: a folder of text files, as your own recorder may write
 it.
 """

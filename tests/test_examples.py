@@ -170,8 +170,8 @@ def test_listening_gains_where_posts_are_few_and_not_where_they_are_many(play):
     assert done["answer"] == pytest.approx(few[0])
     assert few[1] < 0.01
     assert many[1] > 0.05, "where there is little to gain, nothing is shown"
-    assert tried.answer[0].startswith("scenario.landmarks from 5 to 45 lowers the position RMSE by")
-    assert tried.answer[0].endswith("It is shown to fall with active invariant EKF.")
+    assert tried.answer[0].startswith("scenario.landmarks from 5 to 45 lowers the aligned")
+    assert tried.answer[1].endswith("It is shown to fall with active invariant EKF.")
 
 
 def test_one_process_shards_and_a_cluster_find_the_same(play, tmp_path_factory, monkeypatch):

@@ -62,7 +62,8 @@ def test_compilation_is_announced(capsys, monkeypatch, words, said):
 def test_a_study_prints_progress_results_and_folder(obey):
     status, printed, said = obey("small.toml", "-o", "one")
     assert (status, printed) == (0, "3 worlds, 30 trials, 0 failed\none\n")
-    first, last = said.splitlines()
+    paper, first, last = said.splitlines()
+    assert 'settings = "best"' in paper
     assert first == "0/3 worlds; trials: active 0/12, fused 0/12, passive 0/6"
     assert re.fullmatch(
         r"3/3 worlds, \d+\.\d trials/s, 0 s left; trials: active 12/12, fused 12/12, passive 6/6",
@@ -75,10 +76,6 @@ def test_the_same_command_again_goes_on_and_repeats_nothing(obey, ran):
     ran.clear()
     assert obey("small.toml", "-o", "one")[1].startswith("3 worlds, 30 trials")
     assert ran == [2]
-
-
-def test_a_quiet_study_prints_only_its_folder(obey):
-    assert obey("small.toml", "--iterations", "1", "--quiet", "-o", "one") == (0, "one\n", "")
 
 
 def test_without_a_name_the_folder_is_the_plans_so_that_the_same_command_goes_on(obey):
@@ -189,14 +186,8 @@ def test_a_length_of_time_is_worded_in_the_unit_that_fits(seconds, words):
         ("small.toml --iterations 2.5", "--iterations: found '2.5', expected a whole number"),
         ("small.toml --workers 0", "--workers: found 0, expected 1 to 1000000"),
         ("small.toml --shard 4/4", "--shard: found '4/4', expected I/N with I from 0 to N - 1"),
-        ("small.toml --shard 1", "--shard: found '1', expected I/N"),
-        ("small.toml --shard a/4", "--shard: found 'a/4', expected I/N"),
         ("small.toml --shard 0/0", "--shard: found '0/0', expected I/N"),
         ("small.toml --sharp 0/4", "Unknown option: --sharp. Did you mean --shard?"),
-        (
-            "small.toml --iterations 1000000000000",
-            "--iterations: found 1000000000000, expected 1 to",
-        ),
         ("small.toml --emitter.radius 0.01", "--emitter.radius: the plan varies this setting"),
         ("small.toml --rays.exponent 0", "--rays.exponent: found 0.0, expected greater than 0"),
         ("small.toml --workers 2 --scheduler tcp://here:1", "--workers: the cluster at tcp://here"),

@@ -153,13 +153,9 @@ def beside(
 
 def each_combination(study: Study, variable: Variable) -> str:
     """Describe for a caption the lines of a chart that has a line per combination of variables."""
-    others = [other for other in study.variables if other is not variable]
+    others = [with_article(other) for other in study.variables if other is not variable]
     first = combination_name(study, 0, [variable])
-    what = (
-        f"value of {with_article(others[0])}"
-        if len(others) == 1
-        else (f"combination of {listed([with_article(other) for other in others])}")
-    )
+    what = f"value of {others[0]}" if len(others) == 1 else f"combination of {listed(others)}"
     return f"a line for each {what}, that of {first} the strongest"
 
 
@@ -225,12 +221,7 @@ def level_charts(selection: Selection, only: str = "") -> list[Chart]:
     """
     axes = selection.study.variables or (None,)
     there = [what for what in levels() if has_numbers(selection.study, what.score)]
-    return [
-        _chart(selection, what, variable)
-        for variable in axes
-        for what in there
-        if only in what.score
-    ]
+    return [_chart(selection, what, axis) for axis in axes for what in there if only in what.score]
 
 
 def _chart(selection: Selection, what: Level, variable: Variable | None) -> Chart:

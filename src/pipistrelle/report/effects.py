@@ -21,6 +21,7 @@ from pipistrelle.evaluation.scores import shown_in
 from pipistrelle.report.study import (
     MAP,
     POSITION,
+    POSITION_ALIGNED,
     Cell,
     Rule,
     Selection,
@@ -46,6 +47,8 @@ HEADLINE: Rule = "none"
 """Rule of the answer: divergence caused by a setting is part of its effect."""
 OTHERWISE: Rule = "case"
 """Rule of the second row of an effect whose direction changes without diverged cases."""
+ANSWERED = {POSITION_ALIGNED: "aligned position RMSE", POSITION: "position RMSE"}
+"""Scores of the answer. Without the rigid motion that is common to an estimate, cases compare."""
 MOST_NAMES = 4
 """Most filters and strategies that an answer names."""
 Pair = tuple[Cell, Cell]
@@ -117,11 +120,6 @@ def gains_of(study: Study) -> tuple[Measure, ...]:
         for one in measures_of(study)
         if one.unit in ("m", "rad")
     )
-
-
-def is_first(measure: Measure) -> bool:
-    """Return whether a measure is the position RMSE, which the report's answer is about."""
-    return measure.score == POSITION and not measure.over
 
 
 def measured(
@@ -387,7 +385,7 @@ def headline(subject: str, title: str, unit: str, contrast: Contrast, cases: int
     size = f"{amount((sign or 1) * finding.mean, unit)} {interval((low, high), unit)}"
     if sign:
         return f"{begin} {'raises' if sign > 0 else 'lowers'} the {title} by {size}{mean_of}."
-    return f"{begin} shows no effect on the {title}; the change is {size}{mean_of}."
+    return f"{begin}: no effect on the {title} was shown; the change is {size}{mean_of}."
 
 
 def question(study: Study) -> str:
@@ -405,25 +403,30 @@ def question(study: Study) -> str:
 
 
 def answer(selection: Selection, effects: Sequence[Effect]) -> list[str]:
-    """Return the answer of a study: a sentence per variable, else per strategy and filter.
+    """Return the answer of a study: sentences per variable, else per strategy and filter.
 
-    `effects`: under the rule `HEADLINE`. Each sentence is the change of the position RMSE between
+    `effects`: under the rule `HEADLINE`. A sentence is the change of a score of `ANSWERED` between
     two values, averaged over everything else; of several values of a variable the largest shown.
     """
-    study, first = selection.study, [effect for effect in effects if is_first(effect.measure)]
-    if study.variables:
-        return [_of_variable(selection, variable, first) for variable in study.variables]
-    if first:
-        by_factor = ([e for e in first if e.pairing.factor == name] for name in (STRATEGY, FILTER))
-        return [sentence for some in by_factor for _, sentence in _averaged(selection, some)]
-    (way,) = study.trials
-    (errors,) = samples(selection, POSITION, [(*way, 0)])
-    if not len(errors):
-        return ["Not decided: no world is left."]
-    (mean,) = judge([Statement(label="", sample=errors)])
-    size = interval(mean.alone, "m") if mean.n > 1 else "in the one world"
-    title = filter_titles(study)[way[0]]
-    return [f"{title}'s position RMSE is {amount(mean.mean, 'm')} {size} by {way[1]} sensing."]
+    study, sentences = selection.study, []
+    for score in (name for name in ANSWERED if name == POSITION or has_numbers(study, name)):
+        own = [e for e in effects if e.measure.score == score and not e.measure.over]
+        for variable in study.variables:
+            sentences.append(_of_variable(selection, variable, own))
+        for factor in () if study.variables else (STRATEGY, FILTER):
+            some = [effect for effect in own if effect.pairing.factor == factor]
+            sentences += [sentence for _, sentence in _averaged(selection, some)]
+        if study.variables or own:
+            continue
+        (way,) = study.trials
+        (errors,) = samples(selection, score, [(*way, 0)])
+        if not len(errors):
+            return ["Not decided: no world is left."]
+        (mean,) = judge([Statement(label="", sample=errors)])
+        size = interval(mean.alone, "m") if mean.n > 1 else "in the one world"
+        begin = f"{filter_titles(study)[way[0]]}'s {ANSWERED[score]} is {amount(mean.mean, 'm')}"
+        sentences.append(f"{begin} {size} by {way[1]} sensing.")
+    return [*dict.fromkeys(sentences)]
 
 
 def _of_variable(selection: Selection, variable: Variable, effects: Sequence[Effect]) -> str:
@@ -459,7 +462,8 @@ def _averaged(
             subject = f"{with_article(variable)} from {before} to {after}"
             if variable.numbers is None:
                 subject = f"{variable.name} = {after} instead of {before}"
-        sentence = headline(subject, group[0].measure.title, "m", contrast, len(some))
+        title = ANSWERED[group[0].measure.score]
+        sentence = headline(subject, title, "m", contrast, len(some))
         signs = {direction(effect.finding) for effect in group}
         if len(group) > 1 and signs != {direction(contrast.finding)}:
             sentence += f" {_shown_by(selection.study, group)}"

@@ -10,7 +10,7 @@ import json
 import platform
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from importlib.metadata import PackageNotFoundError, version
+from importlib.metadata import version
 from math import inf
 from pathlib import Path
 from typing import Any
@@ -105,16 +105,10 @@ def summary(result: Answered) -> dict[str, Any]:
     study, selection, rule = result.study, result.selections[result.rule], result.rule
     effects = result.effects[rule], result.effects[OTHERWISE]
     exclusions = tables.exclusion_rows(study)
-    versions = {"python": platform.python_version()}
-    for name in LIBRARIES:
-        try:
-            versions[name] = version(name)
-        except PackageNotFoundError:
-            versions[name] = "unknown"
     return {
         "format": 1,
         "version": __version__,
-        "versions": versions,
+        "versions": {"python": platform.python_version()} | {n: version(n) for n in LIBRARIES},
         "study": study.name,
         "seed": study.config.seed,
         "worlds_planned": study.planned,

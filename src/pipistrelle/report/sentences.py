@@ -414,13 +414,11 @@ def _fused_anees_largest(selection: Selection) -> Iterator[Comparison]:
         pair = curves(selection, [("fastslam", FUSED), ("fastslam", strategy)])
         if pair is not None and len(pair[0]) > 1:
             flat = [one.reshape(len(one), -1) for one in pair]
-            first = flat[0].shape[1]
-
-            def excess(mean: np.ndarray, first: int = first) -> np.ndarray:
-                return mean[:, :first].max(axis=1) - mean[:, first:].max(axis=1)
-
-            label = f"FastSLAM 2.0: largest ANEES, fused − {strategy}"
-            yield _compared(label, "", pseudovalues(np.hstack(flat), excess), "fastslam")
+            k = flat[0].shape[1]
+            gap = pseudovalues(
+                np.hstack(flat), lambda m, k=k: m[:, :k].max(axis=1) - m[:, k:].max(axis=1)
+            )
+            yield _compared(f"FastSLAM 2.0: largest ANEES, fused − {strategy}", "", gap, "fastslam")
 
 
 def _as_printed(selection: Selection) -> Iterator[Comparison]:

@@ -489,6 +489,8 @@ def _trials(
         of_filter = {way: cases for way, cases in numbers.items() if way[0] == name}
         shared = np.all([full[:, cases] for cases in of_filter.values()], axis=0)
         common |= {way: rmse_of(error[:, cases], shared) for way, cases in of_filter.items()}
+    with np.errstate(invalid="ignore"):  # the mean of NaN only is NaN
+        means = [np.nansum(one, axis=0) / np.sum(np.isfinite(one), axis=0) for one in ideal]
     by_way = {}
     for way, cases in numbers.items():
         first = np.sort(np.unique(cases, return_index=True)[1])
@@ -501,7 +503,7 @@ def _trials(
             placed=full[:, c],
             off=error[:, c],
             nees=nees[:, c],
-            consistent=_means(*(moment[:, c] for moment in ideal)),
+            consistent=np.array([mean[c] for mean in means]),
         )
     return by_way
 
@@ -526,10 +528,3 @@ def _array(
     array = np.full(shape, empty)
     array[tuple(part.astype(np.intp) for part in index)] = values.to_numpy()
     return array
-
-
-def _means(*columns: Float[np.ndarray, "n b k"]) -> Float[np.ndarray, "i b k"]:
-    """Average arrays over the worlds, without NaN; the average of NaN only is NaN."""
-    counts = [np.sum(np.isfinite(column), axis=0) for column in columns]
-    with np.errstate(invalid="ignore"):
-        return np.array([np.nansum(c, axis=0) / n for c, n in zip(columns, counts, strict=True)])

@@ -158,13 +158,8 @@ def _cells(effects: Sequence[changes.Effect], at: int | None = None) -> dict[str
             text, ends = "same", ""
         elif finding.n < 2:
             text, ends = "?", ""
-        cell = {
-            "shown": changes.direction(finding) != 0,
-            "n": finding.n,
-            "interval": ends,
-            "text": text,
-        }
-        cells[measure.score] = cell
+        shown = changes.direction(finding) != 0
+        cells[measure.score] = {"shown": shown, "n": finding.n, "interval": ends, "text": text}
     return cells
 
 
@@ -179,11 +174,8 @@ def case_rows(selection: Selection) -> list[dict[str, Any]]:
     for way, trials in study.trials.items():
         for column, i in enumerate(own_cases(trials).tolist()):
             cell = (*way, i)
-            row: dict[str, Any] = {
-                "filter": way[0],
-                "strategy": way[1],
-                "at": case_name(study, way, i),
-            }
+            row: dict[str, Any] = dict(zip(("filter", "strategy"), way, strict=True))
+            row["at"] = case_name(study, way, i)
             for measure in changes.measures_of(study):
                 (sample,) = samples(selection, measure.score, [cell])
                 row["n"] = row.get("n", len(sample))
