@@ -75,8 +75,8 @@ TEXT_COLUMNS: Mapping[str, Column] = MappingProxyType(
 FORMER_NAMES = MappingProxyType({"detour": "excess_path", "detour_std": "excess_path_std"})
 """Former names of columns and keys of logs, and their present names."""
 _LABEL_IT = (
-    "number what your sensor tells apart, the same whenever it is seen, and clutter -1; or leave "
-    "the field empty, for --association.method to decide"
+    "number your landmarks, the same number in all rows of one, and clutter -1; or leave the field "
+    "empty, for --association.method to decide"
 )
 
 
@@ -238,6 +238,7 @@ def _values(
         found = f"{name} {fields[name][row][:80]!r}"
         expected = " or ".join(words[name]) if name in words else "a finite number"
         fix = "correct the field" + " or leave it empty" * (name in optional)
+        fix = _LABEL_IT if name == "landmark" and name in optional else fix
         raise refusal(place_of(table, row), found, expected, fix)
     return values
 

@@ -43,7 +43,7 @@ import pytest
         ("run --particles 9", "--particles: found 9, but --filter is smoother, which has no"),
         ("run --filter both --particles 3 --fastslam.particles 3",
          "--particles and --fastslam.particles are one setting; give one of them"),
-        ("run --strategy loud", 'Invalid value "loud" for --strategy'),
+        ("run --strategy active,loud", "--strategy: found 'loud', expected 'active', 'fused',"),
         ("run --duration 0.4", "--duration: found 0.4, expected at least one frame (0.5 s)"),
         ("run --duration nan", "--duration: found nan, expected at least one frame"),
         ("run --duration inf", "--duration: found inf, expected at least one frame"),
@@ -63,7 +63,6 @@ import pytest
         ("run --landmarks 9999", "scenario.landmarks: found 9999"),
         ("run --animate=avi", 'Invalid value "avi" for --animate'),
         ("run --animate avi", "--animate: found 'avi', expected gif or mp4"),
-        ("slam none --animate avi", "--animate: found 'avi', expected gif or mp4"),
         ("run --animate gif extra", "run: found 'extra', but run takes no arguments"),
         ("run extra", "run: found 'extra', but run takes no arguments"),
         ("slam one two", "slam: found 'two', but slam takes one argument"),
@@ -118,10 +117,7 @@ def test_mistakes_are_explained_in_a_line_and_write_nothing(refused, words, said
         (["run", "-o", ""], "-o: found ''"),
         (["run", "--save-log="], "--save-log: found ''"),
         (["slam", ""], "slam: found ''"),
-        (
-            ["report", "", "-o", "d"],
-            "report: found '', expected a value (for the folder that you are in: .)",
-        ),
+        (["report", "", "-o", "d"], "report: found '', expected a value (for the folder that"),
     ],
 )
 def test_an_empty_path_is_rejected(refused, words, said):

@@ -54,7 +54,7 @@ from pipistrelle.estimation.smoother.records import (
 from pipistrelle.jit import Whole, no_alloc, optimised_once
 
 IN_ONE_WORLD = (
-    "No unbiased estimate from past measurements has a smaller RMSE over worlds than the bound."
+    "Over worlds no unbiased estimate of past measurements is below the bound; in one it may be."
 )
 """Sentence shown with a bound beside errors."""
 NO_ROUTES: Mapping[int, np.ndarray] = MappingProxyType({})

@@ -286,17 +286,17 @@ def frames_named(given: Given, count: int) -> range:
     raise InputError(f"{given.where}: found {shown(given.value)}, expected {expected}")
 
 
-def named_strategies(chosen: str | Sequence[str]) -> tuple[Strategy, ...]:
+def named_strategies(chosen: str | Sequence[str], where: str) -> tuple[Strategy, ...]:
     """Return the sensing strategies that an argument chooses, in the order of `STRATEGIES`."""
     if isinstance(chosen, str):
-        chosen = STRATEGIES if chosen == "all" else (chosen,)
+        chosen = STRATEGIES if chosen == "all" else chosen.split(",")
     chosen = tuple(chosen) if isinstance(chosen, Iterable) else (chosen,)
     for strategy in chosen or (chosen,):
         if strategy not in get_args(Strategy):
             near = meant(str(strategy), STRATEGIES)
             fix = f"did you mean {near!r}?" if near else "choose"
-            expected = "'active', 'fused', 'passive' or 'all'"
-            raise InputError(f"strategies: found {shown(strategy)}, expected {expected}; {fix}")
+            expected = "'active', 'fused', 'passive', several with commas, or 'all'"
+            raise InputError(f"{where}: found {shown(strategy)}, expected {expected}; {fix}")
     return tuple(strategy for strategy in STRATEGIES if strategy in chosen)
 
 

@@ -317,7 +317,8 @@ def _numbers(
     yield f"rows         {count} in {scans} scans, {count / max(scans, 1):.3g} in each"
     labels, seen = np.unique(rows["landmark"], return_counts=True)
     known = labels != UNLABELLED
-    yield f"labels       {seen[known].sum()} rows with a label, {seen[~known].sum()} without"
+    more = ", for --association.method marginal" * int((~known).any())
+    yield f"labels       {seen[known].sum()} rows with a label, {seen[~known].sum()} without{more}"
     if known.any():
         spread = np.quantile(seen[known], (0.0, 0.25, 0.5, 0.75, 1.0))
         few, *quarters, most = (f"{number:.0f}" for number in spread)
@@ -336,7 +337,8 @@ def _numbers(
     yield f"gaps         {f'{len(gaps)} without scans, the longest {where}' if where else 'none'}"
     known_steps = 0 if truth.path is None else np.isfinite(truth.path[:, 0]).sum()
     placed = 0 if truth.landmarks is None else len(truth.landmarks[0])
-    yield f"truth        {known_steps} of {time.size} poses, {placed} landmarks"
+    true = f"{known_steps} of {time.size} poses, {placed} landmarks"
+    yield f"truth        {true if known_steps or placed else 'none'}"
 
 
 def _quantity(recorded: "Log", rows: "Rows", name: str, unit: str) -> str:

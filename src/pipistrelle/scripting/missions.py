@@ -130,6 +130,10 @@ def prepare_slam(
     for note in recorded.notes:
         door.note(f"pipistrelle: {place}: {note}")
     door.warn(*overruled, *log_warnings(recorded, truth, place))
+    blind = all((scan.bearing != scan.bearing).all() for scan in recorded.scans)
+    if blind and not {"ekf", "iekf"}.isdisjoint(filters):
+        fix = f"{door.option('filters', 'smoother')} is more accurate than EKFs"
+        door.warn(f"{place}: no row has a bearing; with ranges only, {fix}")
     beam = None if width.value is None else radians(width.value)
 
     def conduct(*, progress: Progress | None = None, watch: Watch | None = None) -> Mission:

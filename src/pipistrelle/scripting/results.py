@@ -120,9 +120,9 @@ class Results:
 
             mission = self.mission
             return tables_of(mission.trials, mission.drive.truth, caller_names(mission))
-        paths = {name: self.folder / f"{name}.parquet" for name in TABLES}
         tables = {}
-        for name, path in paths.items():
+        for name in TABLES:
+            path = self.folder / f"{name}.parquet"
             try:
                 tables[name] = pl.read_parquet(read_file(path))
             except (OSError, pl.exceptions.PolarsError):
@@ -255,7 +255,7 @@ def run(
     config : Config, mapping, name, or path of a TOML file, optional
         Settings to start from. The rest is ``settings="best"``, unless they name other settings; a
         `Config` is complete.
-    strategies : "active", "fused", "passive", several of them, or "all"
+    strategies : "active", "fused", "passive", several with commas, or "all"
         Measurements to use: ranges, all, or only bearings.
     filters : str or class, optional
         Estimators, separated by commas; "both" are the paper's two.
@@ -318,7 +318,7 @@ def run(
 def run_by(door: Door) -> Results:
     """Simulate a mission as `run` does, with the arguments in `door`."""
     config, world, usual = mission_settings(door)
-    strategies = named_strategies(door.asked["strategies"])
+    strategies = named_strategies(door.asked["strategies"], door.option("strategies"))
     names = door.estimators(usual)
     from pipistrelle.scripting.missions import Recordings, simulated
 
@@ -358,7 +358,7 @@ def slam(
         Settings to start from.
     robot : int or str, optional
         The robot, by number or name, if there are several.
-    strategies : "active", "fused", "passive", several of them, or "all"
+    strategies : "active", "fused", "passive", several with commas, or "all"
         Rows to use: with a range, all, or only their bearings.
     filters : str or class, optional
         Estimators, separated by commas; "both" are the paper's two.
@@ -397,7 +397,7 @@ def slam(
 def slam_by(door: Door) -> Results:
     """Estimate path and map from a log as `slam` does, with the arguments in `door`."""
     layer, usual = over_named(door.beneath, door.flags)
-    strategies = named_strategies(door.asked["strategies"])
+    strategies = named_strategies(door.asked["strategies"], door.option("strategies"))
     names = door.estimators(usual or SLAM_TAKES)
     from pipistrelle.scripting.missions import prepare_slam
 

@@ -130,8 +130,9 @@ def closing_table(
 ) -> str:
     """Format the scores of a mission as a table with a column per estimate, and notes below it.
 
-    `count` is the number of landmarks in the world, `driven` the distance by the odometry [m]. Six
-    columns fit into 100 characters. `names` overrides headings of strategies.
+    `count` is the number of landmarks in the world, `driven` the distance by the odometry [m]. A
+    table wider than the terminal, and than 100 characters, is printed in parts. `names` overrides
+    headings of strategies.
     """
     from pipistrelle.evaluation.bound import IN_ONE_WORLD
 
@@ -144,7 +145,13 @@ def closing_table(
         cells = [column.get(title, "") for column in columns]
         if any(cells):
             lines.append((title, *(text or "-" for text in cells)))
-    rows = [f"{line[0]:<32}" + "".join(f"{c:>{width}}" for c in line[1:]) for line in lines]
+    first = max(32, 1 + max(len(line[0]) for line in lines))
+    each = max(1, (max(100, shutil.get_terminal_size().columns) - first) // width)
+    rows = [
+        f"{title:<{first}}" + "".join(f"{cell:>{width}}" for cell in cells[k : k + each])
+        for k in range(0, len(trials), each)
+        for title, *cells in ([("",)] * (k > 0) + lines)
+    ]
     bounded = any(trial.scores.position_bound_m is not None for trial in trials)
     weighed = any(column[NIS_TITLE] for column in columns)
     scores = [(trial.strategy, trial.filter, asdict(trial.scores)) for trial in trials]
@@ -168,7 +175,8 @@ def listening(estimates: Iterable[tuple[str, str, Mapping[str, Any]]]) -> Iterat
         placed = [scores.get("landmarks_full") for scores in (fused, active)]
         if strategy != "fused" or None in placed:
             continue
-        counts = " landmarks instead of ".join(f"{count:.0f}" for count in placed)
+        counts = " landmarks instead of ".join(dict.fromkeys(f"{count:.0f}" for count in placed))
+        counts += " landmarks, as without" * (placed[0] == placed[1])
         line = f"Listening{f', {short_name(name)}' * several}: {counts}"
         said = []
         for score, title in ALIGNED.items():
@@ -178,10 +186,17 @@ def listening(estimates: Iterable[tuple[str, str, Mapping[str, Any]]]) -> Iterat
                 said.append(f"{title} by {' instead of '.join(known)}")
         if said:
             line += f"; after alignment {', and '.join(said)}"
-        raw, aligned = fused.get("position_rmse_m"), fused.get(POSITION_ALIGNED)
-        if raw is not None and aligned is not None and aligned < sqrt(0.5) * raw:
-            line += ". Most of the raw error is one rigid motion of path and map"
+        own = [scores for (_, estimator), scores in found.items() if estimator == name]
+        turned = [what for what in ("position", "map") if all(_is_turned(s, what) for s in own)]
+        if turned:
+            line += f". Most of the raw {' and '.join(turned)} error is one rigid motion"
         yield f"{line}."
+
+
+def _is_turned(scores: Mapping[str, Any], name: str) -> bool:
+    """Return whether most of a squared error, of position or map, is a rigid motion."""
+    raw, aligned = (scores.get(f"{name}_rmse{kind}_m") for kind in ("", "_aligned"))
+    return raw is not None and aligned is not None and aligned < sqrt(0.5) * raw
 
 
 def _cells(

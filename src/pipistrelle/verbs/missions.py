@@ -142,7 +142,7 @@ def _hear(asked: dict[str, Any]) -> int:
     if outside := heard.log.rows - heard.log.inside:
         warn(f"{recording}: {outside} rows are before or after the odometry, and left out by slam")
     if not asked["quiet"]:
-        put(f"{heard.log.rows} rows")
+        put(f"{heard.log.rows} rows; for slam add --association.method marginal")
     put(heard.folder)
     return 0
 

@@ -92,7 +92,7 @@ NamedSettings = Annotated[
 ]
 _KINDS: dict[str, Any] = {
     "config": NamedSettings,
-    "strategies": Literal["active", "fused", "passive", "all"],
+    "strategies": Literal["active", "fused", "passive", "all"] | str,
     "filters": _LITERAL[(*CATALOGUE, *GROUPS)] | str | None,
     "robot": Annotated[int | str | None, Parameter(converter=_robot, n_tokens=1)],
     "shard": str | None,

@@ -215,11 +215,11 @@ def array(
         put(_table(layout, patterns))
         for name, pattern in zip(layout.name, patterns, strict=True):
             if pattern.alike > 0.0:
-                this, that = (f"{math.degrees(angle):.0f}°" for angle in pattern.worst)
+                this, that = (math.degrees(math.remainder(at, math.tau)) for at in pattern.worst)
                 put(
-                    f"{pattern.alike:.0%} of the bearings are ambiguous, as {this} and {that}: to "
-                    f"{f'face {name}' if name else 'these microphones'} they sound nearly or quite "
-                    "the same; the deviations of rows say so."
+                    f"{pattern.alike:.0%} of the bearings are ambiguous, as {this:.0f}° and "
+                    f"{that:.0f}°: to {f'face {name}' if name else 'these microphones'} they sound "
+                    "nearly or quite the same; the deviations of rows say so."
                 )
     if output is not None:
         from pipistrelle.figures.sound import draw_array

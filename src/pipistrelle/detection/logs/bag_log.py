@@ -121,7 +121,9 @@ def odometry_of(bag: Bag, settings: BagConfig) -> str:
     if len(there) == 1:
         return there[0]
     found = f"several topics of odometry: {', '.join(there)}" if there else "no odometry"
-    fix = "name one: --bag.odometry TOPIC" if there else "--topics lists what there is"
+    fix = "--topics lists what there is"
+    if there:
+        fix = f"name one, --bag.odometry {there[0]}, or the truth, --truth {there[-1]}"
     raise refusal(bag.path, found, f"one topic of {ODOMETRY}", fix)
 
 
@@ -421,8 +423,8 @@ def odometry_table(
         for name in MOTION_COVARIANCE:
             column[name] = column[name] * lasted**2
         known = int(np.isfinite(column[MOTION_COVARIANCE[0]]).sum())
-        sure = f", {known} of {len(lasted)} as sure as its twist says" * bool(known)
-        remarks.notes.append(f"{topic} is the odometry, the ways between its poses {steps}{sure}")
+        stated = f"; {known} of {len(lasted)} have the covariance of its twist" * bool(known)
+        remarks.notes.append(f"{topic} is the odometry, the motions of its poses {steps}{stated}")
         used = ("time", *POSE, *MOTION_COVARIANCE)
     return replace(table, column={name: column[name] for name in used})
 
