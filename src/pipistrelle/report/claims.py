@@ -243,8 +243,8 @@ def _sentences_line(board: dict[str, Any]) -> str:
     return (
         f"Of the paper's {board['sentences']} sentences on results, {number_word(means)} "
         f"{'holds' if means == 1 else 'hold'} by means and {number_word(bands)} by bands of one "
-        f"standard deviation. With or without diverged trials, 95 % intervals show "
-        f"{number_word(shown)} of them and refute {number_word(refuted)}."
+        f"standard deviation. Whatever is left out, 95 % intervals show {number_word(shown)} of "
+        f"them and refute {number_word(refuted)}."
     ) + f" The study has no cases, or too few worlds, for {number_word(left)}." * bool(left)
 
 

@@ -372,8 +372,8 @@ def _check_unvaried(
         # The plan in a study's folder lists every setting, so a default value is no conflict.
         if key in over or resolve({key: layer[key]}) != Config():
             name = f" as {BEAMWIDTH}" * (in_degrees and ".".join(key) == RADIUS)
-            why = f"the plan varies this setting{name}; change [grid] in a copy: cp {path} my.toml"
-            raise InputError(f"{layer[key].where}: {why}")
+            why = f"the plan varies this setting{name}; take it out of [grid] in {path}"
+            raise InputError(f"{layer[key].where}: {why}, or in a copy (cp {path} my.toml)")
 
 
 def _beneath(path: Path, table: Mapping[str, Any], over: Layer) -> tuple[Layer, tuple[str, ...]]:
