@@ -387,7 +387,12 @@ def front_end(
     if around and heard.size:
         leak = 10.0 ** (lines.detection.leakage_db / 10.0) / MARGIN
         talk[np.ix_(heard, heard)] = np.maximum(talk[np.ix_(heard, heard)], leak)
-        _refuse_lines_own(config, where)
+        for key, usual in (("snapshots", "maxima"), ("overlaps", "merge")):
+            if (value := getattr(config.detection, key)) != usual:
+                raise InputError(
+                    f"detection.{key}: found {value!r}, which only lines on faces have, for the "
+                    f"microphones of {where} that hear all around; expected {usual!r}"
+                )
     np.fill_diagonal(talk, 0.0)
     each = product(heard.tolist(), around), product(wide, range(layout.normal.size))
     for caller, g in chain(*each):
@@ -572,16 +577,6 @@ def _direct_of(
     bearings = found.bearing.tolist()
     lead = np.array([_ahead(one, bearing) for one, bearing in zip(finders, bearings, strict=True)])
     return direct_calls((found.caller, found.delay, found.delay_std), powers, lags, edge, lead)
-
-
-def _refuse_lines_own(config: Config, where: str) -> None:
-    """Raise if a setting is used that requires line arrays on faces."""
-    for key, usual in (("snapshots", "maxima"), ("overlaps", "merge")):
-        if (found := getattr(config.detection, key)) != usual:
-            raise InputError(
-                f"detection.{key}: found {found!r}, which only lines on faces have, for the "
-                f"microphones of {where} that hear all around; expected {usual!r}"
-            )
 
 
 def _refuse_far_apart(place: Float[np.ndarray, "k 2"], wavelength: float, where: str) -> None:

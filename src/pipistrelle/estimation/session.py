@@ -233,7 +233,7 @@ class Session(Generic[B]):
             self.belief, self._rng.bit_generator.state = self._open
             before, took = self._legs.pop()
             width = max(before.shape[1], controls.shape[1])
-            steps = np.full((len(took) + len(dt), width), np.nan)  # unknown covariances
+            steps = np.full((len(took) + len(dt), width), np.nan)  # NaN: unknown covariances
             steps[: len(took), : before.shape[1]] = before
             steps[len(took) :, : controls.shape[1]] = controls
             self._legs.append((steps, np.concatenate((took, dt))))

@@ -157,7 +157,12 @@ def fit_warnings(
     for trial in () if odd["bearings"] else trials:
         questions += _rejected(trial, recorded, config)
         if trial.track.labels:
-            unmapped += _unmapped(trial, recorded)
+            labels = np.concatenate(trial.track.labels)
+            mapped = np.count_nonzero(np.isin(labels, trial.track.landmarks.landmark))
+            if 2 * mapped < labels.size:
+                found = f"{mapped} of {labels.size} rows are of landmarks of the map at the end"
+                case = f"{trial.strategy} {short_name(trial.filter)}"
+                unmapped.append((f"{found} ({case})", _units(recorded)))
             wide += [*_refuted(trial, recorded)]
     if questions or unmapped:
         mistake, fits = misreading(recorded)
@@ -250,16 +255,6 @@ def _refuted(trial: "TrialResult", recorded: "Log") -> Iterator[Question]:
             then, asked = "it was searched for again", "was it moved, or its name given to another?"
         then = then if repaired else "path and map are not to be trusted from then on"
         yield f"{since}, {found} ({who}); {then}", asked
-
-
-def _unmapped(trial: "TrialResult", recorded: "Log") -> list[Question]:
-    """Return a warning if an association assigned less than half of the rows to the final map."""
-    labels = np.concatenate(trial.track.labels)
-    mapped = np.count_nonzero(np.isin(labels, trial.track.landmarks.landmark))
-    if 2 * mapped >= labels.size:
-        return []
-    found = f"{mapped} of {labels.size} rows are of landmarks of the map at the end"
-    return [(f"{found} ({trial.strategy} {short_name(trial.filter)})", _units(recorded))]
 
 
 def _unsure(trials: "Sequence[TrialResult]", config: Config) -> Iterator[str]:

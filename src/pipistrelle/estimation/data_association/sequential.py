@@ -272,7 +272,10 @@ class _Work:
             joint, lost = self._placed_again(), watched.lost + 1
             self.blind = joint is None and lost <= watch.SETTLED
             self.begins = joint is None and not self.blind
-            self._match_again(joint or self.before)
+            self.joint, self.new = joint or self.before, []
+            self.fits = self.given == UNLABELLED
+            self.label[:], self.named[:] = self.given, UNLABELLED
+            self.match_all()
             again = self._observed()[0] if joint else self.memory.watch
             self.known.past[:] *= not self.begins
             return again._replace(times=watched.times, lost=0 if self.begins else lost)
@@ -299,13 +302,6 @@ class _Work:
             if call != OWN or OWN not in watched.alarms[:, 1]:
                 watched = watch.alarmed(watched, since, call, repaired=call != OWN)
         return watched
-
-    def _match_again(self, joint: JointGaussian) -> None:
-        """Match all measurements again by another joint Gaussian of pose and map."""
-        self.joint, self.new = joint, []
-        self.fits = self.given == UNLABELLED
-        self.label[:], self.named[:] = self.given, UNLABELLED
-        self.match_all()
 
     def _placed_again(self) -> JointGaussian | None:
         """Return the joint Gaussian with the pose that the scan has on the old map, if any."""

@@ -6,7 +6,6 @@ its line or key.
 """
 
 import os
-from collections.abc import Sequence
 from difflib import get_close_matches
 from pathlib import Path
 from typing import Any, Literal
@@ -144,7 +143,11 @@ def read_world(folder: Path) -> World:
     except ValidationError as error:
         raise table_refusal(folder / "world.toml", error, _WorldTable, "format") from None
     callers, routes = _callers(folder / "world.toml", table.callers)
-    _refuse_misspelt(folder, (*there, *routes))
+    missing = [name for name in FILES if name not in (*there, *routes)]
+    for path in sorted(folder.iterdir()):
+        near = get_close_matches(path.name.lower(), missing, n=1, cutoff=0.85)
+        if near and path.name not in (*FILES, *there, *routes):
+            raise refusal(folder, f"{path.name!r}", repr(near[0]), "rename it")
     if not there:
         expected = f"one of {', '.join(FILES)}, or several"
         raise refusal(folder, "none of its files", expected, "see `pipistrelle run --save-world`")
@@ -218,15 +221,6 @@ def world_files(scenario: Scenario, config: Config) -> dict[str, str]:
     own = _own_settings(config.model_copy(update={"emitter": emitter}))
     head = {"format": 1, "config": own, "callers": callers}
     return files | {"world.toml": tomli_w.dumps(head)}
-
-
-def _refuse_misspelt(folder: Path, there: Sequence[str]) -> None:
-    """Raise if a file in a world's folder seems to be a missing file with a misspelt name."""
-    missing = [name for name in FILES if name not in there]
-    for path in sorted(folder.iterdir()):
-        near = get_close_matches(path.name.lower(), missing, n=1, cutoff=0.85)
-        if near and path.name not in (*FILES, *there):
-            raise refusal(folder, f"{path.name!r}", repr(near[0]), "rename it")
 
 
 def _own_settings(config: Config) -> dict[str, Any]:
