@@ -52,7 +52,7 @@ def test_victoria_park_is_a_log_of_a_car_with_a_lidar_ahead(park, tmp_path):
     assert log.sensor_pose == (3.78, 0.5, 0.0)
     assert len(log.scans) == 200, "the trunk that is too far is left out"
     assert {scan.bearing[0] for scan in log.scans} == {0.0}, "theirs is from the right"
-    assert log.association["detection"] == 0.9
+    assert log.association["detection_rate"] == 0.9
 
 
 def test_the_score_is_of_the_lidar_after_alignment(park, tmp_path, capsys):

@@ -100,7 +100,7 @@ AT_THE_DISK = {
     "experiments/results/reading.py": {"loadtxt"},  # of bytes that were read
     "experiments/runs/replay.py": {"open"},  # sums of a log's files, of ordinary ones alone
     "experiments/studies/study.py": {"unlink"},  # what a killed writer left, by its name
-    "experiments/studies/world.py": {"scan_parquet", "unlink"},  # checked; left by a kill
+    "experiments/studies/world.py": {"rename", "scan_parquet", "unlink"},  # columns; checked; left
     "detection/sounds/sound_file.py": {"open"},  # a few bytes of an ordinary file
     "detection/logs/bag.py": {"open"},  # of a compressed file that rosbags has opened
     "figures/style.py": {"read_text", "write_bytes"},  # our own pages; pictures in a new folder

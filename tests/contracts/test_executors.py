@@ -285,7 +285,7 @@ def test_pools_that_finish_no_world_are_an_error(monkeypatch, pool):
 
 def test_an_abandoned_world_counts_as_failed(plan, folder):
     study.open_store(folder, plan)
-    study._give_up(folder, plan, 2)
+    study._kept(folder, plan, 2, study.failed_records(plan, study.KILLED))
     standing = run_study(plan, folder, shard=(2, 3))
     assert standing.failed == standing.trials
     assert standing.first_error == study.KILLED.strip()

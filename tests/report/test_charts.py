@@ -224,7 +224,7 @@ def test_over_words_means_are_shifted_points_with_bars_and_the_bound_is_a_dash(t
 def test_each_of_two_variables_has_charts_with_every_combination(tmp_path):
     grid = '"rays.exponent" = [1, 3]\n"beacon.level_db" = [36.8, 48.8]'
     study, charts = charts_of(tmp_path, grid, effect=by_level(0.3))
-    for name, variable in (("rays_power", 0), ("beacon_level_db", 1)):
+    for name, variable in (("rays_exponent", 0), ("beacon_level_db", 1)):
         chart = charts[f"position_rmse_by_{name}"]
         assert chart.title == f"Position RMSE, over {study.variables[variable].name}"
         shown = np.array([line_of(panel, "fused").y for panel in chart.panels])
@@ -361,7 +361,7 @@ def test_the_gain_is_charted_along_each_variable_a_line_for_each_combination_of_
     study = read_study(tmp_path / "s")
     selection = select(study, "none")
     by_power, by_level = gain_charts(selection)
-    assert (by_power.name, by_level.name) == ("gain_by_rays_power", "gain_by_beacon_level_db")
+    assert (by_power.name, by_level.name) == ("gain_by_rays_exponent", "gain_by_beacon_level_db")
     assert "a line for each value of beacon.level_db, that of beacon.level_db = 36.8" in (
         by_power.caption
     )

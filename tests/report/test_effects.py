@@ -631,7 +631,7 @@ def test_each_variable_has_a_sentence_averaged_over_all_cases(planted):
     ways = 'strategies = ["active", "fused"]\nfilters = ["ekf"]\n'
     level, power = planted(LEVELS + '\n"rays.exponent" = [1.0, 3.0]', ways=ways, effect=effect)
     assert re.match(r"beacon\.level_db from 36\.8 to 48\.8 lowers the .* averaged over 4", level)
-    assert re.match(r"rays\.power from 1 to 3: no effect .* shown; .* averaged over 6", power)
+    assert re.match(r"rays\.exponent from 1 to 3: no effect .* shown; .* averaged over 6", power)
 
 
 def test_a_filter_from_outside_counts_in_the_average():

@@ -535,7 +535,7 @@ def test_a_bag_of_two_sonars_maps_landmarks_however_wide_their_cones_are(obey, u
 def test_discarded_rows_are_counted_by_the_limits_of_each_filter(obey, undrawn):
     sonars(Path("walk.mcap"))
     words = ["slam", "walk.mcap", "--association.method", "marginal", "--filter", "ekf,smoother"]
-    Path("own.toml").write_text("[own.ekf.association]\nbearing_std = 0.04\n")
+    Path("own.toml").write_text("[own.ekf.association]\nmax_angle_std = 0.04\n")
     assert obey(*words, "--config", "own.toml", "-o", "out")[0] == 0
     ekf, smoother = summary("out")["runs"]
     assert ekf["ignored_rows"]["unsure_bearing"] > 10

@@ -318,7 +318,7 @@ ROWS = {
 def test_measurements_without_labels_are_refused_with_both_remedies(tmp_path):
     rows = "time,bearing,range\n0.1,0.5,1\n"
     folder = recorded(tmp_path, measurements=rows)
-    refused(folder, "line 1", "the same whenever it is seen", "for --association.method to decide")
+    refused(folder, "line 1", "the same number in all rows", "for --association.method to decide")
 
 
 @pytest.mark.parametrize("label", ["", "-1"])

@@ -156,7 +156,7 @@ def test_a_precise_bearing_updates_a_ray_within_its_members_linearity(kind):
 
 
 def test_fitted_rays_with_the_printed_likelihood_are_refused():
-    with pytest.raises(ValueError, match='spacing "auto" needs likelihood "normal"'):
+    with pytest.raises(ValueError, match='precise_bearings "auto" needs likelihood "normal"'):
         RayConfig(precise_bearings="auto", likelihood="printed")
     assert resolve(from_flags({"rays": {"precise_bearings": "auto"}})) != Config()
 

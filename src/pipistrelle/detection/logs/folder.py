@@ -117,7 +117,7 @@ def read_log(folder: Path) -> Log:
     >>> log.time, log.controls[:, 0].round(12)
     (array([0. , 0.5, 0.6]), array([1.6, 2. ]))
     >>> log.scans[0].time, log.scans[0].landmark, log.scans[0].range
-    (0.5, array([7]), array([nan]))
+    (0.3, array([7]), array([nan]))
     """
     vehicle, former = read_vehicle(folder / "log.toml")
     names = [caller.name for caller in vehicle.callers]
