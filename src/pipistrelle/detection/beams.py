@@ -333,12 +333,12 @@ def edge_around(
     Of a tone by `front_edge`; of a sweep by two calls, if they fit better than one.
     """
     pulse, more, bearing = wide.call.pulse, wide.margin + TAPS, bearing - wide.normal
-    step, reach = 1.0, 3 * pulse
-    if not wide.call.tone:
+    if wide.call.tone:
+        step, before, after = 1.0, 3 * pulse, pulse - 1
+    else:
         step = PAIR_STEP / (wide.band.spread * wide.call.interval)
-        reach = math.ceil(step * wide.alike.size)
-    low, last = max(b - reach, 0), matched.shape[1] - 1
-    high = min(b + (pulse - 1 if wide.call.tone else reach), last)
+        before = after = math.ceil(step * wide.alike.size)
+    low, high = max(b - before, 0), min(b + after, matched.shape[1] - 1)
     sound = np.empty((len(matched), high - low + 1 + 2 * more), dtype=np.complex64)
     _cut_out(np.ascontiguousarray(matched, dtype=np.complex64), low - more, sound)
     beam = np.empty(int((high - low) / step) + 1, dtype=np.complex128)
