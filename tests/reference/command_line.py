@@ -25,7 +25,7 @@ def track(folder, name):
 def table(printed):
     """Parse the rows of the final table: title and cells, eleven characters each."""
     lines = [line for line in printed.splitlines()[:-1] if line != IN_ONE_WORLD]
-    lines = list(takewhile(lambda line: not line.startswith("Listening"), lines))
+    lines = list(takewhile(bool, lines))
     return {line[:32].strip(): re.findall(r".{11}", line[32:]) for line in lines[2:]}
 
 

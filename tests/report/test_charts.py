@@ -20,7 +20,7 @@ from pipistrelle.report.charts import (
 from pipistrelle.report.effects import effects_of, measures_of
 from pipistrelle.report.sentences import TABLE_II
 from pipistrelle.report.study import COMMON, RULES, lap_time, read_study, select
-from pipistrelle.report.variables import axis_of, axis_of_words
+from pipistrelle.report.variables import axis_of, axis_of_words, with_article
 from report.invented import BEAMWIDTH, diverging, invent, narrowed, only
 from report.planted import LEVELS as GRID
 from report.planted import by_level, write_planted
@@ -226,7 +226,7 @@ def test_each_of_two_variables_has_charts_with_every_combination(tmp_path):
     study, charts = charts_of(tmp_path, grid, effect=by_level(0.3))
     for name, variable in (("rays_exponent", 0), ("beacon_level_db", 1)):
         chart = charts[f"position_rmse_by_{name}"]
-        assert chart.title == f"Position RMSE, over {study.variables[variable].name}"
+        assert chart.title == f"Position RMSE, over {with_article(study.variables[variable])}"
         shown = np.array([line_of(panel, "fused").y for panel in chart.panels])
         table = study.trials["ekf", "fused"].scores["position_rmse_m"].mean(axis=0).reshape(2, 2)
         np.testing.assert_allclose(shown, table.T if variable == 0 else table, rtol=1e-12)
@@ -288,7 +288,7 @@ def selection(tmp_path):
 def test_each_measure_has_a_panel_and_each_strategy_its_points(selection):
     (chart,) = effect_charts(selection)
     assert (chart.name, chart.title) == (
-        "effect_beacon_level_db_ekf", "What beacon.level_db changes, EKF",
+        "effect_beacon_level_db_ekf", "What the beacon level changes, EKF",
     )  # fmt: skip
     assert [panel.title for panel in chart.panels] == [
         measure.title for measure in measures_of(selection.study)
@@ -362,7 +362,7 @@ def test_the_gain_is_charted_along_each_variable_a_line_for_each_combination_of_
     selection = select(study, "none")
     by_power, by_level = gain_charts(selection)
     assert (by_power.name, by_level.name) == ("gain_by_rays_exponent", "gain_by_beacon_level_db")
-    assert "a line for each value of beacon.level_db, that of beacon.level_db = 36.8" in (
+    assert "a line for each value of the beacon level, that of beacon.level_db = 36.8" in (
         by_power.caption
     )
     active, fused = (study.trials["ekf", w].scores["position_rmse_m"] for w in ("active", "fused"))

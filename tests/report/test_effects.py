@@ -460,7 +460,7 @@ def planted(tmp_path):
 def test_a_planted_effect_is_answered_with_its_size_and_interval(planted, metres, verb):
     (sentence,) = planted(effect=by_level(metres))
     match = re.fullmatch(
-        rf"beacon\.level_db from 36\.8 to 48\.8 {verb} the position RMSE by "
+        rf"The beacon level from 36\.8 to 48\.8 {verb} the position RMSE by "
         r"([\d.]+) m \[([\d.]+), ([\d.]+)\]\.", sentence,
     )  # fmt: skip
     mean, low, high = map(float, match.groups())
@@ -472,7 +472,7 @@ def test_a_planted_effect_is_answered_with_its_size_and_interval(planted, metres
 def test_no_effect_is_answered_with_the_change_and_its_interval(planted):
     (sentence,) = planted()
     match = re.fullmatch(
-        r"beacon\.level_db from 36\.8 to 48\.8: no effect on the position RMSE was shown; "
+        r"The beacon level from 36\.8 to 48\.8: no effect on the position RMSE was shown; "
         r"the change is (−?[\d.]+) m \[(−?[\d.]+), (−?[\d.]+)\]\.", sentence,
     )  # fmt: skip
     mean, low, high = (float(text.replace("−", "-")) for text in match.groups())
@@ -505,7 +505,7 @@ def test_a_change_that_is_equal_in_every_world_has_no_interval(tmp_path):
         ([0.0, 0.0, 0.0], "leaves the position RMSE the same to the last digit."),
     ):
         position[:] = 0.5 * np.arange(12)[:, None] + np.array(rises)
-        assert answer_of(study) == [f"beacon.level_db from 36.8 to 48.8 {words}"]
+        assert answer_of(study) == [f"The beacon level from 36.8 to 48.8 {words}"]
 
 
 def off_by(metres):
@@ -531,25 +531,25 @@ NEAR = {"[0.5, 20.0]": 0.0, "[1.0, 20.0]": 0.4, "[2.0, 20.0]": -0.6, "[3.0, 20.0
     [
         (
             LEVELS, by_value("beacon.level_db", **{"36.8": 0.0, "42.8": -0.4, "48.8": 0.0}),
-            rf"beacon\.level_db from 36\.8 to 42\.8 lowers the .* by 0\.\d+ m {INTERVAL}\.",
+            rf"The beacon level from 36\.8 to 42\.8 lowers the .* by 0\.\d+ m {INTERVAL}\.",
         ),
         (
             '"rays.weights" = ["instantaneous", "aggregated"]',
             by_value("rays.weights", instantaneous=0.0, aggregated=0.4),
-            r"rays\.weights = aggregated instead of instantaneous raises the position RMSE by .*",
+            r"Aggregated instead of instantaneous as the rays weights raises the position .*",
         ),
         (
             f'"rays.range_bounds" = [{", ".join(NEAR)}]', by_value("rays.range_bounds", **NEAR),
-            r"rays\.range_bounds = \[2, 20\] instead of \[0\.5, 20\] lowers .*",
+            r"\[2, 20\] instead of \[0\.5, 20\] as the rays range bounds lowers .*",
         ),
         (
             SOUNDS, off_by(0.3),
-            r"assumed\.speed_of_sound from 343 to 3(37|49) raises the position RMSE by "
+            r"The assumed speed of sound from 343 to 3(37|49) raises the position RMSE by "
             rf"0\.[23]\d* m {INTERVAL}\.",
         ),
         (
             '"assumed.speed_of_sound" = [337.0, 343.0]', off_by(0.3),
-            r"assumed\.speed_of_sound from 343 to 337 raises .*",
+            r"The assumed speed of sound from 343 to 337 raises .*",
         ),
     ],
     ids=["between the ends", "words", "the largest of several", "either side", "one side"],
@@ -621,7 +621,7 @@ def test_an_answer_is_undecided_without_worlds(tmp_path, worlds):
     if worlds == 3:
         study.trials["ekf", "fused"].failed[:] = True
     left = "a single world is left" if worlds == 1 else "no world is left"
-    assert answer_of(study) == [f"beacon.level_db from 36.8 to 48.8: not decided, {left}."]
+    assert answer_of(study) == [f"The beacon level from 36.8 to 48.8: not decided, {left}."]
 
 
 def test_each_variable_has_a_sentence_averaged_over_all_cases(planted):
@@ -630,8 +630,8 @@ def test_each_variable_has_a_sentence_averaged_over_all_cases(planted):
 
     ways = 'strategies = ["active", "fused"]\nfilters = ["ekf"]\n'
     level, power = planted(LEVELS + '\n"rays.exponent" = [1.0, 3.0]', ways=ways, effect=effect)
-    assert re.match(r"beacon\.level_db from 36\.8 to 48\.8 lowers the .* averaged over 4", level)
-    assert re.match(r"rays\.exponent from 1 to 3: no effect .* shown; .* averaged over 6", power)
+    assert re.match(r"The beacon level from 36\.8 to 48\.8 lowers the .* averaged over 4", level)
+    assert re.match(r"The rays exponent from 1 to 3: no effect .* shown; .* averaged over 6", power)
 
 
 def test_a_filter_from_outside_counts_in_the_average():

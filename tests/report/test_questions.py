@@ -70,10 +70,10 @@ def reported(tmp_path):
 
 def test_a_planted_effect_is_in_the_answer_in_the_table_and_in_the_summary(reported):
     page = reported(effect=by_level(0.34), ways=BOTH)
-    assert "What does beacon.level_db change?" in page.header
+    assert "What does the beacon level change?" in page.header
     sentence = (
         r"no effect on the aligned position RMSE was shown; .*"
-        r"beacon\.level_db from 36\.8 to 48\.8 raises the position RMSE by 0\.3\d* m "
+        r"The beacon level from 36\.8 to 48\.8 raises the position RMSE by 0\.3\d* m "
         r"\[0\.\d+, 0\.\d+\], averaged over 2 cases\."
     )
     assert re.search(sentence, page.header)
@@ -85,13 +85,13 @@ def test_a_planted_effect_is_in_the_answer_in_the_table_and_in_the_summary(repor
     assert everything["alone"][0] < 0.34 < everything["alone"][1]
     assert page.summary["answered_by"] == "none"
     assert 'id="rule-none" checked' in page.text
-    assert page.summary["question"] == "What does beacon.level_db change?"
+    assert page.summary["question"] == "What does the beacon level change?"
 
 
 def test_a_table_of_false_assumptions_has_a_row_for_either_side_of_the_truth(reported):
     page = reported('"assumed.wheelbase" = [0.16, 0.18, 0.2, 0.22, 0.24]', ways=BOTH, worlds=3)
     table, every = page.said(*SECTION).split(EVERY)
-    assert table.startswith("assumed.wheelbase, against 0.2 ")
+    assert table.startswith("The assumed wheelbase, against 0.2 ")
     ends, inner = ("0.16", "0.24"), ("0.18", "0.22")
     for part, values in ((table, ends), (every, (*ends, *inner))):
         for strategy in ("fused", "passive"):
@@ -103,7 +103,7 @@ def test_a_table_of_false_assumptions_has_a_row_for_either_side_of_the_truth(rep
 def test_where_the_truth_is_the_greatest_value_a_table_goes_down_from_it(reported):
     page = reported('"assumed.wheelbase" = [0.16, 0.18, 0.2]', worlds=3)
     table, every = page.said(*SECTION).split(EVERY)
-    assert table.startswith("assumed.wheelbase, from 0.2 to 0.16 ")
+    assert table.startswith("The assumed wheelbase, from 0.2 to 0.16 ")
     assert "fused EKF, to 0.18 " in every
 
 
@@ -118,21 +118,21 @@ def test_where_nothing_is_planted_nothing_is_shown_anywhere(reported):
 
 
 KINDS = {
-    "a number": (LEVELS, FUSED_EKF, "What does beacon.level_db change?"),
+    "a number": (LEVELS, FUSED_EKF, "What does the beacon level change?"),
     "an assumption": (
-        '"assumed.wheelbase" = [0.18, 0.2, 0.22]', BOTH, "What does assumed.wheelbase change?",
+        '"assumed.wheelbase" = [0.18, 0.2, 0.22]', BOTH, "What does the assumed wheelbase change?",
     ),
     "a beamwidth": ("beamwidth = [180, 33, 11]", ONE_FILTER, "What does the beamwidth change?"),
     "words": (
-        '"rays.weights" = ["instantaneous", "aggregated"]', BOTH, "What does rays.weights change?",
+        '"rays.weights" = ["instantaneous", "aggregated"]', BOTH, "What does the rays weights ",
     ),
     "lists": (
         '"rays.range_bounds" = [[0.5, 20.0], [0.5, 10.0], [2.0, 40.0]]', FUSED_EKF,
-        "What does rays.range_bounds change?",
+        "What does the rays range bounds change?",
     ),
     "two variables": (
         '"rays.exponent" = [1, 3]\n' + LEVELS, TWO_FILTERS,
-        "What do rays.exponent and beacon.level_db change?",
+        "What do the rays exponent and the beacon level change?",
     ),
     "three variables": (
         'beamwidth = [180, 11]\n"rays.exponent" = [1, 3]\n"air.spreading" = ["paper", "bistatic"]',
@@ -143,14 +143,14 @@ KINDS = {
         "What do emitter.radius and emitter.frequency change?",
     ),
     "other worlds": (
-        '"scenario.landmarks" = [12, 20]', FUSED_EKF, "What does scenario.landmarks change?",
+        '"scenario.landmarks" = [12, 20]', FUSED_EKF, "What does the scenario landmarks change?",
     ),
     "a value alone": ('"rays.exponent" = [3.0]', ONE_FILTER, "How do active, fused and passive"),
     "no grid": ("", ONE_FILTER, "How do active, fused and passive sensing compare?"),
     "two filters": ("", TWO_FILTERS, "How do EKF and invariant EKF compare?"),
     "a filter from outside": (
         LEVELS, 'filters = ["no_such:Slam"]\nstrategies = ["fused"]\n',
-        "What does beacon.level_db change?",
+        "What does the beacon level change?",
     ),
     "one case": ("", FUSED_EKF, "How well does EKF locate the vehicle by fused sensing?"),
     "passive alone": (
@@ -310,8 +310,8 @@ def test_every_interval_is_the_summarys_and_half_of_it_would_have_been_shown(tmp
     assert main(["report", str(folder)]) == 0
     printed = capsys.readouterr().out
     assert INTERVALS in printed
-    _, raw, *_, last = printed.splitlines()
-    assert raw.startswith("beacon.level_db from 36.8 to 48.8 raises the position RMSE by 0")
+    *_, raw, last = printed.splitlines()
+    assert raw.startswith("The beacon level from 36.8 to 48.8 raises the position RMSE by 0")
     assert last == str(folder / "report" / "index.html")
     (row,) = (line for line in printed.splitlines() if line.startswith("fused EKF"))
     assert re.match(r"fused EKF +\+0\.3\d* m\* +\[0\.\d+, 0\.\d+\]$", row)

@@ -23,7 +23,7 @@ from pipistrelle.evaluation.scores import SCORES
 from pipistrelle.experiments.studies.plan import Plan
 from pipistrelle.scripting import missions
 from pipistrelle.settings import from_text
-from pipistrelle.verbs.console import listening
+from pipistrelle.verbs.console import answer
 from reference.command_line import COMPILING, SHORT, contents, summary, table, track
 from reference.results import loop, mission_folder, study_folder
 from report.drawing import draw_only
@@ -54,28 +54,27 @@ def test_a_run_prints_its_stages_scores_and_folder(obey):
         "position bound over worlds [m]", "heading bound over worlds [rad]",
     ]  # fmt: skip
     assert IN_ONE_WORLD in printed
-    placed = [run["landmarks_full"] for run in runs]
-    assert f"\nListening: {placed[1]} landmarks" in printed
+    assert f"\n\nListening, ekf: {runs[1]['landmarks_full']} landmark" in printed
     assert {"mission.png", "mission.pdf", "config.toml"} <= {p.name for p in Path("one").iterdir()}
 
 
-def test_fused_sensing_is_compared_with_active_by_the_finite_scores_of_each_estimator():
+def test_the_closing_sentence_is_on_listening_or_on_the_most_accurate_estimate():
     active = {"landmarks_full": 20, "position_rmse_aligned_m": 0.018, "map_rmse_shared_m": 0.041}
     fused = {"landmarks_full": 38, "position_rmse_aligned_m": 0.013, "map_rmse_shared_m": 0.008}
-    far = {"landmarks_full": 9, "position_rmse_aligned_m": inf, "position_rmse_m": inf}
-    active["position_rmse_m"] = fused["position_rmse_m"] = 0.282
-    active |= {"map_rmse_m": 0.089, "map_rmse_aligned_m": 0.071}
+    far = {"landmarks_full": 1, "position_rmse_aligned_m": inf, "diverged": True}
     one = [("active", "ekf", active), ("fused", "ekf", fused)]
-    assert list(listening(one)) == [
-        "Listening: 38 landmarks instead of 20; after alignment the path is off by 13 mm instead "
-        "of 18 mm, and the landmarks that all strategies placed by 8 mm instead of 41 mm. Most of "
-        "the raw position error is one rigid motion."
-    ]
-    assert list(listening(one[1:])) == [], "nothing to compare with"
-    (same,) = listening([("active", "ekf", fused), one[1]])
-    assert same.startswith("Listening: 38 landmarks, as without; after")
-    two = [*one, ("active", "iekf", active), ("fused", "iekf", far)]
-    assert list(listening(two))[1] == "Listening, iekf: 9 landmarks instead of 20."
+    listening = (
+        "Listening, ekf: 38 landmarks instead of 20; aligned path error 13 mm instead of 18 mm; "
+        "aligned error of the landmarks that all strategies placed 8 mm instead of 41 mm."
+    )
+    assert answer(one) == listening
+    assert answer([("active", "iekf", active), ("fused", "iekf", far), *one]) == listening
+    assert answer([*one, ("fused", "smoother", active)]) == listening, "without active sensing"
+    assert answer([("all rows", "my:Own", far)]) == "My:Own: 1 landmark; diverged."
+    two = [("active", "iekf", far), one[0]]
+    assert answer(two).startswith("Active ekf: 20 landmarks; aligned path error 18 mm; aligned er")
+    untrue = {"landmarks_full": 7, "position_rmse_aligned_m": None, "final_std_m": 0.25}
+    assert "of the final position 250 mm." in answer([("all rows", "smoother", untrue)])
 
 
 @pytest.mark.parametrize(("words", "said"), [((), 1), (("--quiet",), 0)])

@@ -50,7 +50,7 @@ if TYPE_CHECKING:
 K = TypeVar("K", bound=Hashable)
 LETTERS = "ABCDEFGHIJKLMNOPQRSTUVWXYZ"
 """Short names of folders."""
-POSITION = "position_rmse_m"
+POSITION, POSITION_ALIGNED = "position_rmse_m", "position_rmse_aligned_m"
 SIGNIFICANCE = 0.05
 """Differences with a smaller p, corrected for all cases, are marked as shown."""
 ROUNDING = 1e-6
@@ -129,8 +129,8 @@ class ComparedStudies(Compared):
     """Numbers of finished and of planned worlds."""
     rows: tuple[Mapping[str, Any], ...]
     """Rows of `comparison_table`: by score, then by case, then by study."""
-    overall: tuple[Contrast, ...]
-    """Position RMSE of each other study, averaged over the cases of a world."""
+    overall: tuple[tuple[str, Contrast], ...]
+    """Position RMSEs, aligned and raw, of each other study, averaged over the cases of a world."""
 
 
 def are_studies(folders: Sequence[Path]) -> bool:
@@ -493,8 +493,8 @@ def _judged(
     frame: "pl.DataFrame",
     varied: Sequence[str],
     widths: Mapping[int, float],
-) -> tuple[tuple[dict[str, Any], ...], tuple[Contrast, ...]]:
-    """Judge the differences between studies: each score by case, and the mean position RMSE.
+) -> tuple[tuple[dict[str, Any], ...], tuple[tuple[str, Contrast], ...]]:
+    """Judge the differences between studies: each score by case, and the mean position RMSEs.
 
     `frame`: of the matched cases. `widths`: beamwidths of the cases of the first study [deg].
     """
@@ -535,8 +535,13 @@ def _judged(
         )
     paired = set(range(len(folders))) - {one.b for one in judged if not one.paired}
     draw = pl.col("folder").replace(dict.fromkeys(paired, 0))
-    position = position.with_columns(draw=draw)
-    return tuple(rows), contrasts(position, "folder", over=["match"], draw="draw")
+    overall = []
+    for score in (POSITION_ALIGNED, POSITION):
+        errors = frame.filter(pl.col("score") == score).with_columns(draw=draw)
+        overall += [
+            (score, one) for one in contrasts(errors, "folder", over=["match"], draw="draw")
+        ]
+    return tuple(rows), tuple(overall)
 
 
 def _version(folder: Path) -> str:

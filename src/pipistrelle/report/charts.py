@@ -377,11 +377,12 @@ def effect_charts(selection: Selection) -> list[Chart]:
         axis = axis_of(variable) if variable else axis_of_words(words)
         at = dict(zip(words, places(variable) if variable else range(len(words)), strict=True))
         title = titles.get(whose, f"{whose} sensing")
+        what = with_article(variable) if variable else f"the {factor}"
         mean = "averaged over the combinations of the rest, " if family[0].apart else ""
         charts.append(
             Chart(
                 name=f"effect_{slug(factor)}_{slug(whose)}",
-                title=f"What {'the ' * ('.' not in factor)}{factor} changes, {title}",
+                title=f"What {what} changes, {title}",
                 caption=f"Difference to {first} in the same world, {mean}mean over worlds and its "
                 "95 % interval as one of its family. Full: shown, by Holm's correction. Map: "
                 "landmarks that both have placed. NEES: the ratio",

@@ -371,7 +371,7 @@ def headline(subject: str, title: str, unit: str, contrast: Contrast, cases: int
     which the change is averaged.
     """
     finding, mean_of = contrast.finding, f", averaged over {cases} cases" * (cases > 1)
-    begin = subject if "." in subject.split()[0] else subject[0].upper() + subject[1:]
+    begin = subject[0].upper() + subject[1:]
     if finding.n < 2:
         left = "a single world is left" if finding.n else "no world is left"
         return f"{begin}: not decided, {left}{mean_of}."
@@ -461,7 +461,7 @@ def _averaged(
         if variable is not None:
             subject = f"{with_article(variable)} from {before} to {after}"
             if variable.numbers is None:
-                subject = f"{variable.name} = {after} instead of {before}"
+                subject = f"{after} instead of {before} as {with_article(variable)}"
         title = ANSWERED[group[0].measure.score]
         sentence = headline(subject, title, "m", contrast, len(some))
         signs = {direction(effect.finding) for effect in group}

@@ -149,8 +149,9 @@ def two_sided(variable: Variable) -> bool:
 
 
 def with_article(variable: Variable) -> str:
-    """Return a variable's name for a sentence; only the beamwidth has an article."""
-    return f"the {variable.name}" if variable.name == BEAM else variable.name
+    """Return a variable's name for a sentence: "the beacon level" for `beacon.level_db`."""
+    name = re.sub("_(db|deg|c|kpa)$", "", variable.name)
+    return f"the {re.sub('[._]', ' ', name)}"
 
 
 def geometric(numbers: Sequence[float]) -> bool:

@@ -7,14 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 from cyclopts import Parameter
 
 from pipistrelle.evaluation.scores import heading, shown_in
-from pipistrelle.verbs.console import (
-    announced,
-    command_line,
-    listening,
-    number,
-    output_to,
-    text_table,
-)
+from pipistrelle.verbs.console import announced, command_line, number, output_to, text_table
 from pipistrelle.verbs.streams import put, say
 
 
@@ -43,12 +36,10 @@ def report(
             put(f"partial: {summary['worlds_done']} of {summary['worlds_planned']} worlds")
         if count := summary["trials_failed"]:
             put(f"failed: {count} trial{'' if count == 1 else 's'}; see the page")
-        for sentence in summary["answer"]:
-            put(sentence)
         if not summary["claims"]:
             for table in summary["effect_tables"]:
-                put("\n" + _effects(table))
-            put(f"\n*: shown. {INTERVALS}")
+                put(_effects(table) + "\n")
+            put(f"*: shown. {INTERVALS}")
             if (count := summary["worlds_done"]) < MIN_WORLDS:
                 worlds = "1 world" if count == 1 else f"{count} worlds"
                 put(f"This is of {worlds}: so few may show what others would not.")
@@ -60,6 +51,7 @@ def report(
             held = ", ".join(f"{claim[name]} of {count} by {name}" for name in YARDSTICKS)
             numbers = ", ".join(map(str, claim["decided_by"]))
             put(f"{'':<18} Sentences that hold: {held}; {verdict}: {numbers}.")
+        put("\n" + "\n".join(summary["answer"]))
     put(target / "index.html")
 
 
@@ -114,12 +106,12 @@ def compare(
     names = dict(zip(comparing.LETTERS, map(spelt, folders), strict=False))
     if comparing.are_studies(folders):
         compared = comparing.compare_studies(folders, drop_diverged=drop_diverged)
-        from pipistrelle.report.effects import headline
+        from pipistrelle.report.effects import ANSWERED, headline
 
         cases = sum(r["score"] == comparing.POSITION and r["letter"] == "B" for r in compared.rows)
         answer = [
-            headline(f"{comparing.LETTERS[one.b]} instead of A", "position RMSE", "m", one, cases)
-            for one in compared.overall
+            headline(f"{comparing.LETTERS[one.b]} instead of A", ANSWERED[score], "m", one, cases)
+            for score, one in compared.overall
         ]
         tables = _study_tables(compared)
         for letter, (done, planned) in zip(names, compared.worlds, strict=True):
@@ -152,32 +144,28 @@ def compare(
             ]
             settings = text_table("", [["settings that differ", *compared.folders]], rows)
         head = "\n".join(f"{letter}  {name}" for letter, name in names.items())
-        blocks = [head, "\n".join(answer), *tables, settings, "\n".join(compared.notes)]
+        blocks = [head, *tables, settings, "\n".join(compared.notes), "\n".join(answer)]
         put("\n\n".join(block for block in blocks if block))
     if output is not None:
         put(output)
 
 
 def _missions_answer(compared: "ComparedMissions") -> list[str]:
-    """Return a sentence for each other folder's position RMSE, and for fused sensing in each."""
-    from pipistrelle.experiments.comparing import POSITION, less
+    """Return sentences on the change of each position error from the first folder to each other."""
+    from pipistrelle.experiments.comparing import less
+    from pipistrelle.report.effects import ANSWERED
     from pipistrelle.report.variables import amount
 
-    errors, lines = [one.scores.get(POSITION) for one in compared.estimates], []
+    lines = []
     for i, letter in list(enumerate(compared.folders))[1:]:
-        gaps = [less(error[i], error[0]) for error in errors if error]
-        known = [gap for gap in gaps if gap is not None]
-        if known:
-            mean, count = sum(known) / len(known), len(known)
-            size = "+" * (mean > 0.0) + amount(mean, "m")
-            mean_of = f", averaged over {count} estimates" * (count > 1)
-            lines.append(f"{letter} instead of A changes the position RMSE by {size}{mean_of}.")
-    for i, letter in enumerate(compared.folders):
-        scores = (
-            (*one.estimates[i], {name: values[i] for name, values in one.scores.items()})
-            for one in compared.estimates
-        )
-        lines += [f"{letter}: {line}" for line in listening(scores)]
+        for score, title in ANSWERED.items():
+            errors = [one.scores[score] for one in compared.estimates if score in one.scores]
+            gaps = [less(error[i], error[0]) for error in errors]
+            if known := [gap for gap in gaps if gap is not None]:
+                mean, count = sum(known) / len(known), len(known)
+                size = "+" * (mean > 0.0) + amount(mean, "m")
+                mean_of = f", averaged over {count} estimates" * (count > 1)
+                lines.append(f"{letter} instead of A changes the {title} by {size}{mean_of}.")
     return lines
 
 

@@ -7,7 +7,7 @@ import sys
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict
-from math import isfinite, sqrt
+from math import inf, isfinite, nan, sqrt
 from textwrap import fill
 from threading import Timer
 from typing import TYPE_CHECKING, Any
@@ -32,10 +32,10 @@ NIS = (
 """Note below a table with innovations."""
 POSITION_ALIGNED = "position_rmse_aligned_m"
 ALIGNED = {
-    POSITION_ALIGNED: "the path is off",
-    "map_rmse_shared_m": "the landmarks that all strategies placed",
+    POSITION_ALIGNED: "aligned path error",
+    "map_rmse_shared_m": "aligned error of the landmarks that all strategies placed",
 }
-"""Scores that compare fused with active sensing, in words."""
+"""Scores of the closing sentence of a mission, in words."""
 
 
 def command_line() -> str:
@@ -153,56 +153,61 @@ def closing_table(
         for title, *cells in ([("",)] * (k > 0) + lines)
     ]
     bounded = any(trial.scores.position_bound_m is not None for trial in trials)
-    weighed = any(column[NIS_TITLE] for column in columns)
-    scores = [(trial.strategy, trial.filter, asdict(trial.scores)) for trial in trials]
+    weighed = any(column.get(NIS_TITLE) for column in columns)
+    scores = [asdict(trial.scores) | {"final_std_m": _final_std(trial)} for trial in trials]
+    turned = [
+        title
+        for title in ("position", "map")
+        if all(
+            (one[f"{title}_rmse_aligned_m"] or inf) < sqrt(0.5) * (one[f"{title}_rmse_m"] or 0.0)
+            for one in scores
+        )
+    ]
     notes = [
         *[IN_ONE_WORLD] * bounded,
+        *[f"Most of the raw {' and '.join(turned)} error is one rigid motion."] * bool(turned),
         *[NIS] * weighed,
-        *(fill(line, 100) for line in listening(scores)),
     ]
-    return "\n".join([*rows, *notes])
+    ways = zip(heads, filters, scores, strict=True)
+    return "\n".join([*rows, *notes, "", fill(answer(ways), 100)])
 
 
-def listening(estimates: Iterable[tuple[str, str, Mapping[str, Any]]]) -> Iterator[str]:
-    """Yield a sentence for each estimator that compares its fused with its active sensing.
+def answer(estimates: Iterable[tuple[str, str, Mapping[str, Any]]]) -> str:
+    """Summarise a mission in a sentence: its most accurate estimate, and the effect of listening.
 
-    `estimates`: strategy, estimator and scores of each.
+    `estimates`: strategy, estimator and scores of each; without truth also `final_std_m`.
     """
-    found = {(strategy, name): scores for strategy, name, scores in estimates}
-    several = len({name for _, name in found}) > 1
-    for (strategy, name), fused in found.items():
-        active = found.get(("active", name), {})
-        placed = [scores.get("landmarks_full") for scores in (fused, active)]
-        if strategy != "fused" or None in placed:
-            continue
-        counts = " landmarks instead of ".join(dict.fromkeys(f"{count:.0f}" for count in placed))
-        counts += " landmarks, as without" * (placed[0] == placed[1])
-        line = f"Listening{f', {short_name(name)}' * several}: {counts}"
-        said = []
-        for score, title in ALIGNED.items():
-            ends = (scores.get(score) for scores in (fused, active))
-            known = [f"{1e3 * end:.0f} mm" for end in ends if end is not None and isfinite(end)]
-            if len(known) == 2:
-                said.append(f"{title} by {' instead of '.join(known)}")
-        if said:
-            line += f"; after alignment {', and '.join(said)}"
-        own = [scores for (_, estimator), scores in found.items() if estimator == name]
-        turned = [what for what in ("position", "map") if all(_is_turned(s, what) for s in own)]
-        if turned:
-            line += f". Most of the raw {' and '.join(turned)} error is one rigid motion"
-        yield f"{line}."
+    found = {(way, name): scores for way, name, scores in estimates}
+    pairs = [key for key in found if key[0] == "fused" and ("active", key[1]) in found]
+    errors = {key: found[key].get(POSITION_ALIGNED) or nan for key in pairs or found}
+    best = min(errors, key=lambda key: (not isfinite(errors[key]), errors[key]))
+    scores, other = found[best], found["active", best[1]] if pairs else {}
+    count, before = scores["landmarks_full"], other.get("landmarks_full")
+    said = [f"{count} landmark{'s' * (count != 1)}"]
+    if pairs:
+        said[0] += ", as without" if count == before else f" instead of {before}"
+    for score, title in ALIGNED.items():
+        ends = [one[score] for one in (scores, other) if isfinite(one.get(score) or nan)]
+        if len(ends) == 1 + bool(pairs):
+            said.append(f"{title} {' instead of '.join(map(_length, ends))}")
+    if std := scores.get("final_std_m"):
+        said.append(f"standard deviation of the final position {_length(std)}")
+    said += ["diverged"] * bool(scores.get("diverged"))
+    name = f"listening, {best[1]}" if pairs else " ".join(best[len(found) == 1 :])
+    return f"{name[0].upper()}{name[1:]}: {'; '.join(said)}."
 
 
-def _is_turned(scores: Mapping[str, Any], name: str) -> bool:
-    """Return whether most of a squared error, of position or map, is a rigid motion."""
-    raw, aligned = (scores.get(f"{name}_rmse{kind}_m") for kind in ("", "_aligned"))
-    return raw is not None and aligned is not None and aligned < sqrt(0.5) * raw
+def _length(value: float) -> str:
+    """Format a length in millimetres, or in metres from 1 m on."""
+    return f"{1e3 * value:.0f} mm" if value < 1.0 else f"{value:.2f} m"
 
 
 def _cells(
     trial: "TrialResult", count: int | None, driven: float | None
 ) -> Iterator[tuple[str, str]]:
     """Yield title and text of each score of an estimate; the text is "" if it is missing."""
+    from pipistrelle.experiments.results.scores import judged
+
     s = trial.scores
     for name, score in shown_in("mission").items():
         yield heading(score), number(getattr(s, name), score.digits)
@@ -211,25 +216,23 @@ def _cells(
     yield "fully placed, particles' mean", number(trial.track.full, 1)
     yield "measurements per frame", number(s.measurements_per_frame, 2)
     yield "rejected by the gate", str(s.gated or "")
-    yield from _without_truth(trial, driven)
+    if s.position_rmse_m is None:
+        share = 100.0 * s.gated / measurements if (measurements := judged(trial.scans)) else None
+        yield NIS_TITLE, number(s.nis_mean, 2)
+        yield "rejected by the gate [%]", number(share, 2)
+        yield "final position, 1 sigma [m]", number(_final_std(trial), 3)
+        yield "driven, by the odometry [m]", number(driven, 1)
     for name, (value, std) in trial.track.calibration.items():
         yield name.replace("_", " "), f"{value:.5g}"
         yield f"{name.replace('_', ' ')}, 1 sigma", f"{std:.2g}"
     yield "diverged", "yes" if s.diverged else ""
 
 
-def _without_truth(trial: "TrialResult", driven: float | None) -> Iterator[tuple[str, str]]:
-    """Yield table rows that describe an estimate without truth: NIS, gate, deviations."""
-    from pipistrelle.experiments.results.scores import judged
-
-    pose, measurements = trial.track.pose, judged(trial.scans)
-    scored = trial.scores.position_rmse_m is not None
-    share = None if scored or not measurements else 100.0 * trial.scores.gated / measurements
-    spread = float(pose.covariance[-1, 0, 0] + pose.covariance[-1, 1, 1])
-    yield NIS_TITLE, number(None if scored else trial.scores.nis_mean, 2)
-    yield "rejected by the gate [%]", number(share, 2)
-    yield "final position, 1 sigma [m]", number(None if scored else sqrt(max(spread, 0.0)), 3)
-    yield "driven, by the odometry [m]", number(None if scored else driven, 1)
+def _final_std(trial: "TrialResult") -> float | None:
+    """Return the standard deviation of the final position [m]; None if there is truth."""
+    covariance = trial.track.pose.covariance[-1]
+    variance = max(float(covariance[0, 0] + covariance[1, 1]), 0.0)
+    return sqrt(variance) if trial.scores.position_rmse_m is None else None
 
 
 def number(value: float | None, digits: int, missing: str = "") -> str:
