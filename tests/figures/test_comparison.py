@@ -121,6 +121,7 @@ def test_a_path_that_is_lost_or_far_away_leaves_the_others_to_be_seen(tmp_path):
     left, right = figure.axes[0].get_xlim()
     assert 10.0 < right - left < 60.0
     assert figure.axes[2].get_ylim()[1] < 1e3
+    assert figure.axes[2].get_title("left") == "diverged: B, C"
     figure = draw_comparison(missions_of(tmp_path / "all", *[{("fused", "ekf"): LOST}] * 2))
     figure.draw_without_rendering()
 

@@ -66,7 +66,7 @@ STUDIES = (
     "a row for each case, study and score: means, their difference, its interval by itself "
     "(alone_low, alone_high) and as one of all cases (low, high), and p as one of them (Holm)",
     "the differences by case: thick by itself, thin as one of all cases; full points are "
-    "significant",
+    "significant, crosses had worlds that diverged or failed",
 )
 
 

@@ -312,7 +312,6 @@ def _draw_panel(axes: "Axes", panel: Panel) -> None:
         axes.set_axis_off()
     else:
         axes.grid(True)
-    axes.set_axisbelow(True)
     for name, axis, given in (("x", axes.xaxis, panel.x), ("y", axes.yaxis, panel.y)):
         scale = "log" if given.log else "linear"
         axes.set(**{f"{name}scale": scale, f"{name}lim": given.limits, f"{name}label": given.label})

@@ -39,7 +39,7 @@ def draw_comparison(compared: ComparedMissions | ComparedStudies) -> "Figure":
     Missions have a row for each estimate: paths and landmarks as recorded, the same after a rigid
     motion onto the truth, and the distance from it over time. Studies have a panel for each score
     with the difference of each case: a thick line for its interval by itself, a thin line for its
-    interval within the family.
+    interval within the family, and a cross if any of its worlds diverged or failed.
 
     Returns: a figure that pyplot does not keep.
     """
@@ -73,14 +73,15 @@ def _draw_missions(compared: ComparedMissions) -> "Figure":
         aligned.set_title(f"each turned and shifted onto {whom}", loc="left")
         _draw_errors(figure, (grid[2 * row, 2], grid[2 * row + 1, 2]), estimate, known=known)
     truth = {"color": TRUTH, "lw": 3.2, "alpha": 0.35}
-    entries = [("true path", truth)] if known else []
+    each = "" if compared.one_drive else " of each, in its colour"
+    entries = [(f"true path{each}", truth)] if known else []
     for i, (letter, folder) in enumerate(compared.folders.items()):
         filters = dict.fromkeys(title_of(e.estimates[i][1]) for e in compared.estimates)
         name = f"{_named(letter, folder)} ({' and '.join(filters)})"
         entries.append((name, {"lw": 1.3} | _look(i)))
-    circle = {"lw": 0, "marker": "o", "ms": 3.2, "mfc": "none", "mec": INK}
+    circle = {"color": INK, "lw": 0, "marker": "o", "ms": 3.2, "mfc": "none"}
     entries.append(("placed landmarks", circle))
-    _draw_legend(figure, entries, 5)
+    _draw_legend(figure, entries)
     return figure
 
 
@@ -108,7 +109,6 @@ def _draw_paths(
 ) -> None:
     """Draw on a map the true paths, broad, and each folder's estimated path and landmarks."""
     axes.grid(True)
-    axes.set_axisbelow(True)
     truths = {i: truth for i, truth in enumerate(compared.truths) if truth is not None}
     for i, truth in list(truths.items())[: 1 if compared.one_drive else None]:
         colour = TRUTH if compared.one_drive else _look(i)["color"]
@@ -131,7 +131,6 @@ def _draw_errors(
             error = view.error if first is None else view.error_aligned
             axes.plot(view.time, error, lw=1.1, **_look(i))
         axes.grid(True)
-        axes.set_axisbelow(True)
         what = "error" if known else "from the first"
         axes.set_ylabel(f"{what},\n{name} [m]", multialignment="center")
         errors = [np.asarray(line.get_ydata()) for line in axes.lines]
@@ -141,6 +140,9 @@ def _draw_errors(
         axes.set_xlim(0.0, max(view.time[-1] for view in estimate.views))
         if first is None:
             axes.tick_params(labelbottom=False)
+            diverged = zip(LETTERS, estimate.scores.get("diverged", ()), strict=False)
+            if lost := [letter for letter, is_lost in diverged if is_lost]:
+                axes.set_title(f"diverged: {', '.join(lost)}", loc="left")
         else:
             axes.set_xlabel("time [s]")
         first = first or axes
@@ -157,17 +159,19 @@ def _named(letter: str, folder: Path) -> str:
     return f"{letter}  {name if len(name) <= LONGEST else f'…{name[1 - LONGEST :]}'}"
 
 
-def _draw_legend(
-    figure: "Figure", entries: Sequence[tuple[str, dict[str, Any]]], most: int
-) -> None:
-    """Draw a legend of names and line styles below the panels, in at most `most` columns."""
+def _draw_legend(figure: "Figure", entries: Sequence[tuple[str, dict[str, Any]]]) -> None:
+    """Draw a legend of names and line styles below the panels, in as many columns as fit."""
     from matplotlib.lines import Line2D
 
     handles = [Line2D([], [], **look) for _, look in entries]
-    names, columns = [name for name, _ in entries], min(len(entries), most)
-    legend = figure.legend(handles, names, loc="outside lower left", ncols=columns)
-    for text in legend.get_texts():
-        text.set_parse_math(False)
+    names = [name for name, _ in entries]
+    for columns in range(len(entries), 0, -1):
+        legend = figure.legend(handles, names, loc="outside lower left", ncols=columns)
+        for text in legend.get_texts():
+            text.set_parse_math(False)
+        if columns == 1 or legend.get_window_extent().width < figure.bbox.width:
+            break
+        legend.remove()
 
 
 def _draw_studies(compared: ComparedStudies) -> "Figure":
@@ -176,8 +180,7 @@ def _draw_studies(compared: ComparedStudies) -> "Figure":
     from matplotlib.ticker import MaxNLocator
 
     first, others = compared.rows[0], len(compared.folders) - 1
-    same = ("score", "letter")
-    labels = [r["case"] for r in compared.rows if all(r[name] == first[name] for name in same)]
+    labels = [row["case"] for row in compared.rows if row["score"] == first["score"]][::others]
     there = {row["score"] for row in compared.rows}
     shown = {name: score for name, score in shown_in("studies").items() if name in there}
     rows = -(-len(shown) // ACROSS)
@@ -197,26 +200,31 @@ def _draw_studies(compared: ComparedStudies) -> "Figure":
                 if row[low] is not None and row[high] is not None:
                     axes.hlines(place, row[low], row[high], color=colour, lw=width, zorder=2)
             face = colour if row["p"] < SIGNIFICANCE else "white"
-            axes.plot(row["difference"], place, "o", ms=4.6, mfc=face, mec=colour, zorder=3)
+            mark, size = ("X", 6.6) if row["diverged_first"] or row["diverged"] else ("o", 4.6)
+            axes.plot(row["difference"], place, mark, ms=size, mfc=face, mec=colour, zorder=3)
         title = heading(score).replace(" [", "\u00a0[")  # no line begins with the unit
         axes.set_title(fill(title, TITLE), loc="left", weight="bold")
         axes.set_xlabel("other less A" if others > 1 else "B less A")
         axes.xaxis.set_major_locator(MaxNLocator(4))
-        axes.grid(True, axis="x")
-        axes.set_axisbelow(True)
+        axes.grid(True)
     panels[0].set_yticks(range(len(labels)), labels)
     panels[0].set_ylim(len(labels) - 0.5, -0.5)
     for text in (text for axes in grid[:, 0] for text in axes.get_yticklabels()):
         text.set_parse_math(False)
-    names = [_named(*one) for one in compared.folders.items()]
     entries: list[tuple[str, dict[str, Any]]] = [
-        (name, {"color": RUNS[i % len(RUNS)], "lw": 2.6} if i else {"lw": 0})
-        for i, name in enumerate(names)
+        (_named(*one), {"color": RUNS[i % len(RUNS)], "lw": 2.6} if i else {"lw": 0})
+        for i, one in enumerate(compared.folders.items())
     ]
     entries += [
         ("95 %, by itself", {"color": INK, "lw": 2.6}),
         ("95 %, as one of all cases", {"color": INK, "lw": 0.9}),
-        ("significant so", {"color": INK, "lw": 0, "marker": "o", "ms": 4.6}),
+        (
+            "full: significant as one of all cases",
+            {"color": INK, "lw": 0, "marker": "o", "ms": 4.6},
+        ),
     ]
-    _draw_legend(figure, entries, 6)
+    if any(row["diverged_first"] or row["diverged"] for row in compared.rows):
+        cross = {"color": INK, "mfc": "none", "lw": 0, "marker": "X", "ms": 6.6}
+        entries.append(("diverged or failed in some worlds", cross))
+    _draw_legend(figure, entries)
     return figure

@@ -488,7 +488,6 @@ def draw_maps(
                 sharey=first,
             )
             axes.grid(True)
-            axes.set_axisbelow(True)
             if (row, column - 1) in places:
                 axes.tick_params(labelleft=False)
             else:

@@ -42,8 +42,6 @@ def draw_array(
     group are drawn: along its normal or ahead, and the beam with the highest side lobe.
     """
     import matplotlib
-
-    matplotlib.use("Agg")
     from matplotlib.figure import Figure
 
     with matplotlib.rc_context(STYLE | PLAIN):
@@ -148,9 +146,8 @@ def draw_hearing(overview: Overview) -> "Figure":
             _bearings(axes[number, 1], overview, number)
             axes[number, 0].set_title(f"{name}: matched filter")
             axes[number, 1].set_title(f"{name}: taken for echoes")
-            if end > 0.0:
-                axes[number, 0].set_xlim(0.0, end)
-                axes[number, 1].set_xlim(0.0, end)
+            for panel in axes[number]:
+                panel.set_xlim(0.0, end or None)
     return figure
 
 
