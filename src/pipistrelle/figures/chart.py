@@ -310,8 +310,6 @@ def _draw_panel(axes: "Axes", panel: Panel) -> None:
     if panel.equal:
         axes.set_aspect("equal")
         axes.set_axis_off()
-    else:
-        axes.grid(True)
     for name, axis, given in (("x", axes.xaxis, panel.x), ("y", axes.yaxis, panel.y)):
         scale = "log" if given.log else "linear"
         axes.set(**{f"{name}scale": scale, f"{name}lim": given.limits, f"{name}label": given.label})

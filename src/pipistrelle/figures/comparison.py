@@ -16,6 +16,7 @@ from pipistrelle.experiments.comparing import (
     ComparedMissions,
     ComparedStudies,
 )
+from pipistrelle.figures.chart import PLAIN
 from pipistrelle.figures.style import INK, STYLE, TRUTH
 from pipistrelle.files import spelt
 
@@ -45,7 +46,7 @@ def draw_comparison(compared: ComparedMissions | ComparedStudies) -> "Figure":
     """
     import matplotlib
 
-    with matplotlib.rc_context(STYLE):
+    with matplotlib.rc_context(STYLE | PLAIN):
         if isinstance(compared, ComparedMissions):
             return _draw_missions(compared)
         return _draw_studies(compared)
@@ -68,7 +69,7 @@ def _draw_missions(compared: ComparedMissions) -> "Figure":
             axes.set(xlim=limits[0], ylim=limits[1], aspect="equal", xlabel="x [m]")
         raw.set_ylabel("y [m]")
         title = ", ".join(filter(None, [estimate.title, "as they are"]))
-        raw.set_title(title, loc="left", parse_math=False)
+        raw.set_title(title, loc="left")
         whom = "its truth" if known else "the first"
         aligned.set_title(f"each turned and shifted onto {whom}", loc="left")
         _draw_errors(figure, (grid[2 * row, 2], grid[2 * row + 1, 2]), estimate, known=known)
@@ -108,7 +109,6 @@ def _draw_paths(
     axes: "Axes", compared: ComparedMissions, estimate: ComparedEstimate, *, fitted: bool
 ) -> None:
     """Draw on a map the true paths, broad, and each folder's estimated path and landmarks."""
-    axes.grid(True)
     truths = {i: truth for i, truth in enumerate(compared.truths) if truth is not None}
     for i, truth in list(truths.items())[: 1 if compared.one_drive else None]:
         colour = TRUTH if compared.one_drive else _look(i)["color"]
@@ -130,7 +130,6 @@ def _draw_errors(
         for i, view in enumerate(estimate.views):
             error = view.error if first is None else view.error_aligned
             axes.plot(view.time, error, lw=1.1, **_look(i))
-        axes.grid(True)
         what = "error" if known else "from the first"
         axes.set_ylabel(f"{what},\n{name} [m]", multialignment="center")
         errors = [np.asarray(line.get_ydata()) for line in axes.lines]
@@ -167,8 +166,6 @@ def _draw_legend(figure: "Figure", entries: Sequence[tuple[str, dict[str, Any]]]
     names = [name for name, _ in entries]
     for columns in range(len(entries), 0, -1):
         legend = figure.legend(handles, names, loc="outside lower left", ncols=columns)
-        for text in legend.get_texts():
-            text.set_parse_math(False)
         if columns == 1 or legend.get_window_extent().width < figure.bbox.width:
             break
         legend.remove()
@@ -206,11 +203,8 @@ def _draw_studies(compared: ComparedStudies) -> "Figure":
         axes.set_title(fill(title, TITLE), loc="left", weight="bold")
         axes.set_xlabel("other less A" if others > 1 else "B less A")
         axes.xaxis.set_major_locator(MaxNLocator(4))
-        axes.grid(True)
     panels[0].set_yticks(range(len(labels)), labels)
     panels[0].set_ylim(len(labels) - 0.5, -0.5)
-    for text in (text for axes in grid[:, 0] for text in axes.get_yticklabels()):
-        text.set_parse_math(False)
     entries: list[tuple[str, dict[str, Any]]] = [
         (_named(*one), {"color": RUNS[i % len(RUNS)], "lw": 2.6} if i else {"lw": 0})
         for i, one in enumerate(compared.folders.items())

@@ -77,13 +77,11 @@ def _draw_places(axes: "Axes", microphones: Microphones, layout: Scattered) -> N
     axes.set(xlabel="y, to the left [mm]", ylabel="x, ahead [mm]", aspect="equal")
     axes.margins(0.2)
     axes.invert_xaxis()
-    axes.grid(True)
 
 
 def _turned(axes: "Axes") -> None:
     """Turn a polar panel so that the vehicle's heading points up."""
     axes.set_theta_zero_location("N")  # pyrefly: ignore[missing-attribute]
-    axes.grid(True)
     axes.tick_params(labelsize=7)
 
 
@@ -124,28 +122,28 @@ def _draw_stds(axes: "Axes", layout: Scattered, wave: dict[str, float]) -> None:
         axes.plot(around, np.minimum(std, top), color=_COLOURS[g % len(_COLOURS)], lw=1.1)
     axes.set_ylim(0.0)
     _turned(axes)
-    axes.set_title("least deviation of a bearing [deg], at 20 dB", fontsize=9)
+    axes.set_title("least standard deviation of a bearing [°], at 20 dB", fontsize=9)
 
 
 def draw_hearing(overview: Overview) -> "Figure":
     """Draw the detected echoes of a recording: matched-filter output and bearings per emitter.
 
     >>> draw_hearing(Overview(names=("vehicle",))).get_axes()[0].get_title()
-    'vehicle: matched filter'
+    'vehicle: output of the matched filter'
     """
     from matplotlib import rc_context
     from matplotlib.figure import Figure
 
     rows = len(overview.names)
-    with rc_context(STYLE):
+    with rc_context(STYLE | {"axes.grid": False}):
         figure = Figure(figsize=(10.0, 0.6 + 3.0 * rows), layout="constrained")
         axes = figure.subplots(rows, 2, squeeze=False, width_ratios=(3, 2))
         end = _end(overview)
         for number, name in enumerate(overview.names):
             _output(axes[number, 0], overview, number)
             _bearings(axes[number, 1], overview, number)
-            axes[number, 0].set_title(f"{name}: matched filter")
-            axes[number, 1].set_title(f"{name}: taken for echoes")
+            axes[number, 0].set_title(f"{name}: output of the matched filter")
+            axes[number, 1].set_title(f"{name}: detected echoes")
             for panel in axes[number]:
                 panel.set_xlim(0.0, end or None)
     return figure
@@ -178,22 +176,15 @@ def _output(axes: "Axes", overview: Overview, number: int) -> None:
     image = [np.interp(grid, delay, level[:, number], **beyond) for delay, level in levels]
     rows = np.array(overview.time)
     step = float(np.median(np.diff(rows))) if rows.size > 1 else 1.0
-    shaded = axes.imshow(
-        image,
-        aspect="auto",
-        origin="lower",
-        extent=(0.0, 1e3 * end, rows[0] - 0.5 * step, rows[-1] + 0.5 * step),
-        cmap="Greys",
-        vmin=0.0,
-        vmax=50.0,
-        interpolation="nearest",
-    )
-    axes.figure.colorbar(shaded, ax=axes, label="over the noise [dB]", pad=0.01)
+    extent = (0.0, 1e3 * end, rows[0] - 0.5 * step, rows[-1] + 0.5 * step)
+    style = {"cmap": "Greys", "vmin": 0.0, "vmax": 50.0, "interpolation": "nearest"}
+    shaded = axes.imshow(image, aspect="auto", origin="lower", extent=extent, **style)
+    axes.figure.colorbar(shaded, ax=axes, label="level over the noise [dB]", pad=0.01)
     for time, found in zip(overview.time, overview.detections, strict=True):
         own = found.caller == number
         times = np.full(own.sum(), time)
         axes.plot(1e3 * found.delay[own], times, ".", ms=2.5, color=_colour(number))
-    axes.plot(1e3 * overview.direct(number), rows, "|", ms=5, color=INK, alpha=0.7)
+    axes.plot(1e3 * overview.direct(number), rows, "|", ms=6, color=STRATEGY_COLOURS["fused"])
 
 
 def _bearings(axes: "Axes", overview: Overview, number: int) -> None:
@@ -203,7 +194,7 @@ def _bearings(axes: "Axes", overview: Overview, number: int) -> None:
         size = 2.0 + 10.0 * np.log10(np.maximum(found.power[own], 1.0)) / 4.0
         place = 1e3 * found.delay[own], np.degrees(found.bearing[own])
         axes.scatter(*place, s=size, color=_colour(number), alpha=0.4, linewidths=0)
-    axes.set(xlabel="delay after the vehicle's call [ms]", ylabel="bearing [deg]")
+    axes.set(xlabel="delay after the vehicle's call [ms]", ylabel="bearing [°]")
     axes.set(ylim=(-180, 180), yticks=(-180, -90, 0, 90, 180))
 
 
@@ -255,7 +246,6 @@ def draw_log(
             _scatter(axes, rows, np.degrees(rows[name]) if name == "bearing" else rows[name])
             axes.set_ylabel(PANELS[name])
         for axes in (top, *panels):
-            axes.grid(True)
             axes.tick_params(labelbottom=axes is (top, *panels)[-1])
             for begin, end in gaps - log.time[0]:
                 axes.axvspan(begin, end, color=TRUTH, alpha=0.25, lw=0)
@@ -280,8 +270,7 @@ def _draw_path(axes: "Axes", log: Log, truth: Truth, path: Float[np.ndarray, "t 
     axes.plot(*path[0, :2], "o", ms=6, color=INK, label="start")
     axes.plot(*path[-1, :2], "s", ms=6, color=INK, label="end")
     axes.set(xlabel="x [m]", ylabel="y [m]", aspect="equal", adjustable="datalim")
-    axes.set_title(f"{log.name}: path by the odometry")
-    axes.grid(True)
+    axes.set_title(f"{log.name}: trajectory by odometry")
 
 
 def _lines_of(log: Log, rows: Rows, most: int = 30) -> tuple[list[str], Float[np.ndarray, " n"]]:
@@ -321,7 +310,7 @@ def draw_recording(
     from matplotlib import rc_context
 
     size = max(round(0.5 * duration * rate), 16)
-    with rc_context(STYLE):
+    with rc_context(STYLE | {"axes.grid": False}):
         figure = picture(12.0, 5.0)
         figure.set_layout_engine("constrained")
         axes = figure.add_subplot()
