@@ -164,7 +164,7 @@ def test_panels_go_line_by_line_unless_strategies_and_filters_make_a_table():
     both = [(strategy, name) for strategy in strategies for name in filters]
     assert cells(both) == [(0, 0), (1, 0), (0, 1), (1, 1), (0, 2), (1, 2)]
     assert cells(both[::2]) == [(0, 0), (0, 1), (0, 2)]
-    assert cells([("fused", str(i)) for i in range(4)]) == [(0, 0), (0, 1), (0, 2), (1, 0)]
+    assert cells([("fused", str(i)) for i in range(4)]) == [(0, 0), (0, 1), (1, 0), (1, 1)]
     many = [(str(i), name) for i in range(4) for name in filters]
     assert cells(many) == [divmod(i, 3) for i in range(8)]
 

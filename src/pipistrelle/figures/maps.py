@@ -207,12 +207,14 @@ def callers_shown(callers: Sequence[Caller]) -> set[str]:
 def cells(cases: Sequence[tuple[str, str]]) -> list[tuple[int, int]]:
     """Return the grid position of each panel: a column per strategy, a row per filter.
 
-    A single strategy or filter, or more than `MAX_COLUMNS` strategies, fill row after row.
+    More filters than strategies are in columns. A single strategy or filter, or more than
+    `MAX_COLUMNS` strategies, fill row after row, four panels two by two.
     """
     strategies, filters = (list(dict.fromkeys(names)) for names in zip(*cases, strict=True))
     if 1 < len(strategies) <= MAX_COLUMNS and len(filters) > 1:
-        return [(filters.index(name), strategies.index(strategy)) for strategy, name in cases]
-    return [divmod(i, MAX_COLUMNS) for i in range(len(cases))]
+        places = [(filters.index(name), strategies.index(strategy)) for strategy, name in cases]
+        return [place[::-1] for place in places] if len(filters) > len(strategies) else places
+    return [divmod(i, 2 if len(cases) == 4 else MAX_COLUMNS) for i in range(len(cases))]
 
 
 def head(axes: "Axes", strategy: str, estimator: str, name: str = "") -> "Annotation":
@@ -374,7 +376,9 @@ class Closeup:
         window.plot(ends, [0.07, 0.07], color=INK, lw=1.4, **style)
         window.text(0.06, 0.1, f"{bar:g} m", fontsize=7, va="bottom", **style)
         title = f"{particles} particle{'s' if particles != 1 else ''}"
-        window.text(0.06, 0.95, title, fontsize=7, va="top", **style)
+        wide = 72.0 * width * panel.axes.bbox.width / window.figure.dpi
+        size = min(7.0, wide / (0.6 * len(title)))
+        window.text(0.06, 0.95, title, fontsize=size, va="top", **style)
 
     def show(
         self,
@@ -457,7 +461,8 @@ def draw_maps(
 ) -> tuple["Figure", list[list["Axes"]]]:
     """Create a figure of maps with common scales and a legend; the estimates are shown later.
 
-    `names`: headings of strategies. `rows`: label and height [inch] of axes below each map.
+    `names`: headings of strategies. `rows`: label and height [inch] of axes below each map; more
+    than two maps on top of each other are narrow, with only the first of these rows.
     Returns the figure, and the axes below the map of each panel.
     """
     maps = [panel.frames[-1].landmarks for panel in panels]
@@ -468,8 +473,10 @@ def draw_maps(
     drawn = callers_shown(callers).union(*(panel.symbols() for panel in panels))
     if TIED in drawn:
         drawn.remove("placed landmark, 95 %")
-    total, entries = {1: (6.4, 2), 2: (9.0, 4)}.get(columns, (12.0, 4))
-    width = (total - LEFT - RIGHT - (columns - 1) * GAP) / columns
+    across, rows = (max(columns, 4), dict([*rows.items()][:1])) if blocks > 2 else (columns, rows)
+    total, entries = {1: (6.4, 2), 2: (9.0, 4)}.get(across, (12.0, 4))
+    width = (total - LEFT - RIGHT - (across - 1) * GAP) / across
+    total -= (across - columns) * (width + GAP)
     heights = {"y [m]": width * (top - bottom) / (right - left), **rows}
     gaps = [TITLE, 0.5, *[0.12] * len(rows)][: len(heights)]
     block = sum(heights.values()) + sum(gaps) + LABEL
@@ -487,7 +494,6 @@ def draw_maps(
                 sharex=cell[1] if len(cell) > 1 else first,
                 sharey=first,
             )
-            axes.grid(True)
             if (row, column - 1) in places:
                 axes.tick_params(labelleft=False)
             else:

@@ -9,7 +9,7 @@ import numpy as np
 from pipistrelle.acoustics.paths import Caller
 from pipistrelle.detection.scans import make_scan
 from pipistrelle.estimation.beliefs import Landmarks, placed
-from pipistrelle.evaluation.accuracy import heaviest, pose_error, position_error
+from pipistrelle.evaluation.accuracy import alignment, heaviest, moved, pose_error, position_error
 from pipistrelle.evaluation.consistency import anees_bounds, track_nees
 from pipistrelle.experiments.drives import NO_TRUTH, LabelledPoints, Truth
 from pipistrelle.experiments.results.scores import TrialResult
@@ -48,11 +48,12 @@ def draw_mission(
     with the 95 % band of one run. All panels share their scales.
 
     `trials`: in the frame of the truth; each strategy and filter once. Several of both make a
-    column for each strategy and a row for each filter. `truth`: at the times of the tracks; without
-    a path there are no error rows. Callers may be among the landmarks. `callers`: without the
-    vehicle; a fixed caller is a star, with its name unless it is the only beacon, a moving caller
-    is a line. `beamwidth` [rad]: of the vehicle's call, for the strategies that use it; by default
-    no beam is drawn. `names`: headings of strategies, by default their names.
+    column for each strategy and a row for each filter, or the reverse with more filters; more than
+    two rows have only the position error. `truth`: at the times of the tracks; without a path there
+    are no error rows. Callers may be among the landmarks. `callers`: without the vehicle; a fixed
+    caller is a star, with its name unless it is the only beacon, a moving caller is a line.
+    `beamwidth` [rad]: of the vehicle's call, for the strategies that use it; by default no beam is
+    drawn. `names`: headings of strategies, by default their names.
     Returns: a figure unknown to pyplot. Raises ValueError without trials.
 
     Bradley & Abaid, Eqs. (23) and (26), over the time of one run.
@@ -73,7 +74,9 @@ def draw_mission(
         figure, below = draw_maps(panels, truth, callers, names=names, rows=rows)
         for panel, trial in zip(panels, trials, strict=True):
             panel.show_end()
-            panel.line.set_text(outcome(trial, truth))
+            text = outcome(trial, truth)
+            wide = 72.0 * panel.axes.bbox.width / figure.dpi
+            panel.line.set(text=text, fontsize=min(9.5, wide / (0.55 * len(text))))
         if truth.path is not None:
             for axes, trial in zip(below, trials, strict=True):
                 _draw_errors(axes, trial, truth.path)
@@ -149,12 +152,22 @@ def _ties(trial: TrialResult, true_landmarks: LabelledPoints | None) -> list[np.
 
 
 def outcome(trial: TrialResult, truth: Truth) -> str:
-    """Return a line of text on a trial: position RMSE, if known, and number of landmarks."""
+    """Return a line of text on a trial: position RMSE, if known, and number of landmarks.
+
+    If two of at least twelve landmarks make three quarters of the squared error of the aligned map,
+    its RMSE and its median follow.
+    """
     scores = trial.scores
     total = scores.landmarks_total if truth.landmarks is None else len(truth.landmarks[0])
     parts = [f"{scores.landmarks_full} of {total} landmarks placed"]
-    if (rmse := scores.position_rmse_m) is not None:
-        parts.insert(0, f"RMSE {rmse:.2f} m" if rmse < 100.0 else f"RMSE {rmse:.3g} m")
+    if len(ties := _ties(trial, truth.landmarks)) > 11:
+        mapped, true = np.stack(ties, axis=1)
+        errors = np.sort(position_error(moved(mapped, alignment(mapped, true)), true))
+        if 4.0 * np.sum(errors[:-2] ** 2) < np.sum(errors**2):
+            error = f"{np.sqrt(np.mean(errors**2)):.2f} m, median {np.median(errors):.2f} m"
+            parts.insert(0, f"map, aligned {error}")
+    if (off := scores.position_rmse_m) is not None:
+        parts.insert(0, f"RMSE {off:.2f} m" if off < 100.0 else f"RMSE {off:.3g} m")
     if scores.diverged:
         parts = ["diverged", *parts[:-1]]
     return " · ".join(parts)
@@ -169,15 +182,16 @@ def _draw_errors(rows: Sequence["Axes"], trial: TrialResult, true_path: np.ndarr
     wide = np.rad2deg(wide)
     distance = position_error(track.pose.mean, true_path)
     turn = np.rad2deg(pose_error(track.pose.mean, true_path)[:, 2])
-    *errors, consistency = rows
     bands = (far, 0.0, distance), (-wide, wide, turn)
-    for axes, (low, high, error) in zip(errors, bands, strict=True):
+    for axes, (low, high, error) in zip(rows[:2], bands, strict=False):
         axes.fill_between(elapsed, low, high, color=colour, alpha=0.16, lw=0)
         axes.plot(elapsed, error, color=colour, lw=1.1)
-        axes.tick_params(labelbottom=False)
-    consistency.axhspan(*anees_bounds(1), color="#d9d9d9", alpha=0.6, lw=0)
-    consistency.plot(elapsed, track_nees(track.pose, true_path), color=colour, lw=0.9)
-    consistency.set(yscale="log", xlabel="time [s]", xlim=(0.0, elapsed[-1]))
+        axes.tick_params(labelbottom=axes is rows[-1])
+    for consistency in rows[2:]:
+        consistency.axhspan(*anees_bounds(1), color="#d9d9d9", alpha=0.6, lw=0)
+        consistency.plot(elapsed, track_nees(track.pose, true_path), color=colour, lw=0.9)
+        consistency.set(yscale="log")
+    rows[-1].set(xlabel="time [s]", xlim=(0.0, elapsed[-1]))
 
 
 def _scale_errors(panels: Sequence[Sequence["Axes"]]) -> None:
@@ -190,11 +204,14 @@ def _scale_errors(panels: Sequence[Sequence["Axes"]]) -> None:
         bound = max(panel[row].dataLim.ymax for panel in panels)
         return float(np.clip(1.05 * bound, 1.2 * error, 3.0 * error))
 
-    position, heading, consistency = panels[0]
+    position, *others = panels[0]
     # A label at the end of the time would touch the 0 of the next panel.
-    consistency.xaxis.set_major_locator(MaxNLocator(6, steps=[1, 2, 5, 10], prune="upper"))
-    consistency.xaxis.set_major_formatter("{x:g}")
+    position.xaxis.set_major_locator(MaxNLocator(6, steps=[1, 2, 5, 10], prune="upper"))
+    position.xaxis.set_major_formatter("{x:g}")
     position.set_ylim(0.0, highest(0))
+    if not others:
+        return
+    heading, consistency = others
     heading.set_ylim(-highest(1), highest(1))
     largest = max(panel[2].dataLim.ymax for panel in panels)
     consistency.set_ylim(0.05, max(100.0, 2.0 * largest))
