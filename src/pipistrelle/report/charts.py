@@ -379,6 +379,7 @@ def effect_charts(selection: Selection) -> list[Chart]:
         title = titles.get(whose, f"{whose} sensing")
         what = with_article(variable) if variable else f"the {factor}"
         mean = "averaged over the combinations of the rest, " if family[0].apart else ""
+        known = {one.measure for one in family if np.isfinite(one.finding.mean)}
         charts.append(
             Chart(
                 name=f"effect_{slug(factor)}_{slug(whose)}",
@@ -387,7 +388,9 @@ def effect_charts(selection: Selection) -> list[Chart]:
                 "95 % interval as one of its family. Full: shown, by Holm's correction. Map: "
                 "landmarks that both have placed. NEES: the ratio",
                 panels=tuple(
-                    _panel(measure, family, axis, at) for measure in changes.measures_of(study)
+                    _panel(measure, family, axis, at)
+                    for measure in changes.measures_of(study)
+                    if measure in known or not known
                 ),
                 columns=(variable.column if variable else factor, "change"),
             )
@@ -409,16 +412,8 @@ def about(
     filled: Sequence[bool] | np.ndarray,
 ) -> Series:
     """Return a data series of points with error bars that end at `edges`."""
-    return Series(
-        name=name,
-        role=role,
-        x=x,
-        y=mean,
-        low=edges[:, 0],
-        high=edges[:, 1],
-        style="points",
-        filled=np.array(filled, dtype=bool),
-    )
+    marks: dict[str, Any] = {"style": "points", "filled": np.array(filled, dtype=bool)}
+    return Series(name=name, role=role, x=x, y=mean, low=edges[:, 0], high=edges[:, 1], **marks)
 
 
 def _panel(

@@ -84,7 +84,13 @@ def answered(study: Study, sentences: Sequence[Sentence] | None = None) -> Answe
     papers, by_rule = papers_cases(study), selections(study)
     effects = {rule: effects_of(selection) for rule, selection in by_rule.items()}
     asked = (SENTENCES if papers else ()) if sentences is None else sentences
-    judged = judge_sentences(by_rule, asked)
+    judged, done = judge_sentences(by_rule, asked), len(study.worlds)
+    few = [f"Undecided: too few worlds, {done} of {study.planned}."]
+    few *= done < min(study.planned, MIN_WORLDS)
+    if papers:
+        found = papers_answer(by_rule, judged)
+    else:
+        found = changes.answer(by_rule[HEADLINE], effects[HEADLINE])
     return Answered(
         study=study,
         papers=papers,
@@ -93,9 +99,7 @@ def answered(study: Study, sentences: Sequence[Sentence] | None = None) -> Answe
         selections=by_rule,
         effects=effects,
         sentences=judged,
-        answer=papers_answer(by_rule, judged)
-        if papers
-        else changes.answer(by_rule[HEADLINE], effects[HEADLINE]),
+        answer=few + found,
         findings=findings(by_rule) if papers else [],
     )
 

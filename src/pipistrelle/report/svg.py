@@ -107,7 +107,8 @@ def _box(panel: Panel) -> tuple[float, float, float, float]:
     """Return the left, right, upper and lower edges [px] of a panel's axes."""
     if not panel.equal:
         left, right, top, bottom = BOX
-        return left, right, top, bottom - SLANT * panel.x.slanted
+        longest = max((len(text) for _, text in panel.y.ticks), default=0)
+        return max(left, 28.0 + 7.5 * longest), right, top, bottom - SLANT * panel.x.slanted
     (left, right), (low, high) = panel.x.limits, panel.y.limits
     return 0.0, WIDTH, 0.0, WIDTH * (high - low) / (right - left)
 
