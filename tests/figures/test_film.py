@@ -194,7 +194,7 @@ def test_a_film_without_frames_is_an_error(tmp_path):
 
 
 def test_the_legend_of_a_film_names_the_symbols_of_its_frames(snapshots, scene):
-    full, heard = "placed landmark, 95 %", ["range and bearing", "bearing alone"]
+    full, heard = "placed landmark, 95 %", ["range and bearing", "bearing without range"]
     rays = ["unresolved ray, 1σ, darker: likelier", "just pruned"]
     for strategy, measured in (("active", heard[:1]), ("passive", heard[1:]), ("fused", heard)):
         key = strategy, "ekf"

@@ -147,7 +147,7 @@ class FilmPanel(MapPanel):
         ranged = [np.isfinite(heard_from(frame.scan).range) for frame in self.frames]
         drawn = {
             "range and bearing": any(rows.any() for rows in ranged),
-            "bearing alone": any(not rows.all() for rows in ranged),
+            "bearing without range": any(not rows.all() for rows in ranged),
             "just pruned": any(not placed(frame.landmarks).all() for frame in self.frames),
         }
         return super().symbols() | {name for name, is_drawn in drawn.items() if is_drawn}

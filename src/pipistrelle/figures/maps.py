@@ -547,7 +547,7 @@ def legend_symbols() -> dict[str, "Artist | tuple[Artist, ...]"]:
         "true path": line(TRUTH, lw=3.2, alpha=0.45),
         "estimated path": line(lw=1.2),
         "range and bearing": line(lw=1.4),
-        "bearing alone": line(lw=0.7, ls=(0, (4, 3))),
+        "bearing without range": line(lw=0.7, ls=(0, (4, 3))),
         "true landmark": mark("o", 5.0, "none", TRUTH),
         TIED: (full, line(lw=0.7)),
         "placed landmark, 95 %": full,

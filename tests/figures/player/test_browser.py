@@ -291,7 +291,7 @@ def test_a_selected_landmark_shows_its_details(desk, played):
             assert words in story
         assert shapes(desk, "chosen") == np.sum(labels == chosen)
     desk.keyboard.press("Escape")
-    assert "Choose a landmark" in desk.locator(".told").first.inner_text()
+    assert "Select a landmark" in desk.locator(".told").first.inner_text()
 
 
 def test_a_landmarks_life_is_a_line_that_grows_thick_when_it_is_placed(desk, played):

@@ -107,18 +107,6 @@ const choose = (landmark) => {
   draw();
 };
 
-// The landmark to look at first: the first that was a ray for a while and was then placed.
-const instructive = (estimate) => {
-  let best = null, least = Infinity;
-  for (const [landmark, states] of livesOf(estimate)) {
-    const rays = states.filter((one) => one > 0 && one < PLACED).length;
-    const placed = states.indexOf(PLACED);
-    const score = Math.abs(Math.log(rays / 30)) + placed / FRAMES;
-    if (rays >= 8 && states[FRAMES - 1] === PLACED && score < least) [best, least] = [landmark, score];
-  }
-  return best;
-};
-
 const apart = (one, other) => `${short(Math.hypot(one.x - other.x, one.y - other.y))} m`;
 
 // What is to be said of the chosen landmark: not heard, a ray, or placed.
@@ -142,14 +130,14 @@ const heardWords = (estimate, frame) => {
   if (!heard.length) return "Nothing heard.";
   const parts = [];
   if (ranged) parts.push(`${ranged} with ${ranged === 1 ? "its range" : "their ranges"}`);
-  if (alone) parts.push(`${alone} by bearing alone`);
+  if (alone) parts.push(`${alone} by bearing only`);
   return `Heard: ${parts.join(", ")}.`;
 };
 
 const tell = (panel) => {
   const words = [heardWords(panel.estimate, state.frame)];
   if (state.chosen !== null) words.push(storyOf(panel.estimate, state.frame, state.chosen));
-  else words.push("Choose a landmark on the map to follow it.");
+  else words.push("Select a landmark on the map to follow it.");
   panel.told.replaceChildren(...words.map((word) => {
     const line = document.createElement("p");
     line.textContent = word;
@@ -276,7 +264,6 @@ const start = () => {
   document.addEventListener("keydown", onKey);
   new ResizeObserver(() => draw()).observe(control.stage);
   state.shown = mission.estimates.length > 1 ? firstPair() : [0];
-  state.chosen = instructive(mission.estimates[state.shown[0]]);
   show();
 };
 
