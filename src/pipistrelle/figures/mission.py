@@ -72,11 +72,12 @@ def draw_mission(
     rows = ERRORS if truth.path is not None else {}
     with matplotlib.rc_context(STYLE):
         figure, below = draw_maps(panels, truth, callers, names=names, rows=rows)
-        for panel, trial in zip(panels, trials, strict=True):
+        lines = [outcome(trial, truth) for trial in trials]
+        wide = 72.0 * panels[0].axes.bbox.width / figure.dpi
+        size = min(9.5, wide / (0.55 * max(map(len, lines))))
+        for panel, line in zip(panels, lines, strict=True):
             panel.show_end()
-            text = outcome(trial, truth)
-            wide = 72.0 * panel.axes.bbox.width / figure.dpi
-            panel.line.set(text=text, fontsize=min(9.5, wide / (0.55 * len(text))))
+            panel.line.set(text=line, fontsize=size)
         if truth.path is not None:
             for axes, trial in zip(below, trials, strict=True):
                 _draw_errors(axes, trial, truth.path)
@@ -165,7 +166,7 @@ def outcome(trial: TrialResult, truth: Truth) -> str:
         errors = np.sort(position_error(moved(mapped, alignment(mapped, true)), true))
         if 4.0 * np.sum(errors[:-2] ** 2) < np.sum(errors**2):
             error = f"{np.sqrt(np.mean(errors**2)):.2f} m, median {np.median(errors):.2f} m"
-            parts.insert(0, f"map, aligned {error}")
+            parts = [f"aligned map {error}", parts[0].replace("landmarks ", "")]
     if (off := scores.position_rmse_m) is not None:
         parts.insert(0, f"RMSE {off:.2f} m" if off < 100.0 else f"RMSE {off:.3g} m")
     if scores.diverged:

@@ -138,14 +138,13 @@ def draw_hearing(overview: Overview) -> "Figure":
     with rc_context(STYLE | {"axes.grid": False}):
         figure = Figure(figsize=(10.0, 0.6 + 3.0 * rows), layout="constrained")
         axes = figure.subplots(rows, 2, squeeze=False, width_ratios=(3, 2))
-        end = _end(overview)
         for number, name in enumerate(overview.names):
             _output(axes[number, 0], overview, number)
             _bearings(axes[number, 1], overview, number)
             axes[number, 0].set_title(f"{name}: output of the matched filter")
             axes[number, 1].set_title(f"{name}: detected echoes")
             for panel in axes[number]:
-                panel.set_xlim(0.0, end or None)
+                panel.set_xlim(0.0, _end(overview) or None)
     return figure
 
 
@@ -249,7 +248,7 @@ def draw_log(
             axes.tick_params(labelbottom=axes is (top, *panels)[-1])
             for begin, end in gaps - log.time[0]:
                 axes.axvspan(begin, end, color=TRUTH, alpha=0.25, lw=0)
-        since = f"time after {log.time[0]:.15g} s [s]"
+        since = f"time after {log.time[0]:.15g} s [s]" if log.time[0] else "time [s]"
         (top, *panels)[-1].set(xlabel=since, xlim=(0.0, log.time[-1] - log.time[0]))
         others = ": blue by the vehicle's call, yellow by others" * bool(rows["caller"].any())
         top.set_title(f"rows{others}{'; grey: no scans' * bool(len(gaps))}")
