@@ -130,12 +130,11 @@ def fields_in(path: Path, separator: str | None = ",") -> list[tuple[int, list[s
     Blank lines and lines that begin with ``#`` are skipped, blanks and quotes around fields
     removed. Without a separator, fields are separated by white space.
     """
-    lines = enumerate(read_text(path).splitlines(), start=1)
-    return [
-        (number, [field.strip(' \t"') for field in line.split(separator)])
-        for number, line in lines
-        if line.strip() and line[0] != "#"
-    ]
+    text = read_text(path)
+    padded = any(mark in text for mark in ' \t"')
+    lines = enumerate(text.splitlines(), start=1)
+    rows = ((n, line.split(separator)) for n, line in lines if line.strip() and line[0] != "#")
+    return [(n, [f.strip(' \t"') for f in fields] if padded else fields) for n, fields in rows]
 
 
 def read_table(

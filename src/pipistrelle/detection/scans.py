@@ -5,6 +5,7 @@ different callers or after association, are merged into one.
 """
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -195,6 +196,22 @@ def _moved(
     kept, place = np.arange(size)[rows], np.full(size + 1, -1)
     place[kept] = np.arange(kept.size)
     return place[direct]
+
+
+def columns_of(scans: Sequence[Scan]) -> dict[str, np.ndarray]:
+    """Join the columns of scans, by name, below the time of each measurement.
+
+    >>> columns = columns_of([make_scan(t, np.array([3]), np.array([0.2])) for t in (0.5, 1.0)])
+    >>> columns["time"], columns["landmark"]
+    (array([0.5, 1. ]), array([3, 3]))
+    """
+    none, sizes = np.empty(0, np.int64), [scan.landmark.size for scan in scans]
+    numbers = np.concatenate([np.empty((NUMBERS, 0)), *(scan.numbers for scan in scans)], axis=1)
+    return {
+        "time": np.repeat([scan.time for scan in scans], sizes),
+        "landmark": np.concatenate([none, *(scan.landmark for scan in scans)]),
+        "caller": np.concatenate([none, *(scan.caller for scan in scans)]),
+    } | dict(zip(COLUMNS[2:], numbers, strict=True))
 
 
 def without_labels(scan: Scan, callers: Int[np.ndarray, " c"]) -> Scan:

@@ -18,7 +18,7 @@ from types import MappingProxyType
 import numpy as np
 from jaxtyping import Float, Int
 
-from pipistrelle.detection.scans import NUMBERS, UNLABELLED, Scan
+from pipistrelle.detection.scans import COLUMNS, UNLABELLED, Scan, columns_of
 from pipistrelle.estimation.motion import (
     Motion,
     MotionNumbers,
@@ -107,10 +107,8 @@ def pose_bound(
     """
     fixed, places = landmarks
     labels = np.append(fixed, np.array([*routes], np.int64))
-    count = [len(scan.landmark) for scan in scans]
-    step = np.repeat(np.searchsorted(time, [scan.time - 1e-9 for scan in scans]), count)
-    label = np.concatenate([np.empty(0, np.int64), *(scan.landmark for scan in scans)])
-    numbers = np.concatenate([np.empty((NUMBERS, 0)), *(scan.numbers for scan in scans)], axis=1)
+    columns = columns_of(scans)
+    step, label = np.searchsorted(time, columns["time"] - 1e-9), columns["landmark"]
     known = np.isin(label, labels)
     caller = np.concatenate([np.empty(0, np.int64), *map(caller_labels, scans)])[known]
     caller[~np.isin(caller, labels)] = UNLABELLED
@@ -141,7 +139,7 @@ def pose_bound(
         motion_numbers(motion),
         wander,
         (index, *nowhere, NOTHING.sensor, np.zeros((0, 3)), np.zeros(0)),
-        (ends, np.ascontiguousarray(numbers[:, known].T)),
+        (ends, np.column_stack([columns[name] for name in COLUMNS[2:]])[known]),
         np.column_stack([rows[:-1], rows[1:], reached[rows[1:]] + 2]),
     )
 

@@ -1,12 +1,12 @@
 """Consistency of covariance and errors: NEES, ANEES, divergence, stray landmarks."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 from jaxtyping import Bool, Float
 
-from pipistrelle.detection.scans import BEARING, BEARING_STD, RANGE, RANGE_STD, Scan
+from pipistrelle.detection.scans import Scan, columns_of
 from pipistrelle.estimation.beliefs import Gaussian, Track, placed, some_of
 from pipistrelle.estimation.observations.range import NEAREST
 from pipistrelle.estimation.rays import gate_bounds
@@ -224,9 +224,9 @@ def strayed_landmarks(
     label if less likely than `CHANCE`, the times of its first and last measurement [s] and its
     length.
     """
-    label = np.concatenate([np.empty(0, np.int64), *(scan.landmark for scan in scans)])
-    time = np.repeat([scan.time for scan in scans], [scan.landmark.size for scan in scans])
-    squared, size = _residuals(track, label, time, scans)
+    rows = columns_of(scans)
+    label, time = rows["landmark"], rows["time"]
+    squared, size = _residuals(track, rows)
     bounds = np.array([math.inf, *gate_bounds(gate)])
     far, least = squared > bounds[size], math.log(CHANCE / max(label.size, 1)) / math.log(share)
     found = {}
@@ -242,17 +242,16 @@ def strayed_landmarks(
 
 
 def _residuals(
-    track: Track, label: np.ndarray, time: np.ndarray, scans: Sequence[Scan]
+    track: Track, rows: Mapping[str, np.ndarray]
 ) -> tuple[Float[np.ndarray, " m"], np.ndarray]:
     """Return each measurement's squared normalised residual and its dimension; 0 if unmapped."""
-    known = some_of(track.landmarks, placed(track.landmarks))
+    known, label = some_of(track.landmarks, placed(track.landmarks)), rows["landmark"]
     order = np.argsort(known.landmark)
     at = np.searchsorted(known.landmark[order], label).clip(0, max(order.size - 1, 0))
     if not order.size:
         return np.zeros(label.size), np.zeros(label.size, np.int64)
-    n, step = order[at], np.searchsorted(track.time, time - 1e-9).clip(0, track.time.size - 1)
-    numbers = np.concatenate([scan.numbers for scan in scans], axis=1)
-    bearing, distance, bearing_std, range_std = numbers[[BEARING, RANGE, BEARING_STD, RANGE_STD]]
+    step = np.searchsorted(track.time, rows["time"] - 1e-9).clip(0, track.time.size - 1)
+    n, bearing, distance = order[at], rows["bearing"], rows["range"]
     pose, P, C = track.pose.mean[step], track.pose.covariance[step], known.covariance[n]
     dx, dy = (known.mean[n] - pose[:, :2]).T
     r = np.maximum(np.hypot(dx, dy), NEAREST)
@@ -260,8 +259,8 @@ def _residuals(
     H = np.array([[-c, -s, none], [s / r, -c / r, -ones]]).transpose(2, 0, 1)
     S = np.einsum("mia,mab,mjb->mij", H, P, H)
     S = S + np.einsum("mia,mab,mjb->mij", H[..., :2], C, H[..., :2])
-    S[:, 0, 0] += range_std**2
-    S[:, 1, 1] += bearing_std**2
+    S[:, 0, 0] += rows["range_std"] ** 2
+    S[:, 1, 1] += rows["bearing_std"] ** 2
     off, turned = distance - r, wrap(bearing - np.arctan2(dy, dx) + pose[:, 2])
     rest = turned - S[:, 0, 1] / S[:, 0, 0] * off
     both = off**2 / S[:, 0, 0] + rest**2 / (S[:, 1, 1] - S[:, 0, 1] ** 2 / S[:, 0, 0])

@@ -273,15 +273,11 @@ def look_by(door: Door) -> Look:
 
 def _log(place: Path, recorded: "Log", truth: "Truth") -> Look:
     """Describe a recorded log."""
-    from pipistrelle.detection.scans import COLUMNS
+    from pipistrelle.detection.scans import columns_of
     from pipistrelle.figures.sound import draw_log
     from pipistrelle.scripting.log_warnings import dead_reckoned, early_warnings
 
-    sizes = [scan.landmark.size for scan in recorded.scans]
-    rows = {"time": np.repeat([scan.time for scan in recorded.scans], sizes)}
-    for name in COLUMNS:
-        rows[name] = np.concatenate([getattr(scan, name) for scan in recorded.scans])
-    gaps = long_gaps(recorded)
+    rows, gaps = columns_of(recorded.scans), long_gaps(recorded)
     return Look(
         lines=(*recorded.notes, *_numbers(recorded, truth, rows, gaps)),
         odd=tuple(early_warnings(recorded, truth, place)),

@@ -22,7 +22,7 @@ from jaxtyping import Float, Int
 from scipy.special import bdtrc
 
 from pipistrelle.config import Config
-from pipistrelle.detection.scans import OWN, UNLABELLED, WIDEST
+from pipistrelle.detection.scans import OWN, UNLABELLED, WIDEST, columns_of
 from pipistrelle.estimation.catalogue import GATE, gate_of, short_name
 from pipistrelle.estimation.data_association.watch import POSE
 from pipistrelle.estimation.motion import relative_motions
@@ -63,7 +63,7 @@ Question = tuple[str, str]
 
 def labels_of(recorded: "Log") -> set[int]:
     """Return the set of landmark labels in a log."""
-    return {label for scan in recorded.scans for label in scan.landmark.tolist()}
+    return {*columns_of(recorded.scans)["landmark"].tolist()}
 
 
 def distance_driven(recorded: "Log") -> float:
@@ -125,11 +125,8 @@ def _jumps(recorded: "Log") -> Iterator[str]:
 
 def _unheard(recorded: "Log", labels: set[int]) -> Iterator[str]:
     """Yield a warning for each caller that has excess paths but no known or measured position."""
-    timed = {
-        number
-        for scan in recorded.scans
-        for number in scan.caller[scan.excess_path == scan.excess_path].tolist()
-    }
+    rows = columns_of(recorded.scans)
+    timed = {*rows["caller"][~np.isnan(rows["excess_path"])].tolist()}
     for number, caller in enumerate(recorded.callers, start=1):
         if number in timed and caller.landmark not in labels and caller.place is None:
             yield (
@@ -298,14 +295,8 @@ def _out_of_bounds(recorded: "Log") -> dict[str, list[Question]]:
     """Return warnings about each kind of measurement with many values outside plausible bounds."""
     near, far = recorded.range_bounds
     bounds = f"range_bounds ({near:g} to {far:g} m)"
-    bearing = recorded.recorded_bearings()
-    distance, excess = (
-        values[~np.isnan(values)]
-        for values in (
-            np.concatenate([getattr(scan, name) for scan in recorded.scans])
-            for name in ("range", "excess_path")
-        )
-    )
+    bearing, rows = recorded.recorded_bearings(), columns_of(recorded.scans)
+    distance, excess = (rows[name][~np.isnan(rows[name])] for name in ("range", "excess_path"))
     few, most = MAX_IGNORED_SHARE, 1.0 - MAX_IGNORED_SHARE
     checks = (
         ("bearings", abs(bearing) > tau, few, "beyond a turn"),
@@ -391,6 +382,8 @@ MISTAKES = (
     ),
 )  # fmt: skip
 """The mistakes that `misreading` tries."""
+_UNDONE = np.array([(m.turn, m.offset, m.from_map, m.scale, m.swapped) for m in (NONE, *MISTAKES)])
+"""Their corrections of bearings and ranges, as rows of numbers; first, the columns as recorded."""
 
 
 _Path = tuple[Float[np.ndarray, "t 3"], Float[np.ndarray, "t 3"], Float[np.ndarray, "t-1 3 3"]]
@@ -449,24 +442,28 @@ def _fits(recorded: "Log") -> tuple[Int[np.ndarray, " k"], Float[np.ndarray, "k 
 
     The fit is the sum over earlier scans of log p(z) / p_0.
     """
-    rows = _recorded_rows(recorded)
-    spans = []
-    for name, least in (("bearing", recorded.bearing_std), ("range", recorded.range_std)):
-        values = np.concatenate([getattr(scan, name) for scan in rows])
+    every, edges = _recorded_rows(recorded)
+    spans, count = [], len(recorded.scans)
+    for values, least in ((every.bearing, recorded.bearing_std), (every.range, recorded.range_std)):
         values = values[~np.isnan(values)]
         spans.append(max(float(np.ptp(values)) if values.size else 0.0, least))
-    rates = {mistake.rate for mistake in (NONE, *MISTAKES)}
-    paths = {rate: _path(recorded, rate) for rate in rates}
+    rates = np.array([mistake.rate for mistake in (NONE, *MISTAKES)])
+    tried = [(rates == rate, _path(recorded, rate)) for rate in np.unique(rates).tolist()]
     scans, fits = [], []
-    chosen = np.linspace(1, len(rows) - 1, COMPARED if len(rows) > 1 else 0)
+
+    def rows(n: int) -> _Rows:
+        step = int(np.searchsorted(recorded.time, recorded.scans[n].time))
+        return _some(every, np.arange(edges[n], edges[n + 1]))._replace(step=step)
+
+    chosen = np.linspace(1, count - 1, COMPARED if count > 1 else 0)
     for n in np.unique(chosen.round().astype(int)):
-        later = _some(rows[n], np.linspace(0, rows[n].label.size - 1, COMPARED))
+        later = rows(n)
+        later = _some(later, np.linspace(0, later.label.size - 1, COMPARED))
         fit = np.zeros((later.label.size, 1 + len(MISTAKES)))
-        for earlier in (rows[n - lag] for lag in LAGS if lag <= n):
-            drift = {rate: _drift(path, earlier.step, later.step) for rate, path in paths.items()}
-            for h, mistake in enumerate((NONE, *MISTAKES)):
-                path = paths[mistake.rate], drift[mistake.rate]
-                fit[:, h] += _log_ratio(earlier, later, mistake, path, spans)
+        for earlier in (rows(n - lag) for lag in LAGS if lag <= n):
+            for mistakes, path in tried:
+                driven = path, _drift(path, earlier.step, later.step)
+                fit[:, mistakes] += _log_ratio(earlier, later, _UNDONE[mistakes], driven, spans)
         scans.append(np.full(len(fit), n))
         fits.append(fit)
     scan, fit = np.concatenate([np.empty(0, int), *scans]), np.concatenate(fits) if fits else []
@@ -474,22 +471,23 @@ def _fits(recorded: "Log") -> tuple[Int[np.ndarray, " k"], Float[np.ndarray, "k 
     return scan[compared], np.reshape(fit, (len(scan), 1 + len(MISTAKES)))[compared]
 
 
-def _recorded_rows(recorded: "Log") -> list[_Rows]:
-    """Return each scan's measurements with a bearing, without direct calls and moving callers."""
-    ends = np.cumsum([scan.landmark.size for scan in recorded.scans])
-    bearings = np.split(recorded.recorded_bearings(), ends[:-1])
+def _recorded_rows(recorded: "Log") -> tuple[_Rows, Int[np.ndarray, " s+1"]]:
+    """Return the measurements with a bearing, and the first of each scan, the last scan's end too.
+
+    Direct calls and moving callers are left out.
+    """
+    rows, bearing = columns_of(recorded.scans), recorded.recorded_bearings()
+    stated = np.array([rows["bearing_std"], rows["range_std"]])
+    general = np.array([[recorded.bearing_std], [recorded.range_std]])
+    stds, label = np.where(np.isnan(stated), general, stated), rows["landmark"]
+    edges = np.cumsum([0, *(scan.landmark.size for scan in recorded.scans)])
     moving = [caller.landmark for caller in recorded.callers if caller.moves]
-    rows = []
-    for scan, bearing in zip(recorded.scans, bearings, strict=True):
-        stated = np.array([scan.bearing_std, scan.range_std])
-        general = np.array([[recorded.bearing_std], [recorded.range_std]])
-        stds = np.where(np.isnan(stated), general, stated)
-        step = int(np.searchsorted(recorded.time, scan.time))
-        whole = _Rows(bearing, scan.range, stds**2, scan.landmark, step)
-        usable = ~np.isnan(bearing) & ~np.isin(scan.landmark, moving)
-        usable[scan.direct[scan.direct >= 0]] = False
-        rows.append(_some(whole, np.flatnonzero(usable)))
-    return rows
+    usable = ~np.isnan(bearing) & ~np.isin(label, moving)
+    for scan, begin in zip(recorded.scans, edges.tolist(), strict=False):
+        if scan.direct.size:
+            usable[begin + scan.direct[scan.direct >= 0]] = False
+    whole = _Rows(bearing, rows["range"], stds**2, label, 0)
+    return _some(whole, np.flatnonzero(usable)), np.append(0, np.cumsum(usable))[edges]
 
 
 def _some(rows: _Rows, chosen: np.ndarray) -> _Rows:
@@ -527,66 +525,67 @@ def _drift(path: _Path, begin: int, step: int) -> Float[np.ndarray, "3 3"]:
 
 
 def _undone(
-    rows: _Rows, mistake: Mistake, heading: float
-) -> tuple[Float[np.ndarray, " m"], Float[np.ndarray, " m"]]:
-    """Correct a mistake in the measurements of a scan; return new bearings and ranges."""
-    bearing, distance = rows.bearing, rows.range
-    if mistake.swapped:
-        bearing, distance = distance, bearing
-    bearing = mistake.turn * bearing + mistake.offset - heading * mistake.from_map
-    return wrap(bearing), mistake.scale * distance
+    rows: _Rows, mistakes: Float[np.ndarray, "h 5"], heading: float
+) -> tuple[Float[np.ndarray, "h m"], Float[np.ndarray, "h m"]]:
+    """Correct mistakes (`_UNDONE`) in the measurements of a scan; return bearings and ranges."""
+    turn, offset, from_map, scale, swapped = mistakes.T[:, :, np.newaxis]
+    bearing = np.where(swapped, rows.range, rows.bearing)
+    distance = np.where(swapped, rows.bearing, rows.range)
+    return wrap(turn * bearing + offset - heading * from_map), scale * distance
 
 
 def _expected(
-    earlier: _Rows, mistake: Mistake, path: _Driven, step: int
-) -> tuple[Float[np.ndarray, "5 n"], Int[np.ndarray, " n"]]:
-    """Predict the measurements at a later step from an earlier scan; return also their labels.
+    earlier: _Rows, mistakes: Float[np.ndarray, "h 5"], path: _Driven, step: int
+) -> Float[np.ndarray, "5 h n"]:
+    """Predict the measurements at a later step from an earlier scan, with mistakes corrected.
 
-    The prediction is a bearing, a range, and the entries bb, rb and rr of their covariance.
+    The prediction is a bearing, a range, and the entries bb, rb and rr of their covariance; NaN
+    without a range.
     """
     (sensor, *_), P = path
     now, before = sensor[step], sensor[earlier.step]
-    b, r = _undone(earlier, mistake, before[2])
-    ranged = np.isfinite(b) & (r > 0.0)
-    b, r, variance = b[ranged], r[ranged], earlier.variance[:, ranged]
-    ray = np.column_stack((np.cos(before[2] + b), np.sin(before[2] + b)))
-    off = before[:2] - now[:2] + r[:, np.newaxis] * ray
-    distance = np.maximum(np.hypot(*off.T), np.finfo(float).tiny)
-    u = off / distance[:, np.newaxis]
-    normal = np.column_stack((-u[:, 1], u[:, 0]))
-    c, s = (ray * u).sum(axis=1), (ray * normal).sum(axis=1)
-    along, across = variance[1], r**2 * variance[0]
-    to_range = np.column_stack((-u, np.zeros(len(u))))
-    to_bearing = np.column_stack((-normal / distance[:, np.newaxis], -np.ones(len(u))))
+    b, r = _undone(earlier, mistakes, before[2])
+    r = np.where(np.isfinite(b) & (r > 0.0), r, np.nan)
+    ray = np.stack((np.cos(before[2] + b), np.sin(before[2] + b)))
+    off = (before - now)[:2, np.newaxis, np.newaxis] + r * ray
+    distance = np.maximum(np.hypot(*off), np.finfo(float).tiny)
+    u = off / distance
+    normal = np.stack((-u[1], u[0]))
+    c, s = (ray * u).sum(axis=0), (ray * normal).sum(axis=0)
+    across, along = earlier.variance[0] * r**2, earlier.variance[1]
+    to_range = np.stack((*-u, np.zeros_like(r)))
+    to_bearing = np.stack((*-normal / distance, -np.ones_like(r)))
 
     def moved(one: np.ndarray, other: np.ndarray) -> np.ndarray:
-        return np.einsum("ni,ij,nj->n", one, P, other)
+        return np.einsum("ihn,ij,jhn->hn", one, P, other)
 
     bb = (s * s * along + c * c * across) / distance**2 + moved(to_bearing, to_bearing)
     rb = c * s * (along - across) / distance + moved(to_range, to_bearing)
     rr = c * c * along + s * s * across + moved(to_range, to_range)
-    bearing = np.arctan2(off[:, 1], off[:, 0]) - now[2]
-    return np.stack((bearing, distance, bb, rb, rr)), earlier.label[ranged]
+    return np.stack((np.arctan2(off[1], off[0]) - now[2], distance, bb, rb, rr))
 
 
-@np.errstate(over="ignore", under="ignore")
+@np.errstate(over="ignore", under="ignore", invalid="ignore")
 def _log_ratio(
-    earlier: _Rows, later: _Rows, mistake: Mistake, path: _Driven, spans: Sequence[float]
-) -> Float[np.ndarray, " m"]:
-    """Return a log-likelihood ratio per row: predicted by an earlier scan, or by chance."""
-    (b, r, bb, rb, rr), label = _expected(earlier, mistake, path, later.step)
-    bearing, distance = _undone(later, mistake, path[0][0][later.step, 2])
-    db, dr = wrap(bearing[:, np.newaxis] - b), distance[:, np.newaxis] - r
+    earlier: _Rows, later: _Rows, mistakes: np.ndarray, path: _Driven, spans: Sequence[float]
+) -> Float[np.ndarray, "m h"]:
+    """Return a log-likelihood ratio per row and mistake: predicted by a scan, or by chance."""
+    expected = _expected(earlier, mistakes, path, later.step)
+    b, r, bb, rb, rr = expected[:, :, np.newaxis]
+    bearing, distance = _undone(later, mistakes, path[0][0][later.step, 2])
+    db, dr = wrap(bearing[..., np.newaxis] - b), distance[..., np.newaxis] - r
     bb, rr = later.variance[0][:, np.newaxis] + bb, later.variance[1][:, np.newaxis] + rr
     determinant = rr * bb - rb * rb
     squared = (bb * dr * dr - 2.0 * rb * dr * db + rr * db * db) / determinant
-    both = mistake.scale * np.exp(-0.5 * squared) / (2.0 * pi * np.sqrt(determinant))
+    turn, scale, swapped = abs(mistakes[:, [0, 3, 4]].T[..., np.newaxis, np.newaxis])
+    both = scale * np.exp(-0.5 * squared) / (2.0 * pi * np.sqrt(determinant))
     angle_only = np.exp(-0.5 * db * db / bb) / np.sqrt(2.0 * pi * bb)
-    density = np.where(np.isnan(dr), angle_only, both * spans[1]) * spans[0] * abs(mistake.turn)
-    turns = abs(mistake.turn) * spans[1 if mistake.swapped else 0] / (2.0 * pi)
-    unlabelled = label.size and (label == UNLABELLED).all()
-    partner = np.full(db.shape, True) if unlabelled else later.label[:, np.newaxis] == label
-    partners = partner.sum(axis=1)
-    mean = np.where(partner, density, 0.0).sum(axis=1) / np.maximum(partners, 1)
-    comparable = (partners > 0) & ~np.isnan(bearing)
-    return np.where(comparable, np.log(0.5 + 0.5 * mean / max(turns, 1.0)), 0.0)
+    density = np.where(np.isnan(dr), angle_only, both * spans[1]) * spans[0] * turn
+    turns = turn * np.where(swapped, spans[1], spans[0]) / (2.0 * pi)
+    ranged = ~np.isnan(r)
+    labelled = (ranged & (earlier.label != UNLABELLED)).any(axis=2, keepdims=True)
+    partner = ranged & (~labelled | (later.label[:, np.newaxis] == earlier.label))
+    partners = partner.sum(axis=2)
+    mean = np.where(partner, density, 0.0).sum(axis=2) / np.maximum(partners, 1)
+    fit = np.log(0.5 + 0.5 * mean / np.maximum(turns[..., 0], 1.0))
+    return np.where((partners > 0) & ~np.isnan(bearing), fit, 0.0).T

@@ -28,7 +28,7 @@ from pipistrelle.detection.logs.vehicle import (
     read_vehicle,
     vehicle_of,
 )
-from pipistrelle.detection.scans import UNLABELLED, Scan
+from pipistrelle.detection.scans import UNLABELLED, Scan, columns_of
 from pipistrelle.files import LOG, OwnFiles, read_text, shipped_text
 from pipistrelle.refusals import refusal
 from pipistrelle.text_tables import Table, check_unique, place_of, read_table, rows_kept, table_text
@@ -229,20 +229,18 @@ def _odometry_columns(log: Log) -> dict[str, np.ndarray]:
 
 def _measurement_columns(log: Log) -> dict[str, np.ndarray]:
     """Return the columns of ``measurements.csv``."""
-    sizes = [len(scan.landmark) for scan in log.scans]
-    column = {"time": np.repeat([scan.time for scan in log.scans], sizes)}
-    required = MEASUREMENTS.columns[1:]
-    for name in (*required, *STATED):
-        fields = [as_logged(scan, name) for scan in log.scans]
-        values = np.concatenate(fields) if fields else np.empty(0)
-        labelled = name == "level_db" and (column["landmark"] != UNLABELLED).any()
-        if name in required or not (labelled or np.isnan(values).all()):
-            column[name] = values
-    whose = np.concatenate([np.empty(0, dtype=np.int64), *(scan.caller for scan in log.scans)])
-    if log.callers and whose.any():
-        column[CALLER] = np.array(["", *(caller.name for caller in log.callers)])[whose]
-    if (told := column["landmark"] != UNLABELLED).any():
-        column["landmark"] = np.where(told, column["landmark"].astype(str), "")
+    rows = columns_of(log.scans)
+    direct = [as_logged(scan, "excess_path") for scan in log.scans]
+    rows["excess_path"] = np.concatenate([np.empty(0), *direct])
+    labelled = rows["landmark"] != UNLABELLED
+    column = {name: rows[name] for name in MEASUREMENTS.columns}
+    for name in STATED:
+        if not ((name == "level_db" and labelled.any()) or np.isnan(rows[name]).all()):
+            column[name] = rows[name]
+    if log.callers and rows["caller"].any():
+        column[CALLER] = np.array(["", *(caller.name for caller in log.callers)])[rows["caller"]]
+    if labelled.any():
+        column["landmark"] = np.where(labelled, rows["landmark"].astype(str), "")
     return column
 
 

@@ -15,12 +15,12 @@ from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Float
 from pydantic import AfterValidator, ConfigDict, Field, ValidationInfo, field_validator
 
 from pipistrelle.config import LONGEST_STEP, NonNegative, Real, Section
 from pipistrelle.detection.logs.poses import RESOLUTION, motions_between
-from pipistrelle.detection.scans import NO_CALLERS, OWN, UNLABELLED, Scan, make_scan, with_columns
+from pipistrelle.detection.scans import NO_CALLERS, OWN, UNLABELLED, Scan, columns_of, make_scan
 from pipistrelle.geometry import wrap
 from pipistrelle.refusals import refusal
 from pipistrelle.text_tables import Schema, Table, check_columns, check_unique, place_of, rows_kept
@@ -140,7 +140,7 @@ class Log:
 
     def recorded_bearings(self) -> Float[np.ndarray, " n"]:
         """Return the recorded bearings of all scans, before wrapping."""
-        wrapped = np.concatenate([np.empty(0), *(scan.bearing for scan in self.scans)])
+        wrapped = columns_of(self.scans)["bearing"]
         read = wrapped if self.bearings is None else self.bearings
         return read if np.array_equal(wrap(read), wrap(wrapped), equal_nan=True) else wrapped
 
@@ -372,25 +372,31 @@ def _scans(
     labels = np.array([UNLABELLED, *(caller.landmark for caller in callers)])
     stamp, bearing, landmark = measured["time"], measured["bearing"], measured["landmark"]
     end = time[np.searchsorted(time, stamp - resolution)]
-    said = measured | {
+    said: dict[str, Any] = measured | {
         "landmark": np.maximum(landmark, UNLABELLED),
         "time": np.where(end - stamp > resolution, stamp, end),
         "bearing": np.where(~(np.abs(bearing) >= np.pi), bearing, wrap(bearing)),
     }
-    cuts = np.flatnonzero(np.diff(stamp)) + 1
-    parts = zip(*(np.split(column, cuts) for column in said.values()), strict=True)
-    rows = (dict(zip(said, part, strict=True)) for part in parts)
-    scans = (make_scan(**row | {"time": float(row["time"][0])}) for row in rows if row["time"].size)
+    edges = np.unique([0, *np.flatnonzero(np.diff(stamp)) + 1, stamp.size]).tolist()
     named = labels if callers and (landmark > UNLABELLED).any() else NO_CALLERS
-    scans = (replace(scan, callers=named) for scan in scans)
-    return tuple(scan if known else _direct_calls_marked(scan, labels) for scan in scans)
+    straight = np.equal(said.get("excess_path", math.nan), 0.0) & (not known)
+    if straight.any():
+        said["excess_path"] = np.where(straight, np.nan, said["excess_path"])
+    rows = make_scan(**said | {"time": math.nan})
+    whose = (rows.landmark > UNLABELLED) & (rows.landmark == labels[rows.caller])
+    direct = (straight | whose) & (not known)
 
+    def scan(begin: int, end: int) -> Scan:
+        caller, at = rows.caller[begin:end], np.flatnonzero(direct[begin:end])[::-1]
+        marked = NO_CALLERS if known else np.full(labels.size, UNLABELLED)
+        marked[caller[at]] = at  # of several, the first
+        return Scan(
+            time=float(said["time"][begin]),
+            landmark=rows.landmark[begin:end],
+            caller=caller,
+            numbers=np.ascontiguousarray(rows.numbers[:, begin:end]),
+            callers=named,
+            direct=marked,
+        )
 
-def _direct_calls_marked(scan: Scan, labels: Int[np.ndarray, " c"]) -> Scan:
-    """Mark the direct call of each caller, which has an excess path of 0, or its label."""
-    named = (scan.landmark > UNLABELLED) & (scan.landmark == labels[scan.caller])
-    direct, straight = np.full(labels.size, UNLABELLED), scan.excess_path == 0.0
-    rows = np.flatnonzero(straight | named)[::-1]  # the first is used
-    direct[scan.caller[rows]] = rows
-    excess = np.where(straight, np.nan, scan.excess_path)
-    return replace(with_columns(scan, excess_path=excess), direct=direct)
+    return tuple(map(scan, edges[:-1], edges[1:]))
