@@ -4,7 +4,7 @@ Settings, plans and logs are written by hand, and rejected with the same form of
 validated by pydantic; its errors are reworded here, and a correction of a misspelt name suggested.
 """
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from difflib import get_close_matches
 from typing import Any, get_args
 
@@ -63,17 +63,22 @@ def values_expected(fault: Any, field: FieldInfo) -> int | None:
 def table_refusal(
     where: object, error: ValidationError, model: type[BaseModel], *first: str
 ) -> InputError:
-    """Convert pydantic's validation error of a table to an `InputError` about the first fault.
+    """Convert pydantic's validation error of a table to an `InputError`, a line for each fault.
 
-    Faults of the keys `first` precede those of unknown keys, and these all others. The missing keys
-    of a table are named at once. Tables in a list are numbered from 1.
+    A fault of the keys `first` is named without others; unknown keys precede other faults. The
+    missing keys of a table are named at once. Tables in a list are numbered from 1.
     """
-    faults, rank = error.errors(include_url=False), {name: n for n, name in enumerate(first)}
-    unknown = {"extra_forbidden": len(rank)}
-    fault = min(
-        faults,
-        key=lambda f: rank.get(str([*f["loc"], ""][0]), unknown.get(f["type"], len(rank) + 1)),
-    )
+    faults = error.errors(include_url=False)
+    leading = [fault for name in first for fault in faults if fault["loc"][:1] == (name,)]
+    inner = {fault["loc"][:n] for fault in faults for n in range(len(fault["loc"]))}
+    rest = [fault for fault in faults if fault["loc"] not in inner]
+    rest.sort(key=lambda fault: fault["type"] != "extra_forbidden")
+    lines = (str(_fault_refusal(where, one, faults, model)) for one in leading[:1] or rest)
+    return InputError("\n".join(dict.fromkeys(lines)))
+
+
+def _fault_refusal(where: object, fault: Any, faults: Sequence[Any], model: Any) -> InputError:
+    """Convert one of a table's faults to an `InputError`."""
     if fault["type"] == "json_invalid":
         return refusal(where, "text that is no JSON", "JSON", "restore the file or make it again")
     if not fault["loc"] and fault["type"].startswith("model"):

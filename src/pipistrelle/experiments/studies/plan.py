@@ -10,10 +10,10 @@ the piston with that beamwidth, so both forms describe the same study.
 import json
 import re
 import warnings
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import suppress
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from decimal import ROUND_FLOOR, Context
+from functools import partial
 from hashlib import sha256
 from importlib.resources import files
 from itertools import product
@@ -22,13 +22,12 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import Annotated, Any, Literal, cast
 
-from pydantic import Field, PlainValidator, ValidationError
-from pydantic_core import PydanticCustomError
+from pydantic import AfterValidator, Field, ValidationError
 
 from pipistrelle.acoustics.call import with_calls
 from pipistrelle.arrays.layout import with_array
 from pipistrelle.config import STRATEGIES, Config, InputError, Section, Strategy
-from pipistrelle.estimation.catalogue import CATALOGUE, PAPERS, check_distinct, check_name
+from pipistrelle.estimation.catalogue import CATALOGUE, PAPERS, check_distinct, names_class
 from pipistrelle.experiments.hearing.caller_paths import with_routes
 from pipistrelle.experiments.hearing.scenario import ALL_DRAWN, World
 from pipistrelle.experiments.hearing.world_folder import (
@@ -184,15 +183,13 @@ DIGITS = Context(prec=12, rounding=ROUND_FLOOR)
 the widest."""
 
 
-def with_radii(
+def radii_of(
     where: str, grid: Mapping[str, Any], strategies: Sequence[str], layer: Layer
-) -> dict[str, Any]:
-    """Replace the beamwidths [deg] in a plan's grid by piston radii [m], in the same order.
+) -> list[float]:
+    """Return the piston radii [m] of the beamwidths [deg] in a plan's grid, in the same order.
 
     `layer` contains the plan's settings, which give the tone and the speed of sound.
     """
-    if BEAMWIDTH not in grid:
-        return dict(grid)
     widths, place = grid[BEAMWIDTH], f"{where}.{BEAMWIDTH}"
     names = {".".join(key) for key, _ in leaves(grid)}
     if RADIUS in names:
@@ -215,8 +212,7 @@ def with_radii(
         radii[radius] = width
     widest = max(radii)
     resolve(layer | {("emitter", "radius"): Given(widest, f"{place}: radius of {radii[widest]}")})
-    renamed = {RADIUS if name == BEAMWIDTH else name: values for name, values in grid.items()}
-    return renamed | {RADIUS: [*radii]}
+    return [*radii]
 
 
 def _radius(where: str, width: Any, config: Config) -> float:
@@ -234,38 +230,28 @@ def _radius(where: str, width: Any, config: Config) -> float:
 FORMAT = 1
 
 
-def _checked(expected: str, valid: Callable[[Any], bool]) -> PlainValidator:
-    """Return a Pydantic validator that raises unless `valid` accepts the value of a plan's key."""
-
-    def check(found: Any) -> Any:
-        if valid(found):
-            return found
-        raise PydanticCustomError("key", "Input should be {expected}", {"expected": expected})
-
-    return PlainValidator(check)
+def _checked_filter(name: str) -> str:
+    """Return an estimator's name; raise unless it is in the catalogue or ``module:Class``."""
+    if name not in CATALOGUE and not names_class(name):
+        raise ValueError(f"{', '.join(map(repr, CATALOGUE))} or module:Class")
+    return name
 
 
-def _names_filter(found: Any) -> bool:
-    """Return whether a value is an estimator's name, in the catalogue or ``module:Class``."""
-    with suppress(InputError):
-        return bool(check_name(str(found)))
-    return False
+def _checked_folder(name: str) -> str:
+    """Return a word; raise unless a folder may have it as its name."""
+    if not re.fullmatch(r"\w[\w.-]*", name):
+        raise ValueError("letters, digits, _ . and -, as of a folder")
+    return name
 
 
-def _names_folder(found: Any) -> bool:
-    """Return whether a value is a word that a folder may have as its name."""
-    return isinstance(found, str) and re.fullmatch(r"\w[\w.-]*", found) is not None
-
-
-_FILTERS = ", ".join(f"'{name}'" for name in CATALOGUE) + " or module:Class"
-_Filter = Annotated[str, _checked(_FILTERS, _names_filter)]
+_Filter = Annotated[str, AfterValidator(_checked_filter)]
 
 
 class _PlanFile(Section):
     """Keys of a plan file, validated by Pydantic; the settings in its tables are checked later."""
 
     format: Literal[1]
-    name: Annotated[str, _checked("letters, digits, _ . and -, as of a folder", _names_folder)]
+    name: Annotated[str, AfterValidator(_checked_folder)]
     iterations: Annotated[int, Field(ge=1, le=MOST_WORLDS)]
     planned: int = 0
     strategies: Annotated[tuple[Strategy, ...], Field(min_length=1)] = STRATEGIES
@@ -273,7 +259,7 @@ class _PlanFile(Section):
     settings: Any = None
     config: dict[str, Any] = Field(default_factory=dict)
     grid: dict[str, Any] = Field(default_factory=dict)
-    own: dict[str, dict[str, Any]] = Field(default_factory=dict)
+    own: dict[str, Any] = Field(default_factory=dict)
 
 
 def find_plan(word: str) -> Path:
@@ -320,48 +306,72 @@ def plan_of(
     {'beacon.level_db': (36.8, 42.8)}
     """
     over = over or {}
-    named, usual = _beneath(path, table, over)
-    file = _plan_file(path, {"filters": usual, **table} if usual else table, iterations)
-    tables = {name: table.get(name, {}) for name in ("config", "grid", "own")}
+    given = ((name, table.get(name)) for name in ("config", "grid", "own"))
+    tables = {name: one if isinstance(one, Mapping) else {} for name, one in given}
+    named, usual = _beneath(path, (tables["config"], table), over)
+    names = {RADIUS if n == BEAMWIDTH else n: values for n, values in tables["grid"].items()}
     worlds: dict[str, World] = {}
-    layer = _laid(path, tables["config"], over, worlds)
-    radii = with_radii(f"{path}: grid", tables["grid"], file.strategies, layer)
-    asked = [
-        (key, ".".join(key), _read(path, key, given.value, worlds))
-        for key, given in from_table(spread(radii, "."), f"{path}: ", "grid.", (BEAMWIDTH,)).items()
-    ]
-    varied = {key for key, _, _ in asked}
-    named = {k: given for k, given in named.items() if not {k, k[2:]} & varied}
-    own_layer = from_table({"own": tables["own"]}, f"{path}: ")
+    file, layer, own_layer, varied = _together(
+        lambda: _plan_file(path, {"filters": usual, **table} if usual else table, iterations),
+        lambda: _laid(path, tables["config"], over, worlds),
+        lambda: from_table({"own": tables["own"]}, f"{path}: "),
+        lambda: from_table(spread(names, "."), f"{path}: ", "grid.", (BEAMWIDTH,)),
+    )
+    if BEAMWIDTH in tables["grid"]:
+        radii = radii_of(f"{path}: grid", tables["grid"], file.strategies, layer)
+        varied[RADIUS_KEY] = Given(radii, f"{path}: grid.{BEAMWIDTH}")
+    asked = {key: _read(path, key, given.value, worlds) for key, given in varied.items()}
+    named = {k: given for k, given in named.items() if not {k, k[2:]} & varied.keys()}
     if others := [key[1] for key in own_layer if key[1] not in file.filters]:
         expected = f"expected one of {', '.join(file.filters)}"
         raise InputError(f"{path}: own.{others[0]}: no filter of this plan; {expected}")
     check_own(own_layer)
     layer, own = parted(laid(named, layer, own_layer))
-    lengths = [len(values) for _, _, values in asked if isinstance(values, list)]
+    lengths = [len(values) for values in asked.values() if isinstance(values, list)]
     most = prod(lengths) * len(file.strategies) * len(file.filters)
     if most > MOST_CASES:
         raise InputError(f"{path}: grid: found {most} cases, expected at most {MOST_CASES}")
-    grid = {name: _values(path, name, key, values, layer) for key, name, values in asked}
+    config, *lists = _together(
+        lambda: resolve(layer),
+        *(partial(_values, path, key, values, layer) for key, values in asked.items()),
+    )
+    grid = dict(zip(map(".".join, asked), lists, strict=True))
     _check_unvaried(path, layer, grid, over, BEAMWIDTH in tables["grid"])
     if twice := [one.where for key, one in own_layer.items() if ".".join(key[2:]) in grid]:
         raise InputError(f"{twice[0]}: the plan varies this setting; take it out")
     own = {name: own[name] for name in file.filters if name in own}
+    values: dict[str, dict[str, Any]] = {}
+    for name, given in own.items():
+        settled: Any = resolve(layer | given).model_dump(mode="json")
+        values[name] = {".".join(key): settled[key[0]][key[1]] for key in given}
     plan = Plan(
         name=file.name,
         iterations=file.iterations,
         planned=max(file.iterations, file.planned),
         strategies=file.strategies,
         filters=file.filters,
-        config=resolve(layer),
+        config=config,
         grid=grid,
-        own=_own_values(own, layer),
+        own=values,
         worlds=worlds,
     )
     for given in ({}, *own.values()):
         for _ in combinations(layer | given, grid, f"{path}: grid.", worlds):
             pass
     return plan
+
+
+def _together(*checks: Callable[[], Any]) -> list[Any]:
+    """Return the results of checks; raise a single error with the errors of all of them."""
+    results, problems = [], []
+    for check in checks:
+        try:
+            results.append(check())
+        except InputError as refused:
+            problems += str(refused).splitlines()
+    if problems:
+        raise InputError("\n".join(dict.fromkeys(problems)))
+    return results
 
 
 def _check_unvaried(
@@ -376,10 +386,10 @@ def _check_unvaried(
             raise InputError(f"{layer[key].where}: {why}, or in a copy (cp {path} my.toml)")
 
 
-def _beneath(path: Path, table: Mapping[str, Any], over: Layer) -> tuple[Layer, tuple[str, ...]]:
+def _beneath(
+    path: Path, places: Iterable[Mapping[str, Any]], over: Layer
+) -> tuple[Layer, tuple[str, ...]]:
     """Return settings and estimators of the preset that `over`, or else the plan's file, names."""
-    config = table.get("config")
-    places = (config if isinstance(config, dict) else {}, table)
     words = [Given(one["settings"], f"{path}: settings") for one in places if "settings" in one]
     given = [*words, *(one for key, one in over.items() if key == SETTINGS)]
     return over_named(*({SETTINGS: one} for one in given))
@@ -419,15 +429,6 @@ def _worlds(path: Path, folders: Any, worlds: dict[str, World]) -> Any:
             raise InputError(f"{path}: grid.{WORLD}: found two worlds called {world.name}; {fix}")
         names.append(world.name)
     return names
-
-
-def _own_values(own: Mapping[str, Layer], layer: Layer) -> dict[str, dict[str, Any]]:
-    """Return filter-specific settings, valid with the common ones, by filter and dotted name."""
-    values = {}
-    for name, given in own.items():
-        settled: Any = resolve(layer | given).model_dump(mode="json")
-        values[name] = {".".join(key): settled[key[0]][key[1]] for key in given}
-    return values
 
 
 def plan_text(plan: Plan) -> str:
@@ -491,7 +492,7 @@ def _as_table(plan: Plan) -> dict[str, Any]:
 
 
 def _plan_file(path: Path, table: Mapping[str, Any], iterations: int | None) -> _PlanFile:
-    """Validate the top-level keys of a plan file; raise at its first fault."""
+    """Validate the top-level keys of a plan file; raise an error that lists its faults."""
     given = {"name": text_of(path.stem), **table}
     if iterations is not None:
         if isinstance(given.get("iterations"), int):
@@ -507,9 +508,9 @@ def _plan_file(path: Path, table: Mapping[str, Any], iterations: int | None) -> 
     return file
 
 
-def _values(path: Path, name: str, key: Key, values: Any, layer: Layer) -> tuple[Any, ...]:
+def _values(path: Path, key: Key, values: Any, layer: Layer) -> tuple[Any, ...]:
     """Validate and return the values that a plan's grid lists for a setting."""
-    where = f"{path}: grid.{name}"
+    where = f"{path}: grid.{'.'.join(key)}"
     if key == ("seed",):
         raise InputError(f"{where}: every iteration is another world already; raise iterations")
     if key in (SETTINGS, OWN):

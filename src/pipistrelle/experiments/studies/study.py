@@ -91,9 +91,14 @@ def open_store(folder: Path, plan: Plan) -> None:
         seen = list(folder.iterdir())
         there = kept_plan(folder) if kept.exists() else None
         left = [path for path in seen if whole_name(path.name) in _FILES]
-        kept_first = [folder / "worlds"]  # a plan needs its worlds first
-        strange = [path.name for path in seen if path not in [*left, *kept_first]]
-        _refuse_strange(folder, there, strange)
+        # Worlds are kept before the plan that needs them.
+        strange = [path.name for path in seen if path not in [*left, folder / "worlds"]]
+        holds = f"{min(strange)} and no plan.toml" if there is None and strange else ""
+        if there and not (_is_ours(kept, there) or (folder / "trials").is_dir()):
+            holds = "a plan.toml that is not Pipistrelle's and no trials"
+        if holds:
+            fix = "name another with -o DIR"
+            raise InputError(f"{folder}: holds {holds}, so it is no study's folder; {fix}")
         if there is not None and (changes := changed_settings(there, plan)):
             differences = "".join(f"\n  {line}" for line in changes)
             fix = f"name a new folder with -o DIR{differences}"
@@ -138,16 +143,6 @@ def _keep_plan(folder: Path, there: Plan | None, plan: Plan) -> None:
             path.parent.mkdir(parents=True, exist_ok=True)
             write_whole(path, content)
     write_whole(kept, plan_text(plan).encode())
-
-
-def _refuse_strange(folder: Path, there: Plan | None, strange: Sequence[str]) -> None:
-    """Raise if a folder is neither empty nor a study's, so that nothing in it is overwritten."""
-    holds = f"{min(strange)} and no plan.toml" if there is None and strange else ""
-    if there and not (_is_ours(folder / "plan.toml", there) or (folder / "trials").is_dir()):
-        holds = "a plan.toml that is not Pipistrelle's and no trials"
-    if holds:
-        fix = "name another with -o DIR"
-        raise InputError(f"{folder}: holds {holds}, so it is no study's folder; {fix}")
 
 
 def _is_ours(kept: Path, plan: Plan) -> bool:
@@ -238,7 +233,15 @@ def run_study(
     worlds = range(shard[0], plan.iterations, shard[1])
     done = done_worlds(folder).intersection(worlds)
     sweep(folder, done)
-    so_far = _nothing_done(plan, len(worlds))
+    cases = Counter[str](case.strategy for case in cases_of(plan))
+    so_far = StudyProgress(
+        worlds=len(worlds),
+        done=0,
+        trials={strategy: number * len(worlds) for strategy, number in cases.items()},
+        ended=dict.fromkeys(cases, 0),
+        failed=dict.fromkeys(cases, 0),
+        first_error=None,
+    )
     waiting: deque[int] = deque()
     for iteration in worlds:
         trials = read_outcomes(folder, plan, iteration) if iteration in done else None
@@ -305,19 +308,6 @@ def _named(case: PlannedCase) -> Iterator[None]:
         values = ", ".join(f"{name} = {value}" for name, value in case.values.items())
         where = f" (where the grid has {values})" if values else ""
         raise InputError(f"{error}{where}") from None
-
-
-def _nothing_done(plan: Plan, worlds: int) -> StudyProgress:
-    """Return the progress of a study before its first world."""
-    cases = Counter[str](case.strategy for case in cases_of(plan))
-    return StudyProgress(
-        worlds=worlds,
-        done=0,
-        trials={strategy: number * worlds for strategy, number in cases.items()},
-        ended=dict.fromkeys(cases, 0),
-        failed=dict.fromkeys(cases, 0),
-        first_error=None,
-    )
 
 
 def _advanced(so_far: StudyProgress, trials: Sequence[Outcome]) -> StudyProgress:
