@@ -101,10 +101,14 @@ class SlamNode(Node):
     def hear(self):
         """Hear the scans of this step; tell whether there were any."""
         due = [scan for scan in self.waiting if scan[0] <= self.slam.time]
-        self.waiting = self.waiting[len(due) :]
+        self.waiting, alarms = self.waiting[len(due) :], self.slam.alarms
         for time, columns in due:
             late = time if time <= self.began else None  # Slam refuses it, by its time
             self.guarded(lambda one, late=late: self.slam.hear(time=late, **one), columns)
+        for time, cause, repaired in self.slam.alarms:
+            if (time, cause, repaired) not in alarms:
+                state = "repaired" if repaired else "path and map are not to be trusted"
+                self.get_logger().warning(f"{cause}: no fit from {time:.3f} s on; {state}")
         return bool(due)
 
     def tell(self, heard):

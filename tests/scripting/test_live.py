@@ -359,6 +359,8 @@ def test_a_caller_is_named_as_the_vehicle_names_it():
     slam.move([1.0, 0.0], dt=1.0)
     slam.hear(landmark=[9], bearing=[0.5], caller=["bat"], excess_path=[4.0], excess_path_std=[0.1])
     assert slam.map.filter(landmark=9)["status"].to_list() == ["full"]
+    slam._session.report = lambda: {"alarms": [(0.5, -1, True), (1.0, 1, False)]}
+    assert slam.alarms == [(0.5, "pose", True), (1.0, "bat", False)]
 
 
 @pytest.mark.slow

@@ -17,7 +17,7 @@ from pipistrelle.detection.logs.vehicle import NOISY, read_vehicle, vehicle_of
 from pipistrelle.detection.logs.vehicle import Vehicle as VehicleKeys
 from pipistrelle.detection.noise import noise_of
 from pipistrelle.detection.scans import OWN
-from pipistrelle.estimation.beliefs import KNOWN, Belief, Gaussian, Landmarks, completed
+from pipistrelle.estimation.beliefs import KNOWN, Belief, Gaussian, completed
 from pipistrelle.estimation.catalogue import ASSOCIATION, ESTIMATOR, class_of, entry, names_class
 from pipistrelle.estimation.checking import usable_controls
 from pipistrelle.estimation.data_association.sequential import association_of
@@ -69,6 +69,8 @@ ROUNDING = float(np.finfo(float).eps) ** 0.5
 """Half of the digits of a number."""
 OWN_WORDS = ("filter", "config", "time", "kept")
 """Keywords that are not settings."""
+OF_TRUTH = ("true_x_m", "true_y_m", "error_m", "true_landmark")
+"""Columns of a map that only a world with truth has."""
 COLUMNS = ("landmark", "bearing", "range", CALLER, *STATED)
 """Columns of a scan."""
 _NO_NUMBERS = (str, bytes, bool, np.bool_, complex, np.complexfloating)
@@ -203,18 +205,23 @@ class Slam:
     @property
     def map(self) -> "pl.DataFrame":
         """Table of the map, a row per hypothesis of each landmark, as in ``landmarks.parquet``."""
-        return self._map_table(self._session.landmarks())
+        return landmark_table(self._session.landmarks(), None).drop(OF_TRUTH)
 
     @property
     def moving(self) -> "pl.DataFrame":
         """Table of the moving callers, with the columns of `map`."""
-        return self._map_table(completed(self._session.belief, Belief).moving())
+        return landmark_table(completed(self._session.belief, Belief).moving(), None).drop(OF_TRUTH)
 
-    @staticmethod
-    def _map_table(landmarks: Landmarks) -> "pl.DataFrame":
-        """Convert landmarks to the table of a map without true positions."""
-        of_truth = ("true_x_m", "true_y_m", "error_m", "true_landmark")
-        return landmark_table(landmarks, None).drop(of_truth)
+    @property
+    def alarms(self) -> list[tuple[float, str, bool]]:
+        """Failures so far of a drive without labels: time [s], cause, and whether it was repaired.
+
+        The cause is ``"pose"``, ``"vehicle"`` (its ranges do not fit) or a caller's name. Path and
+        map are not to be trusted after a failure that was not repaired.
+        """
+        names = ["pose", "vehicle", *(caller.name for caller in self._log.callers)]  # from -1 on
+        alarms = self._session.report().get("alarms", ())
+        return [(time, names[call + 1], repaired) for time, call, repaired in alarms]
 
     @property
     def path(self) -> "pl.DataFrame":
@@ -329,10 +336,8 @@ class Slam:
         self._poses[-1] = (self._time, pose)
         if not self._session.labels:
             return table.column["landmark"]
-        order = np.argsort(np.isnan(table.column["bearing"]), kind="stable")
-        labels = np.empty(order.size, dtype=np.int64)
-        labels[order] = self._session.labels[-1]
-        return labels
+        order = np.argsort(np.isnan(table.column["bearing"]), kind="stable")  # as in the scan
+        return self._session.labels[-1][np.argsort(order)]
 
     def save(self, file: Path | str) -> Path:
         """Write the vehicle, the settings and the estimates into a file that `load` reads.
