@@ -1,7 +1,7 @@
 """Consistency of covariance and errors: NEES, ANEES, divergence, stray landmarks."""
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 from jaxtyping import Bool, Float
@@ -241,9 +241,7 @@ def strayed_landmarks(
     return found
 
 
-def _residuals(
-    track: Track, rows: Mapping[str, np.ndarray]
-) -> tuple[Float[np.ndarray, " m"], np.ndarray]:
+def _residuals(track: Track, rows: dict[str, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
     """Return each measurement's squared normalised residual and its dimension; 0 if unmapped."""
     known, label = some_of(track.landmarks, placed(track.landmarks)), rows["landmark"]
     order = np.argsort(known.landmark)

@@ -163,6 +163,18 @@ def test_the_tables_hold_a_row_for_each_case_frame_and_mapped_landmark(plan, tmp
         assert mine["full"].sum() == row["landmarks_full"]
 
 
+def test_a_study_continued_since_settings_were_renamed_is_read_whole(tmp_path):
+    plan = plan_of(tmp_path, SMALL.replace("emitter.radius", "rays.exponent"))
+    folder, records = tmp_path / "study", world.failed_records(plan, "")
+    open_store(folder, plan)
+    for number in (0, 1):
+        write_world(folder, plan, number, records)
+    old = world_file(folder, "trials", 0)
+    pl.read_parquet(old).rename({"rays.exponent": "rays.power"}).write_parquet(old)
+    trials = load_study(folder).trials.collect()
+    assert (len(trials), "rays.power" in trials) == (2 * len(records), False)
+
+
 def test_a_study_opens_with_its_plan_its_settings_and_an_explanation(folder, plan):
     assert read_plan(folder / "plan.toml") == plan
     assert resolve(from_file(folder / "config.toml")) == plan.config
@@ -176,15 +188,6 @@ def test_reopening_a_study_with_its_plan_changes_no_file(folder, plan, records):
     before = contents(folder)
     open_store(folder, plan)
     assert contents(folder) == before
-
-
-def test_more_worlds_of_one_plan_are_asked_for_in_one_folder_and_fewer_change_nothing(
-    folder, tmp_path
-):
-    open_store(folder, plan_of(tmp_path, iterations=8))
-    assert read_plan(folder / "plan.toml").iterations == 8
-    open_store(folder, plan_of(tmp_path, iterations=2))
-    assert read_plan(folder / "plan.toml").iterations == 8
 
 
 def test_a_folder_remembers_how_many_worlds_its_plan_names(tmp_path, plan):

@@ -15,7 +15,7 @@ import os
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, fields, replace
 from hashlib import sha256
-from itertools import chain, product
+from itertools import chain, groupby, product
 from math import degrees
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -353,19 +353,19 @@ def refuse_strange(folder: Path, plan: Plan, iterations: Iterable[int]) -> None:
     schemas = world_schemas(plan)
     for iteration, name in product(iterations, TABLES[:-1]):
         path = world_file(folder, name, iteration)
-        if os.path.lexists(path) and not _is_table(path, schemas[name]):
+        if os.path.lexists(path) and schemas[name] != _columns(path):
             why = "is no table of this study as Pipistrelle wrote it, so it is not replaced"
             raise InputError(f"{path}: {why}; move it away, or name another folder with -o DIR")
 
 
-def _is_table(path: Path, schema: "Mapping[str, pl.DataType]") -> bool:
-    """Return whether a file is a readable table with these columns, and not a link."""
+def _columns(path: Path) -> "Mapping[str, pl.DataType]":
+    """Return the columns of a table's file with their types; none of a link, or if unreadable."""
     import polars as pl
 
     with contextlib.suppress(OSError, pl.exceptions.PolarsError):
         if not path.is_symlink():
-            return schema == pl.read_parquet_schema(io.BytesIO(read_file(path)))
-    return False
+            return pl.read_parquet_schema(io.BytesIO(read_file(path)))
+    return {}
 
 
 def with_sums(tables: "Mapping[str, pl.DataFrame]", plan: Plan, iteration: int) -> dict[str, bytes]:
@@ -404,9 +404,8 @@ def _plan_sum(plan: Plan) -> str:
     config = plan.config.model_dump(mode="json", exclude_defaults=True)
     medium = config.pop(plan.config.scenario.medium, {})
     medium["speed_of_sound"] = plan.config.medium.sound_speed  # also if it is derived
-    grid = {name: list(values) for name, values in plan.grid.items()}
-    own = {name: dict(settings) for name, settings in plan.own.items()}
-    parts = [plan.strategies, plan.filters, config, medium, grid, *([own] if own else [])]
+    own = [{name: dict(settings) for name, settings in plan.own.items()}] if plan.own else []
+    parts = [plan.strategies, plan.filters, config, medium, dict(plan.grid), *own]
     hook = lambda pairs: {names.get(name, name): value for name, value in pairs}  # noqa: E731
     parts = json.loads(json.dumps(parts), object_pairs_hook=hook)
     return sha256(json.dumps(parts, sort_keys=True).encode()).hexdigest()
@@ -482,11 +481,13 @@ def scan_tables(folder: Path, table: str, worlds: Sequence[int]) -> "pl.LazyFram
         check_ordinary(path)
     try:
         os.fspath(folder.absolute()).encode()
-        frame = pl.scan_parquet(paths, glob=False)
+        sources: dict[Path, Any] = dict(zip(paths, paths, strict=True))
     except UnicodeEncodeError:  # Polars needs paths that are valid text
-        frame = pl.scan_parquet([read_file(path) for path in paths])
-    # Studies of older versions have columns with the old names of settings.
-    return frame.rename(RENAMED, strict=False)
+        sources = {path: read_file(path) for path in paths}
+    # Worlds of older versions have columns with the old names of settings.
+    parts = groupby(paths, lambda path: RENAMED.keys().isdisjoint(_columns(path)))
+    frames = (pl.scan_parquet([sources[path] for path in part], glob=False) for _, part in parts)
+    return pl.concat([frame.rename(RENAMED, strict=False) for frame in frames])
 
 
 def unusable(folder: Path, error: OSError) -> InputError:
