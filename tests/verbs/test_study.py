@@ -126,7 +126,7 @@ def test_failed_trials_of_an_earlier_run_count_until_they_are_run_again(obey, mo
         assert obey("small.toml", "--iterations", "1", "--quiet", "-o", "one")[0] == 1
     assert obey("small.toml", "--iterations", "1", "--quiet", "-o", "one")[0] == 1
     words = ("--iterations", "1", "--retry-failed", "-o", "one")
-    assert obey("small.toml", *words)[:2] == (0, "1 worlds, 10 trials, 0 failed\none\n")
+    assert obey("small.toml", *words)[:2] == (0, "1 world, 10 trials, 0 failed\none\n")
 
 
 def test_on_a_terminal_bars_move(obey, monkeypatch):

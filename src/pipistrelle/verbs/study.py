@@ -55,7 +55,8 @@ def _study(asked: dict[str, Any]) -> int:
         raise
     ended, failed = sum(so_far.ended.values()), sum(so_far.failed.values())
     if not quiet:
-        put(f"{so_far.done} worlds, {ended} trials, {failed} failed")
+        worlds = f"{so_far.done} world{'s' * (so_far.done != 1)}"
+        put(f"{worlds}, {ended} trial{'s' * (ended != 1)}, {failed} failed")
     if failed:
         warn(
             f"{failed} of {ended} trials failed, the first with: "
