@@ -61,19 +61,20 @@ def values_expected(fault: Any, field: FieldInfo) -> int | None:
 
 
 def table_refusal(
-    where: object, error: ValidationError, model: type[BaseModel], *first: str
+    where: object, error: ValidationError, model: type[BaseModel], *first: str, every: bool = False
 ) -> InputError:
-    """Convert pydantic's validation error of a table to an `InputError`, a line for each fault.
+    """Convert pydantic's validation error of a table to an `InputError` about the first fault.
 
-    A fault of the keys `first` is named without others; unknown keys precede other faults. The
-    missing keys of a table are named at once. Tables in a list are numbered from 1.
+    Faults of the keys `first` precede unknown keys, and these all other faults; with `every`, the
+    others follow, a line each, unless a fault of the keys `first` explains them. The missing
+    keys of a table are named at once. Tables in a list are numbered from 1.
     """
-    faults = error.errors(include_url=False)
+    faults = sorted(error.errors(include_url=False), key=lambda f: f["type"] != "extra_forbidden")
     leading = [fault for name in first for fault in faults if fault["loc"][:1] == (name,)]
     inner = {fault["loc"][:n] for fault in faults for n in range(len(fault["loc"]))}
     rest = [fault for fault in faults if fault["loc"] not in inner]
-    rest.sort(key=lambda fault: fault["type"] != "extra_forbidden")
-    lines = (str(_fault_refusal(where, one, faults, model)) for one in leading[:1] or rest)
+    named = (leading[:1] or rest)[: None if every else 1]
+    lines = (str(_fault_refusal(where, fault, faults, model)) for fault in named)
     return InputError("\n".join(dict.fromkeys(lines)))
 
 

@@ -194,7 +194,7 @@ class Description(Section):
 
 
 def read_description(folder: Path) -> Description:
-    """Read ``recording.toml`` of a folder; raise an error that lists its faults."""
+    """Read ``recording.toml`` of a folder; raise at its first fault."""
     path = folder / FILE
     raw = parse_toml(read_text(path), path)
     try:

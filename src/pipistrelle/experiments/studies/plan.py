@@ -501,7 +501,7 @@ def _plan_file(path: Path, table: Mapping[str, Any], iterations: int | None) -> 
     try:
         file = _PlanFile.model_validate_json(json.dumps(given, default=str), strict=True)
     except ValidationError as refused:
-        raise table_refusal(path, refused, _PlanFile, "format") from None
+        raise table_refusal(path, refused, _PlanFile, "format", every=True) from None
     for name in ("strategies", "filters"):
         _check_distinct(f"{path}: {name}", getattr(file, name))
     check_distinct(file.filters, f"{path}: filters")
