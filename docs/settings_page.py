@@ -9,7 +9,7 @@ from pipistrelle.config import LARGEST, CallerConfig, Config
 from pipistrelle.settings import CALLERS, OWN, PREFIX, SETTINGS, from_flags, known_settings
 
 PLACE = "<!-- settings -->"
-CALLER = "<!-- callers -->"
+CALLER = re.compile(".*<!-- callers -->")
 ALL_DRAWN = "any number"
 WORDS = {"string": "a folder", "file": "a file", "boolean": "`true` or `false`"}
 """Settings that are no numbers; text that is free is the folder of a world, or names topics."""
@@ -24,9 +24,10 @@ UNIT = re.compile(r" ?\[((?!0 to 1)[^]]+)\]")
 
 
 def add_settings(app, docname, content):
-    """Put every setting, and every key of a caller, where a page asks for them."""
+    """Put every setting, and every key of a caller, in the place of its mark on a page."""
     if docname in ("settings", "callers"):
-        content[0] = content[0].replace(PLACE, markdown()).replace(CALLER, callers())
+        text = CALLER.sub(lambda _: callers(), content[0])
+        content[0] = text.replace(PLACE, markdown())
 
 
 def markdown():
