@@ -188,7 +188,6 @@ def test_a_length_of_time_is_worded_in_the_unit_that_fits(seconds, words):
         ("small.toml --shard 4/4", "--shard: found '4/4', expected I/N with I from 0 to N - 1"),
         ("small.toml --shard 0/0", "--shard: found '0/0', expected I/N"),
         ("small.toml --sharp 0/4", "Unknown option: --sharp. Did you mean --shard?"),
-        ("small.toml --emitter.radius 0.01", "--emitter.radius: the plan varies this setting"),
         ("small.toml --rays.exponent 0", "--rays.exponent: found 0.0, expected greater than 0"),
         ("small.toml --workers 2 --scheduler tcp://here:1", "--workers: the cluster at tcp://here"),
         ("small.toml -o small.toml", "small.toml: could not be written (File exists)"),

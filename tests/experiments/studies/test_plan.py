@@ -291,17 +291,18 @@ def test_a_default_of_a_varied_setting_has_no_effect(tmp_path):
     assert read_plan(path).grid == {"rays.exponent": (1.0, 3.0)}
 
 
-@pytest.mark.parametrize(
-    ("text", "flag", "said"),
-    [
-        (SMALL, {"emitter": {"radius": 0.01}}, "emitter.radius: the plan varies this setting; "),
-        (BARE + BEAMS, {"emitter": {"radius": 0.01}},
-         "emitter.radius: the plan varies this setting as beamwidth; take it out of [grid]"),
-        (SMALL, {"rays": {"exponent": -1}}, "rays.exponent: found -1, expected"),
-    ],
-)  # fmt: skip
-def test_a_flag_that_contradicts_a_plan_is_named(refused, text, flag, said):
-    assert refused(text, over=from_flags(flag)).startswith(f"--{said}")
+@pytest.mark.parametrize("text", [SMALL, BARE + BEAMS])
+def test_a_flag_replaces_the_values_of_a_grid(tmp_path, text):
+    over = from_flags({"emitter": {"radius": 0.01}})
+    with pytest.warns(UserWarning, match=r"--emitter.radius replaces its values in \[grid\] of"):
+        plan = plan_of(tmp_path, text, over=over)
+    assert "emitter.radius" not in plan.grid
+    assert plan.config.emitter.radius == 0.01
+
+
+def test_a_bad_value_of_a_flag_is_named(refused):
+    said = refused(SMALL, over=from_flags({"rays": {"exponent": -1}}))
+    assert said.startswith("--rays.exponent: found -1, expected")
 
 
 def test_a_plan_that_is_not_there_is_refused():

@@ -317,7 +317,10 @@ def plan_of(
         lambda: from_table({"own": tables["own"]}, f"{path}: "),
         lambda: from_table(spread(names, "."), f"{path}: ", "grid.", (BEAMWIDTH,)),
     )
-    if BEAMWIDTH in tables["grid"]:
+    for key in sorted(over.keys() & varied.keys()):
+        warnings.warn(f"{over[key].where} replaces its values in [grid] of {path}", stacklevel=2)
+        del varied[key]
+    if BEAMWIDTH in tables["grid"] and RADIUS_KEY in varied:
         radii = radii_of(f"{path}: grid", tables["grid"], file.strategies, layer)
         varied[RADIUS_KEY] = Given(radii, f"{path}: grid.{BEAMWIDTH}")
     asked = {key: _read(path, key, given.value, worlds) for key, given in varied.items()}
@@ -336,7 +339,7 @@ def plan_of(
         *(partial(_values, path, key, values, layer) for key, values in asked.items()),
     )
     grid = dict(zip(map(".".join, asked), lists, strict=True))
-    _check_unvaried(path, layer, grid, over, BEAMWIDTH in tables["grid"])
+    _check_unvaried(path, layer, grid, BEAMWIDTH in tables["grid"])
     if twice := [one.where for key, one in own_layer.items() if ".".join(key[2:]) in grid]:
         raise InputError(f"{twice[0]}: the plan varies this setting; take it out")
     own = {name: own[name] for name in file.filters if name in own}
@@ -374,13 +377,11 @@ def _together(*checks: Callable[[], Any]) -> list[Any]:
     return results
 
 
-def _check_unvaried(
-    path: Path, layer: Layer, grid: Mapping[str, Any], over: Layer, in_degrees: bool
-) -> None:
+def _check_unvaried(path: Path, layer: Layer, grid: Mapping[str, Any], in_degrees: bool) -> None:
     """Raise if a setting that the plan's grid varies is also given a single value."""
     for key in (key for key in layer if ".".join(key) in grid):
         # The plan in a study's folder lists every setting, so a default value is no conflict.
-        if key in over or resolve({key: layer[key]}) != Config():
+        if resolve({key: layer[key]}) != Config():
             name = f" as {BEAMWIDTH}" * (in_degrees and ".".join(key) == RADIUS)
             why = f"the plan varies this setting{name}; take it out of [grid] in {path}"
             raise InputError(f"{layer[key].where}: {why}, or in a copy (cp {path} my.toml)")
