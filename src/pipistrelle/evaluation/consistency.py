@@ -8,6 +8,7 @@ from jaxtyping import Bool, Float
 
 from pipistrelle.detection.scans import Scan, columns_of
 from pipistrelle.estimation.beliefs import Gaussian, Track, placed, some_of
+from pipistrelle.estimation.motion import SMALLEST_STD
 from pipistrelle.estimation.observations.range import NEAREST
 from pipistrelle.estimation.rays import gate_bounds
 from pipistrelle.evaluation.accuracy import pose_error
@@ -64,7 +65,8 @@ def track_nees(pose: Gaussian, true: Float[np.ndarray, "k 3"]) -> Float[np.ndarr
     """Return the NEES of each pose of a track; NaN if it is undefined.
 
     After an exact start, the noise of the first control step has rank 2 and leaves the covariance
-    singular. This is not divergence: the NEES begins with the first positive definite covariance.
+    singular. This is not divergence: the NEES begins with the first positive definite covariance,
+    without the variance that some estimators add to an exact start (`motion.SMALLEST_STD`).
 
     `pose` [m, m, rad]: with ``invariant``, errors are right-invariant about the first position;
     `true` [m, m, rad]: NaN if unknown. Returns NaN without truth and before the first positive
@@ -80,9 +82,9 @@ def track_nees(pose: Gaussian, true: Float[np.ndarray, "k 3"]) -> Float[np.ndarr
     error, covariance = pose_error(pose.mean, true), pose.covariance
     if pose.invariant:
         error, covariance = _right_invariant(pose, error)
-    epsilon, definite = _eliminated(error, covariance)
-    begun = np.logical_or.accumulate(definite)
-    exact = ~begun & definite.any() & np.isfinite(covariance).all(axis=(1, 2))
+    epsilon, added = nees(error, covariance), 2.0 * SMALLEST_STD**2 * np.eye(3)
+    begun = np.logical_or.accumulate(_eliminated(error, pose.covariance - added)[1])
+    exact = ~begun & begun.any() & np.isfinite(covariance).all(axis=(1, 2))
     return np.where(exact | ~np.isfinite(true).all(axis=1), np.nan, epsilon)
 
 
