@@ -215,7 +215,7 @@ def test_a_film_without_measurements_needs_no_legend(tmp_path):
 
 def test_a_panel_shows_at_most_two_excess_path_ellipses(timed, timed_scene):
     names, (active, fused) = staged(timed[1], **timed_scene)
-    assert {"excess-path ellipse and its way", "caller as estimated"} <= set(names)
+    assert {"excess-path ellipse, sound path", "caller as estimated"} <= set(names)
     counts = set()
     for frame, label in zip(fused.frames, fused.resolved, strict=True):
         for panel in (active, fused):
@@ -236,7 +236,7 @@ def test_a_panel_shows_at_most_two_excess_path_ellipses(timed, timed_scene):
 
 def test_a_mission_without_timing_shows_no_ellipses_or_callers(panels, snapshots, scene):
     names, _ = staged(snapshots, **scene)
-    assert "excess-path ellipse and its way" not in names
+    assert "excess-path ellipse, sound path" not in names
     for panel in panels.values():
         panel.show_picture(0, panel.frames[20].scan.time)
         assert (panel.excess_paths.get_paths(), panel.ways.get_segments()) == ([], [])

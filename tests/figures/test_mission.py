@@ -300,7 +300,7 @@ def test_estimated_callers_are_marked_with_excess_paths(timed, excess, three):
 
 
 def test_excess_paths_of_the_last_scan_are_ellipses(excess, three, timed_fused):
-    assert "excess-path ellipse and its way" in named(excess)
+    assert "excess-path ellipse, sound path" in named(excess)
     axes, trial, scan = maps(excess)[1], timed_fused, timed_fused.scans[-1]
     lines = [part for part in axes.collections if isinstance(part, LineCollection)]
     ways = [way for part in lines for way in part.get_segments() if way.shape == (3, 2)]
@@ -310,7 +310,7 @@ def test_excess_paths_of_the_last_scan_are_ellipses(excess, three, timed_fused):
         np.testing.assert_array_equal(vehicle, trial.track.pose.mean[k, :2])
         e = np.hypot(*(spot - caller)) + np.hypot(*(spot - vehicle)) - np.hypot(*(caller - vehicle))
         assert np.nanmin(np.abs(scan.excess_path - e)) < 0.5
-    assert "excess-path ellipse and its way" not in named(three)
+    assert "excess-path ellipse, sound path" not in named(three)
 
 
 def test_a_tracked_caller_is_drawn_with_its_track(excess, three, timed_fused):

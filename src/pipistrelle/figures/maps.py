@@ -264,7 +264,7 @@ class MapPanel:
             "unresolved ray, 1σ, darker: likelier": any(not rows.all() for rows in full),
             "caller as estimated": any(len(self._stars(frame)) for frame in self.frames),
             "its estimated track": bool(self.tracks),
-            "excess-path ellipse and its way": bool(set(self.resolved) - {UNLABELLED}),
+            "excess-path ellipse, sound path": bool(set(self.resolved) - {UNLABELLED}),
         }
         return {name for name, is_drawn in drawn.items() if is_drawn}
 
@@ -558,7 +558,7 @@ def legend_symbols() -> dict[str, "Artist | tuple[Artist, ...]"]:
         "moving caller": line(lw=1.0, ls="-."),
         "caller as estimated": mark("*", 11.0, "none", INK),
         "its estimated track": line(lw=1.2, ls=":"),
-        "excess-path ellipse and its way": mark(oval, 16.0, "none", "#33333399"),
+        "excess-path ellipse, sound path": mark(oval, 16.0, "none", "#33333399"),
         "vehicle at the end": mark(dart, 10.0, INK),
         "its beam": mark(sector, 14.0, "#33333338"),
         "particles": mark(dart, 10.0, "#33333350"),
