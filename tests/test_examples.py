@@ -170,7 +170,7 @@ def test_listening_gains_where_posts_are_few_and_not_where_they_are_many(play):
     assert done["answer"] == pytest.approx(few[0])
     assert few[1] < 0.01
     assert many[1] > 0.05, "where there is little to gain, nothing is shown"
-    assert tried.answer[0].startswith("scenario.landmarks from 5 to 45 lowers the aligned")
+    assert tried.answer[0].startswith("The scenario landmarks from 5 to 45 lowers the aligned")
     assert tried.answer[1].endswith("It is shown to fall with active invariant EKF.")
 
 

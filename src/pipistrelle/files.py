@@ -61,8 +61,7 @@ def read_named(path: Path, expected: str) -> bytes:
         raise
     except FileNotFoundError:
         found = "a link to no file" if path.is_symlink() else "no such file"
-        fix = "add it, or name the folder that holds it"
-        raise refusal(path, found, expected, fix) from None
+        raise refusal(path, found, expected, "check the path, or add the file") from None
     except (OSError, ValueError) as error:  # ValueError: an impossible file name
         found, fix = getattr(error, "strerror", error), "check the path and its permissions"
         raise refusal(printable(path), str(found), expected, fix) from None
@@ -75,7 +74,7 @@ def read_text(path: Path) -> str:
         return data.decode("utf-8-sig").replace("\r\n", "\n").replace("\r", "\n")
     except UnicodeDecodeError as error:
         found = f"byte {error.start}, which is no UTF-8 text"
-        raise refusal(path, found, "UTF-8 text", "save it as UTF-8") from None
+        raise refusal(path, found, "UTF-8 text", "save it as UTF-8, or name another file") from None
 
 
 def printable(path: Path) -> str:

@@ -284,7 +284,7 @@ def test_measurements_that_do_not_fit_are_asked_about(obey, log, undrawn):
     assert re.fullmatch(
         rf"pipistrelle: warning: log: {gated} of \d+ measurements do not fit what was expected "
         r"\(fused ekf\); are bearings in radians and counter-clockwise, ranges in metres, "
-        r"and all labels right\?\n",
+        r"all labels right, and stated noise large enough\?\n",
         said,
     )
 
@@ -462,7 +462,7 @@ def test_topics_of_a_bag_are_listed_with_their_roles(obey, refused):
     assert rows["/true"][-1] == "truth"
     assert rows["/seen"][-1] == "echoes"
     assert refused("slam", "walk", "-o", "one").endswith("odom, or the truth, --truth /true")
-    assert "--bag.odometry names it" in obey("slam", "walk", "--topics")[1]
+    assert "--bag.odometry or --truth names it" in obey("slam", "walk", "--topics")[1]
 
 
 def test_options_of_bags_are_rejected_for_a_log_folder(log, refused):

@@ -53,9 +53,7 @@ from pipistrelle.estimation.smoother.records import (
 )
 from pipistrelle.jit import Whole, no_alloc, optimised_once
 
-IN_ONE_WORLD = (
-    "Over worlds no unbiased estimate of past measurements is below the bound; in one it may be."
-)
+IN_ONE_WORLD = "The bound holds for means over worlds; in a single world an error can be smaller."
 """Sentence shown with a bound beside errors."""
 NO_ROUTES: Mapping[int, np.ndarray] = MappingProxyType({})
 """No caller moves."""

@@ -294,7 +294,7 @@ def named_strategies(chosen: str | Sequence[str], where: str) -> tuple[Strategy,
     for strategy in chosen or (chosen,):
         if strategy not in get_args(Strategy):
             near = meant(str(strategy), STRATEGIES)
-            fix = f"did you mean {near!r}?" if near else "choose"
+            fix = f"did you mean {near!r}?" if near else "take one of them"
             expected = "'active', 'fused', 'passive', several with commas, or 'all'"
             raise InputError(f"{where}: found {shown(strategy)}, expected {expected}; {fix}")
     return tuple(strategy for strategy in STRATEGIES if strategy in chosen)

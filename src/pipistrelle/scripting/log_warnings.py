@@ -145,7 +145,8 @@ def fit_warnings(
     odd = _out_of_bounds(recorded)
     questions, unmapped, wide = odd["bearings"] + odd["ranges"], [], []
     notes = [
-        f"none of the {rows} rows of {trial.strategy} sensing is of a landmark, so it maps nothing"
+        f"none of the {rows} rows of {trial.strategy} sensing is of a landmark, nothing is mapped: "
+        "without a label, a bearing needs a range or excess paths, and a range a bearing"
         if (rows := sum(scan.landmark.size for scan in trial.heard))
         else f"nothing in it is heard by {trial.strategy} sensing, so it maps nothing"
         for trial in trials
@@ -185,10 +186,10 @@ def dead_reckoned(recorded: "Log") -> Float[np.ndarray, "t 3"]:
 
 def _units(recorded: "Log") -> str:
     """Return a question for the user on the units and the sense of a log's angles and ranges."""
-    metric = "ranges and excess paths" if has_excess_paths(recorded) else "ranges"
-    angles = "bearings and headings" if recorded.motion == "poses" else "bearings"
-    labels = ", and all labels right" if labels_of(recorded) != {UNLABELLED} else ""
-    return f"are {angles} in radians and counter-clockwise, {metric} in metres{labels}?"
+    metric = f"ranges{' and excess paths' * has_excess_paths(recorded)} in metres"
+    angles = f"bearings{' and headings' * (recorded.motion == 'poses')} in radians"
+    labels = ", all labels right" * (labels_of(recorded) != {UNLABELLED})
+    return f"are {angles} and counter-clockwise, {metric}{labels}, and stated noise large enough?"
 
 
 def _rejected(trial: "TrialResult", recorded: "Log", config: Config) -> list[Question]:

@@ -256,7 +256,7 @@ def run(
         Settings to start from. The rest is ``settings="best"``, unless they name other settings; a
         `Config` is complete.
     strategies : "active", "fused", "passive", several with commas, or "all"
-        Measurements to use: ranges, all, or only bearings.
+        Echoes to use: of the vehicle's calls (active), of others' (passive), of both (fused).
     filters : str or class, optional
         Estimators, separated by commas; "both" are the paper's two.
     beamwidth : float, optional
@@ -359,7 +359,7 @@ def slam(
     robot : int or str, optional
         The robot, by number or name, if there are several.
     strategies : "active", "fused", "passive", several with commas, or "all"
-        Rows to use: with a range, all, or only their bearings.
+        Rows to use: with a range (active), all (fused), or all by bearing (passive).
     filters : str or class, optional
         Estimators, separated by commas; "both" are the paper's two.
     particles : int, optional

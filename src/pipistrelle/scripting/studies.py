@@ -32,7 +32,7 @@ class StudyResults:
     >>> few.trials.height, few.summary.height
     (50, 50)
     >>> few.answer[0]
-    'EKF and FastSLAM 2.0: not decided, no world is left, averaged over the beamwidths.'
+    'Undecided: too few worlds, 1 of 115.'
     """
 
     def __init__(self, folder: Path, kept_by: "TemporaryDirectory[str] | None" = None) -> None:

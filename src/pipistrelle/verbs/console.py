@@ -184,8 +184,7 @@ def answer(estimates: Iterable[tuple[str, str, Mapping[str, Any]]]) -> str:
     scores, other = found[best], found["active", best[1]] if pairs else {}
     count, before = scores["landmarks_full"], other.get("landmarks_full")
     said = [f"{count} landmark{'s' * (count != 1)}"]
-    if pairs:
-        said[0] += ", as without" if count == before else f" instead of {before}"
+    said[0] += (", as without" if count == before else f" instead of {before}") * bool(pairs)
     for score, title in ALIGNED.items():
         ends = [one[score] for one in (scores, other) if isfinite(one.get(score) or nan)]
         if len(ends) == 1 + bool(pairs):

@@ -155,7 +155,7 @@ def roles(topics: Iterable[Topic], settings: BagConfig) -> dict[str, str]:
     echoes = settings.echoes or [topic.name for topic in topics if topic.type in ECHOES]
 
     role = {one.name: "truth, if --truth names it" * (one.type in POSES) for one in topics}
-    several = ", if --bag.odometry names it" * (len(odometries) > 1)
+    several = " or truth, if --bag.odometry or --truth names it" * (len(odometries) > 1)
     role |= {TRANSFORMS: "transforms"} | dict.fromkeys(echoes, "echoes")
     role |= dict.fromkeys(odometries, f"odometry{several}")
     if settings.truth:

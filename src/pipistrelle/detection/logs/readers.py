@@ -31,7 +31,7 @@ _MARKS = {
     "config.toml": UNFINISHED,
 }
 """Kinds of folders by a file that only they contain, in the order in which they are tried."""
-_SOLVE = "solve it first: `pipistrelle slam {} -o DIR`"
+_SOLVE = "solve it: `pipistrelle slam {} -o DIR`"
 _USES = {
     STUDY: "`pipistrelle report {0}` puts it on a page; `pipistrelle run --settings "
     "{0}/config.toml -o DIR` makes a mission of its settings",
@@ -40,7 +40,7 @@ _USES = {
     REPORT.title: "open its index.html",
     LOG.title: _SOLVE,
     SOUND.title: "make a log of it: `pipistrelle hear {} -o LOG`",
-    AUDIO: "describe it for `pipistrelle hear`, which makes a log of it (docs/sound.md)",
+    AUDIO: "name its folder, or describe it for `pipistrelle hear` (docs/sound.md)",
     WORLD.title: "drive through it: `pipistrelle run --world {}`",
 }
 """What to do with a folder of each kind."""
@@ -108,7 +108,7 @@ def wrong_kind(path: Path, expected: str, file: str) -> InputError:
     """Return the error for a path that lacks `file`: its kind, and the verb that takes it."""
     kind, missing = kind_of(path), "a file" if path.exists() else "no such folder"
     log = kind in (reader.title for reader in READERS)
-    fix = _SOLVE if log else _USES.get(kind, "check the path")
+    fix = _SOLVE if log else _USES.get(kind, "name its folder, or check the path")
     return refusal(
         path, kind or (f"no {file}" if path.is_dir() else missing), expected, fix.format(path)
     )
