@@ -70,9 +70,9 @@ def test_the_closing_sentence_is_on_listening_or_on_the_most_accurate_estimate()
     assert answer(one) == listening
     assert answer([("active", "iekf", active), ("fused", "iekf", far), *one]) == listening
     assert answer([*one, ("fused", "smoother", active)]) == listening, "without active sensing"
-    assert answer([("all rows", "my:Own", far)]) == "My:Own: 1 landmark; diverged."
+    assert answer([("all rows", "my:Own", far)]) == "my:Own: 1 landmark; diverged."
     two = [("active", "iekf", far), one[0]]
-    assert answer(two).startswith("Active ekf: 20 landmarks; aligned path error 18 mm; aligned er")
+    assert answer(two).startswith("active ekf: 20 landmarks; aligned path error 18 mm; aligned er")
     untrue = {"landmarks_full": 7, "position_rmse_aligned_m": None, "final_std_m": 0.25}
     assert "of the final position 250 mm." in answer([("all rows", "smoother", untrue)])
 

@@ -85,12 +85,8 @@ def answered(study: Study, sentences: Sequence[Sentence] | None = None) -> Answe
     effects = {rule: effects_of(selection) for rule, selection in by_rule.items()}
     asked = (SENTENCES if papers else ()) if sentences is None else sentences
     judged, done = judge_sentences(by_rule, asked), len(study.worlds)
-    few = [f"Undecided: too few worlds, {done} of {study.planned}."]
-    few *= done < min(study.planned, MIN_WORLDS)
-    if papers:
-        found = papers_answer(by_rule, judged)
-    else:
-        found = changes.answer(by_rule[HEADLINE], effects[HEADLINE])
+    few, headline = done < min(study.planned, MIN_WORLDS), (by_rule[HEADLINE], effects[HEADLINE])
+    found = papers_answer(by_rule, judged) if papers else changes.answer(*headline)
     return Answered(
         study=study,
         papers=papers,
@@ -99,7 +95,7 @@ def answered(study: Study, sentences: Sequence[Sentence] | None = None) -> Answe
         selections=by_rule,
         effects=effects,
         sentences=judged,
-        answer=few + found,
+        answer=[f"Undecided: too few worlds, {done} of {study.planned}."] * few + found,
         findings=findings(by_rule) if papers else [],
     )
 

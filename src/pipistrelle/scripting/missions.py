@@ -16,7 +16,7 @@ from pipistrelle.detection.logs.folder import log_files
 from pipistrelle.detection.logs.readers import reader_of
 from pipistrelle.detection.logs.recording import Log, LogCaller
 from pipistrelle.detection.noise import unstated
-from pipistrelle.detection.scans import Scan
+from pipistrelle.detection.scans import Scan, columns_of
 from pipistrelle.estimation.beliefs import KNOWN
 from pipistrelle.estimation.catalogue import short_name
 from pipistrelle.experiments.drives import split_at
@@ -40,6 +40,7 @@ from pipistrelle.experiments.runs.trial import Watch, run_mission
 from pipistrelle.experiments.runs.truth_files import truth_files
 from pipistrelle.experiments.runs.validate import checked_scenario, warnings_of
 from pipistrelle.files import LOG, SOUND, WORLD, OwnFiles, without_links
+from pipistrelle.refusals import refusal
 from pipistrelle.scripting.arguments import (
     Door,
     check_open,
@@ -130,8 +131,12 @@ def prepare_slam(
     for note in recorded.notes:
         door.note(f"pipistrelle: {place}: {note}")
     door.warn(*overruled, *log_warnings(recorded, truth, place))
-    blind = all((scan.bearing != scan.bearing).all() for scan in recorded.scans)
-    if blind and not {"ekf", "iekf"}.isdisjoint(filters):
+    rows = columns_of(recorded.scans)
+    aimed, ranged = ~np.isnan([rows["bearing"], rows["range"]])
+    if "fastslam" in filters and (ranged & ~aimed).any() and {*strategies} != {"passive"}:
+        found, fix = "ranges without bearings", f"take {door.option('filters', 'smoother')}"
+        raise refusal(place, found, "none with FastSLAM, which does not use them", fix)
+    if not aimed.any() and not {"ekf", "iekf"}.isdisjoint(filters):
         fix = f"{door.option('filters', 'smoother')} is more accurate than EKFs"
         door.warn(f"{place}: no row has a bearing; with ranges only, {fix}")
     beam = None if width.value is None else radians(width.value)

@@ -192,8 +192,8 @@ def answer(estimates: Iterable[tuple[str, str, Mapping[str, Any]]]) -> str:
     if std := scores.get("final_std_m"):
         said.append(f"standard deviation of the final position {_length(std)}")
     said += ["diverged"] * bool(scores.get("diverged"))
-    name = f"listening, {best[1]}" if pairs else " ".join(best[len(found) == 1 :])
-    return f"{name[0].upper()}{name[1:]}: {'; '.join(said)}."
+    name = f"Listening, {best[1]}" if pairs else " ".join(best[len(found) == 1 :])
+    return f"{name}: {'; '.join(said)}."
 
 
 def _length(value: float) -> str:
