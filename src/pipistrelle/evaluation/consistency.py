@@ -41,12 +41,12 @@ def nees(
 
 @np.errstate(all="ignore")
 def _eliminated(
-    error: Float[np.ndarray, "*n d"], covariance: Float[np.ndarray, "*n d d"]
+    error: Float[np.ndarray, "*n d"], covariance: Float[np.ndarray, "*n d d"], less: float = 0.0
 ) -> tuple[Float[np.ndarray, "*n"], Bool[np.ndarray, "*n"]]:
-    """Return the NEES of errors, and whether each covariance is positive definite."""
+    """Return the NEES of errors, and whether each covariance, less a variance, is definite."""
     r = np.array(error, dtype=np.float64)
-    P = np.array(covariance, dtype=np.float64)
     d = r.shape[-1]
+    P = np.array(covariance, dtype=np.float64) - less * np.eye(d)
     smallest = d * np.finfo(np.float64).eps * np.diagonal(P, axis1=-2, axis2=-1)
     epsilon = np.zeros(r.shape[:-1])
     definite = np.ones(r.shape[:-1], dtype=bool)
@@ -82,8 +82,8 @@ def track_nees(pose: Gaussian, true: Float[np.ndarray, "k 3"]) -> Float[np.ndarr
     error, covariance = pose_error(pose.mean, true), pose.covariance
     if pose.invariant:
         error, covariance = _right_invariant(pose, error)
-    epsilon, added = nees(error, covariance), 2.0 * SMALLEST_STD**2 * np.eye(3)
-    begun = np.logical_or.accumulate(_eliminated(error, pose.covariance - added)[1])
+    epsilon = nees(error, covariance)
+    begun = np.logical_or.accumulate(_eliminated(error, pose.covariance, 2.0 * SMALLEST_STD**2)[1])
     exact = ~begun & begun.any() & np.isfinite(covariance).all(axis=(1, 2))
     return np.where(exact | ~np.isfinite(true).all(axis=1), np.nan, epsilon)
 

@@ -108,7 +108,8 @@ def wrong_kind(path: Path, expected: str, file: str) -> InputError:
     """Return the error for a path that lacks `file`: its kind, and the verb that takes it."""
     kind, missing = kind_of(path), "a file" if path.exists() else "no such folder"
     log = kind in (reader.title for reader in READERS)
-    fix = _SOLVE if log else _USES.get(kind, "name its folder, or check the path")
+    other = "name its folder" if path.is_file() else "check the path"
+    fix = _SOLVE if log else _USES.get(kind, other)
     return refusal(
         path, kind or (f"no {file}" if path.is_dir() else missing), expected, fix.format(path)
     )
