@@ -44,6 +44,7 @@ SCORES = {
     for name, score in tomllib.loads(shipped_text("evaluation/scores.toml")).items()
 }
 """Every score by its name in ``summary.json`` and in tables, in the order of display."""
+POSITION, POSITION_ALIGNED = "position_rmse_m", "position_rmse_aligned_m"
 NOT_MEANS = frozenset(("diverged", "gated", "wall_s", "map_rmse_shared_m"))
 """Scores that are not averaged over the worlds of a study."""
 

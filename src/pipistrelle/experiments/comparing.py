@@ -29,7 +29,7 @@ from pipistrelle.detection.logs.readers import STUDY, kind_of
 from pipistrelle.estimation.catalogue import short_name
 from pipistrelle.evaluation.accuracy import alignment, moved, position_error
 from pipistrelle.evaluation.comparison import INTERVALS, Contrast, contrasts
-from pipistrelle.evaluation.scores import NOT_MEANS, SCORES
+from pipistrelle.evaluation.scores import NOT_MEANS, POSITION, POSITION_ALIGNED, SCORES
 from pipistrelle.experiments.results.reading import (
     Estimate,
     StoredMission,
@@ -50,7 +50,6 @@ if TYPE_CHECKING:
 K = TypeVar("K", bound=Hashable)
 LETTERS = "ABCDEFGHIJKLMNOPQRSTUVWXYZ"
 """Short names of folders."""
-POSITION, POSITION_ALIGNED = "position_rmse_m", "position_rmse_aligned_m"
 SIGNIFICANCE = 0.05
 """Differences with a smaller p, corrected for all cases, are marked as shown."""
 ROUNDING = 1e-6

@@ -13,13 +13,12 @@ from typing import Any
 import numpy as np
 
 from pipistrelle.evaluation.comparison import Finding, judge
+from pipistrelle.evaluation.scores import POSITION, POSITION_ALIGNED
 from pipistrelle.report.effects import Measure, compare, direction, json_finding
 from pipistrelle.report.sentences import CLAIMS, SENTENCES, Comparison, Part, Sentence
 from pipistrelle.report.study import (
     COMMON,
     LANDMARKS,
-    POSITION,
-    POSITION_ALIGNED,
     POSITION_BOUND,
     Rule,
     Selection,

@@ -17,11 +17,9 @@ from jaxtyping import Float
 
 from pipistrelle.config import STRATEGIES
 from pipistrelle.evaluation.comparison import Contrast, Finding, Statement, contrasts, judge
-from pipistrelle.evaluation.scores import shown_in
+from pipistrelle.evaluation.scores import POSITION, POSITION_ALIGNED, shown_in
 from pipistrelle.report.study import (
     MAP,
-    POSITION,
-    POSITION_ALIGNED,
     Cell,
     Rule,
     Selection,

@@ -19,7 +19,7 @@ from jaxtyping import Bool, Float, Int
 from pipistrelle.acoustics.emitter import beamwidth
 from pipistrelle.config import Config, InputError
 from pipistrelle.estimation.catalogue import CATALOGUE
-from pipistrelle.evaluation.scores import NOT_MEANS, SCORES
+from pipistrelle.evaluation.scores import NOT_MEANS, POSITION, SCORES
 from pipistrelle.experiments.hearing.scenario import Scenario, standing_landmarks, world_of
 from pipistrelle.experiments.studies.plan import MAKERS, RADIUS, Plan, cases_of, common
 from pipistrelle.experiments.studies.study import load_finished
@@ -48,8 +48,7 @@ Way = tuple[str, str]
 """Filter and strategy."""
 Cell = tuple[str, str, int]
 """Filter, strategy and number of the combination."""
-POSITION, HEADING = "position_rmse_m", "heading_rmse_rad"
-POSITION_ALIGNED, MAP_ALIGNED = "position_rmse_aligned_m", "map_rmse_aligned_m"
+HEADING, MAP_ALIGNED = "heading_rmse_rad", "map_rmse_aligned_m"
 MAP = "map_rmse_m"
 """Map RMSE over the landmarks that the case itself has placed."""
 POSITION_BOUND, HEADING_BOUND = "position_bound_m", "heading_bound_rad"

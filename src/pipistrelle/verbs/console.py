@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 from cyclopts import Parameter
 
 from pipistrelle.estimation.catalogue import short_name
-from pipistrelle.evaluation.scores import heading, shown_in
+from pipistrelle.evaluation.scores import POSITION_ALIGNED, heading, shown_in
 from pipistrelle.files import spelt
 from pipistrelle.verbs.streams import say
 
@@ -30,7 +30,6 @@ NIS = (
     "rightly."
 )
 """Note below a table with innovations."""
-POSITION_ALIGNED = "position_rmse_aligned_m"
 ALIGNED = {
     POSITION_ALIGNED: "aligned path error",
     "map_rmse_shared_m": "aligned error of the landmarks that all strategies placed",
@@ -216,7 +215,8 @@ def _cells(
     yield "measurements per frame", number(s.measurements_per_frame, 2)
     yield "rejected by the gate", str(s.gated or "")
     if s.position_rmse_m is None:
-        share = 100.0 * s.gated / measurements if (measurements := judged(trial.scans)) else None
+        measurements = judged(trial.scans)
+        share = 100.0 * s.gated / measurements if measurements else None
         yield NIS_TITLE, number(s.nis_mean, 2)
         yield "rejected by the gate [%]", number(share, 2)
         yield "final position, 1 sigma [m]", number(_final_std(trial), 3)

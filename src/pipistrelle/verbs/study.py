@@ -87,7 +87,7 @@ def _compiled_first(plan: "Plan", show: Show, quiet: bool) -> Show:
 
             cases, tell = cases_of(plan), None if quiet else say
             if tell and plan.config.settings is None and plan.name not in PLANS:
-                tell('from the paper\'s settings; `settings = "best"` in the plan: those of `run`')
+                tell('The paper\'s settings are used; `settings = "best"` gives those of `run`.')
             timings = {case.config.listening.excess_paths for case in cases}
             with in_two_processes(tell, cases[0].config, plan.filters):
                 compile_kernels(plan.filters, sorted(timings))
