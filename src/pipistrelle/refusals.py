@@ -104,8 +104,9 @@ def _fault_refusal(where: object, fault: Any, faults: Sequence[Any], model: Any)
         gone = [f["loc"] for f in faults if f["type"] == "missing"]
         names = [name for *around, name in gone if around == within and name in known]
         named = ", ".join(repr(key.removesuffix(last) + str(name)) for name in names)
-        found, expected = f"no key{'s' * (', ' in named)} {named}", f"the keys {', '.join(known)}"
-        return refusal(where, found, expected, f"add {named}")
+        needed = ", ".join(name for name, one in known.items() if one.is_required())
+        found = f"no key{'s' * (', ' in named)} {named}"
+        return refusal(where, found, f"the keys {needed}", f"add {named}")
     if fault["type"] == "extra_forbidden":
         near = meant(str(last), known)
         fix = f"did you mean {near!r}?" if near else "remove it"

@@ -169,6 +169,7 @@ REFUSED = {
         lambda s: s.hear(landmark=[9], bearing=[np.nan]),
         "hear, row 1: found bearing ''",
     ),
+    "degrees": (lambda s: s.hear(landmark=[9], bearing=[57.3]), "57.3, expected radians"),
     "an endless range": (
         lambda s: s.hear(landmark=[9], bearing=[0.1], range=[np.inf]),
         "hear, row 1: found range inf",

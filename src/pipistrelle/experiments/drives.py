@@ -6,6 +6,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from jaxtyping import Float, Int
 
+from pipistrelle.detection.logs.poses import poses_along
 from pipistrelle.detection.scans import NO_CALLERS, Scan
 from pipistrelle.estimation.beliefs import Gaussian, Landmarks, Track, no_landmarks
 from pipistrelle.estimation.motion import Motion, relative_motions
@@ -55,6 +56,12 @@ class Drive:
     """Names of the moving callers, which are no landmarks of the map, by label."""
     sensor: Pose = (0.0, 0.0, 0.0)
     """Pose of the sensor in the vehicle's axes: ahead, left [m], counter-clockwise [rad]."""
+
+
+def reckoned(drive: Drive) -> Float[np.ndarray, "t 3"]:
+    """Return the poses of the vehicle by its odometry only, from the mean of its start."""
+    ways, _ = relative_motions(drive.motion, drive.controls, np.diff(drive.time))
+    return poses_along(ways, drive.start.mean.tolist())
 
 
 def split_at(drive: Drive, times: Sequence[float]) -> tuple[Drive, Int[np.ndarray, " t"]]:

@@ -3,7 +3,7 @@
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
-from math import inf, nan
+from math import inf, nan, tau
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple, Self, TypeVar
 
@@ -573,6 +573,10 @@ def table_of(columns: Mapping[str, Any], callers: Sequence[LogCaller], *, labell
         raise refusal("hear", f"columns of the shapes {shapes}", "one row each", "correct them")
     (size,) = next(iter(shapes.values()), (0,))
     column = {name: column.get(name, np.full(size, nan)) for name in COLUMNS}
+    if (far := column["bearing"][np.abs(column["bearing"]) > tau]).size:
+        raise refusal(
+            "hear, bearing", f"{far[0]:g}", "radians, within a turn", "wrap or convert it"
+        )
     if labelled and np.isnan(column["landmark"]).any():
         raise refusal("hear", "no landmark", LABELS, 'give association__method="marginal"')
     return Table(path="hear", line=np.arange(1, size + 1), unit="row", column=column)

@@ -22,6 +22,7 @@ from jaxtyping import Float, Int
 from scipy.special import bdtrc
 
 from pipistrelle.config import Config
+from pipistrelle.detection.logs.poses import poses_along
 from pipistrelle.detection.scans import OWN, UNLABELLED, WIDEST, columns_of
 from pipistrelle.estimation.catalogue import GATE, gate_of, short_name
 from pipistrelle.estimation.data_association.watch import POSE
@@ -503,17 +504,15 @@ def _path(recorded: "Log", rate: float) -> _Path:
     if recorded.motion != "poses":
         controls[:, 1] *= rate
     steps, noise = relative_motions(log_motion(recorded), controls, recorded.dt)
-    heading = recorded.initial_pose[2] + np.concatenate([[0.0], np.cumsum(steps[:, 2])])
+    poses = poses_along(steps, (0.0, 0.0, recorded.initial_pose[2]))
+    heading = poses[:, 2]
     c, s = np.cos(heading), np.sin(heading)
     ahead = np.array([[c[:-1], -s[:-1]], [s[:-1], c[:-1]]])
-    moved = np.einsum("ijt,tj->ti", ahead, steps[:, :2])
-    place = np.concatenate([np.zeros((1, 2)), np.cumsum(moved, axis=0)])
     axes = np.zeros((len(steps), 3, 3))
     axes[:, :2, :2], axes[:, 2, 2] = ahead.transpose(2, 0, 1), 1.0
     x, y, turn = recorded.sensor_pose
-    sensor = place + np.column_stack((c * x - s * y, s * x + c * y))
-    poses = np.column_stack((sensor, heading + turn)), np.column_stack((place, heading))
-    return *poses, axes @ noise @ axes.transpose(0, 2, 1)
+    sensor = poses + np.column_stack((c * x - s * y, s * x + c * y, np.full(len(poses), turn)))
+    return sensor, poses, axes @ noise @ axes.transpose(0, 2, 1)
 
 
 def _drift(path: _Path, begin: int, step: int) -> Float[np.ndarray, "3 3"]:

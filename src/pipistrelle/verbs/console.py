@@ -21,7 +21,7 @@ from pipistrelle.verbs.streams import say
 
 if TYPE_CHECKING:
     from pipistrelle.experiments.results.scores import TrialResult
-    from pipistrelle.experiments.runs.trial import Progress
+    from pipistrelle.experiments.runs.trial import Mission, Progress
 
 
 NIS_TITLE = "innovations, NIS"
@@ -121,20 +121,20 @@ def _stopwatch() -> Callable[[str], float]:
     return elapsed
 
 
-def closing_table(
-    trials: "Sequence[TrialResult]",
-    count: int | None,
-    driven: float | None,
-    names: Mapping[str, str],
-) -> str:
+def closing_table(mission: "Mission", names: Mapping[str, str]) -> str:
     """Format the scores of a mission as a table with a column per estimate, and notes below it.
 
-    `count` is the number of landmarks in the world, `driven` the distance by the odometry [m]. A
-    table wider than the terminal, and than 100 characters, is printed in parts. `names` overrides
+    A table wider than the terminal, and than 100 characters, is printed in parts. `names` overrides
     headings of strategies.
     """
     from pipistrelle.evaluation.bound import IN_ONE_WORLD
+    from pipistrelle.experiments.results.scores import odometry_errors
+    from pipistrelle.scripting.log_warnings import distance_driven
 
+    trials, landmarks = mission.trials, mission.drive.truth.landmarks
+    count = None if landmarks is None else len(landmarks[0])
+    driven = None if mission.log is None else distance_driven(mission.log)
+    raw, aligned = (number(error, 3) for error in odometry_errors(mission.drive))
     columns = [dict(_cells(trial, count, driven)) for trial in trials]
     filters = [short_name(trial.filter) for trial in trials]
     heads = [names.get(trial.strategy, trial.strategy) for trial in trials]
@@ -163,6 +163,7 @@ def closing_table(
         )
     ]
     notes = [
+        *[f"By the odometry alone: position RMSE {raw} m, aligned {aligned} m."] * bool(aligned),
         *[IN_ONE_WORLD] * bounded,
         *[f"Most of the raw {' and '.join(turned)} error is one rigid motion."] * bool(turned),
         *[NIS] * weighed,

@@ -84,15 +84,11 @@ def _slam(asked: dict[str, Any]) -> int:
 
 def _delivered(done: results.Results, quiet: bool) -> int:
     """Print a mission's scores and folder; return exit status 1 if an estimate failed, else 0."""
-    from pipistrelle.scripting.log_warnings import distance_driven
     from pipistrelle.scripting.missions import failures, strategy_names
 
     mission = done.mission
     if not quiet:
-        landmarks, log = mission.drive.truth.landmarks, mission.log
-        count = None if landmarks is None else len(landmarks[0])
-        driven = None if log is None else distance_driven(log)
-        put(closing_table(mission.trials, count, driven, strategy_names(mission)))
+        put(closing_table(mission, strategy_names(mission)))
     failed = failures(mission)
     warn(*failed)
     put(done.folder)

@@ -11,7 +11,13 @@ from hypothesis import strategies as st
 
 from pipistrelle.config import InputError
 from pipistrelle.detection.logs.folder import read_log, write_log
-from pipistrelle.detection.logs.poses import jumps, motions_between, poses_along, relative_motions
+from pipistrelle.detection.logs.poses import (
+    jumps,
+    motions_between,
+    poses_along,
+    relative_motions,
+    turns_in_degrees,
+)
 from pipistrelle.detection.logs.recording import assemble
 from pipistrelle.estimation.motion import Motion, motion_jacobians, motion_noise, motion_step
 from pipistrelle.experiments.runs.replay import log_motion
@@ -437,6 +443,15 @@ def test_motions_between_composed_poses_are_recovered(ways):
     np.testing.assert_allclose(change[:, :2], 0.0, atol=1e-13)
     np.testing.assert_allclose(wrap(change[:, 2]), 0.0, atol=1e-13)
     assert (np.abs(poses_along(motions)[:, 2]) <= np.pi).all()
+
+
+@pytest.mark.parametrize("ahead", [0.1, -0.1])
+def test_headings_in_degrees_are_doubted_and_turns_in_radians_are_not(ahead):
+    heading = np.linspace(0.3, 9.0, 99)
+    x, y = np.cumsum(ahead * np.array([np.cos(heading), np.sin(heading)]), axis=1)
+    for unit, doubted in ((1.0, False), (180.0 / np.pi, True)):
+        column = {"x": x, "y": y, "heading": unit * heading}
+        assert turns_in_degrees(Table(path="", line=np.arange(99), column=column)) == doubted
 
 
 def test_the_poses_on_the_pages_of_the_documentation_are_sound(tmp_path):

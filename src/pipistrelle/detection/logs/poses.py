@@ -13,6 +13,8 @@ sum of its motions', each carried to the start of the step, as an error of headi
 motion; a motion that is cut has its covariance divided in proportion to time.
 """
 
+from collections.abc import Sequence
+
 import numpy as np
 from jaxtyping import Float, Int
 
@@ -58,6 +60,19 @@ def motions_between(odometry: Table, time: Float[np.ndarray, " t"]) -> Float[np.
     return np.hstack([moved, covariance[:, *_FULL]])
 
 
+def turns_in_degrees(odometry: Table) -> bool:
+    r"""Return whether headings beyond a turn, read as degrees, are nearer to the way it drove.
+
+    Nearness is that of the axes of motion, :math:`|\sum d^2 e^{-2 i \theta}|` over the motions d
+    between rows, so that it drives forwards, backwards or at a fixed angle.
+    """
+    heading = odometry.column["heading"]
+    d = np.diff(odometry.column["x"] + 1j * odometry.column["y"])
+    units = np.array([[1.0], [np.pi / 180.0]])
+    near, nearer = np.abs(np.exp(-2j * units * heading[:-1]) @ d**2)
+    return bool(np.abs(heading).max() > 2.0 * np.pi and nearer > near)
+
+
 def path_of(table: Table) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, "n 3"]]:
     """Return times [s] and poses [m, m, rad] of a table, heading unwrapped.
 
@@ -80,15 +95,18 @@ def relative_motions(poses: Float[np.ndarray, "t 3"]) -> Float[np.ndarray, "t-1 
     return np.column_stack([ways, np.where(np.abs(turn) < np.pi, turn, wrap(turn))])
 
 
-def poses_along(motions: Float[np.ndarray, "k _"]) -> Float[np.ndarray, "k+1 3"]:
-    """Return the poses along a sequence of motions, from the origin.
+def poses_along(
+    motions: Float[np.ndarray, "k _"], start: Sequence[float] = (0.0, 0.0, 0.0)
+) -> Float[np.ndarray, "k+1 3"]:
+    """Return the poses along a sequence of motions.
 
-    `motions`: forward, sideways [m] and turn [rad]; further columns are ignored. Returns [m, m,
-    rad] with wrapped headings. Inverse of `relative_motions`, up to rounding.
+    `motions`: forward, sideways [m] and turn [rad]; further columns are ignored. `start` and the
+    result [m, m, rad] with wrapped headings. Inverse of `relative_motions`, up to rounding.
     """
-    heading = np.append(0.0, np.cumsum(motions[:, 2]))
-    places = np.cumsum(_turned(motions[:, :2], heading[:-1]), axis=0)
-    return np.column_stack([np.vstack([np.zeros((1, 2)), places]), wrap(heading)])
+    *place, way = start
+    heading = np.cumsum(np.append(way, motions[:, 2]))
+    ways = _turned(motions[:, :2], heading[:-1])
+    return np.column_stack([np.cumsum(np.vstack([place, ways]), axis=0), wrap(heading)])
 
 
 def jumps(motions: Float[np.ndarray, "k _"], dt: Float[np.ndarray, " k"]) -> Int[np.ndarray, " j"]:

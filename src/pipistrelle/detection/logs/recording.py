@@ -19,7 +19,7 @@ from jaxtyping import Float
 from pydantic import AfterValidator, ConfigDict, Field, ValidationInfo, field_validator
 
 from pipistrelle.config import LONGEST_STEP, NonNegative, Real, Section
-from pipistrelle.detection.logs.poses import RESOLUTION, motions_between
+from pipistrelle.detection.logs.poses import RESOLUTION, motions_between, turns_in_degrees
 from pipistrelle.detection.scans import NO_CALLERS, OWN, UNLABELLED, Scan, columns_of, make_scan
 from pipistrelle.geometry import wrap
 from pipistrelle.refusals import refusal
@@ -174,8 +174,11 @@ def assemble(
     last = np.append(np.diff(stamp) > 0, True)
     rows = _cut(odometry.path, stamp[last], span)
     time = _step_times(odometry, rows, step)
+    doubts = [*settings.pop("doubts", ()), *_silence(rows, step)]
     if settings["motion"] == "poses":
         controls = motions_between(odometry, time)
+        if turns_in_degrees(odometry):
+            doubts.append("headings seem to be in degrees; multiply them by pi / 180")
     else:
         _, *columns = odometry.column.values()
         controls = _mean_controls(stamp[last], np.column_stack(columns)[last], rows, time)
@@ -206,7 +209,6 @@ def assemble(
         *(name for name in STATED if name in measurements.column),
     )
     measured = _in_order({name: measurements.column[name][inside] for name in said})
-    doubts = (*settings.pop("doubts", ()), *_silence(rows, step))
     return Log(
         time=time,
         controls=controls,
@@ -215,7 +217,7 @@ def assemble(
             time, measured, 0.0 if step is None else RESOLUTION, callers, bool(told.all())
         ),
         ignored_rows={reason: count for reason, count in ignored.items() if count},
-        doubts=doubts,
+        doubts=tuple(doubts),
         bearings=measured["bearing"],
         **settings,
     )

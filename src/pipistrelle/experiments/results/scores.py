@@ -10,7 +10,6 @@ from jaxtyping import Float
 from pipistrelle.config import Config
 from pipistrelle.detection.scans import Scan
 from pipistrelle.estimation.beliefs import Gaussian, Landmarks, Track, placed
-from pipistrelle.estimation.motion import motion_step
 from pipistrelle.evaluation.accuracy import (
     alignment,
     heaviest,
@@ -31,7 +30,7 @@ from pipistrelle.evaluation.association import (
 )
 from pipistrelle.evaluation.bound import NO_ROUTES, path_bound, pose_bound, true_controls
 from pipistrelle.evaluation.consistency import diverged, track_nees
-from pipistrelle.experiments.drives import Drive, Truth, split_at
+from pipistrelle.experiments.drives import Drive, Truth, reckoned, split_at
 
 OF_ASSOCIATION = (
     "associated_right", "associated_found",
@@ -262,15 +261,13 @@ def position_floor(drive: Drive, scans: Sequence[Scan]) -> float | None:
     heard = [scan.time for scan in scans if len(scan.landmark)]
     first = int(np.searchsorted(drive.time, heard[0] - 1e-9)) if heard else steps
     first = min(first, steps)
-    reckoned = [drive.start.mean]
-    for control, dt in zip(drive.controls[:first], np.diff(drive.time), strict=False):
-        reckoned.append(motion_step(drive.motion, reckoned[-1], control, dt))
-    lost, was = reckoned[first], true[first]
+    before = reckoned(drive)[: first + 1]
+    lost, was = before[first], true[first]
     if heard and not np.isfinite(was).all():
         return None
     turned = np.array([lost[0], lost[1], lost[2] - was[2]])
     after = moved(true[first:, :2] - was[:2], turned)
-    error = position_error(np.concatenate([np.array(reckoned)[:first, :2], after]), true[:, :2])[1:]
+    error = position_error(np.concatenate([before[:first, :2], after]), true[:, :2])[1:]
     finite = error[np.isfinite(error)]
     return rmse(finite) if finite.size else None
 
@@ -347,6 +344,15 @@ def score_path(pose: Gaussian, true_path: Float[np.ndarray, "k 3"] | None) -> Pa
         "nees_mean": float(np.mean(epsilon)) if len(epsilon) else None,
         "nees_max": float(np.max(epsilon)) if len(epsilon) else None,
     }
+
+
+def odometry_errors(drive: Drive) -> tuple[float | None, float | None]:
+    """Return the position RMSE [m] by the odometry only, raw and aligned, as in `score_path`."""
+    if drive.truth.path is None:
+        return None, None
+    rows = np.isfinite(drive.truth.path).all(axis=1) & (np.arange(len(drive.time)) > 0)
+    path, truth = reckoned(drive)[rows, :2], drive.truth.path[rows, :2]
+    return _rmse(position_error(path, truth)), _aligned_rmse(path, truth)
 
 
 def _rmse(error: Float[np.ndarray, " n"]) -> float | None:
