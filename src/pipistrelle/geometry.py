@@ -31,6 +31,23 @@ def wrap(angle: Float[np.ndarray, "*n"] | float) -> Float[np.ndarray, "*n"]:
     return np.where(wrapped >= np.pi, wrapped - 2.0 * np.pi, wrapped)
 
 
+def carrying(
+    lever: Float[np.ndarray, "*k 2"], turn: Float[np.ndarray, "*k"] | float = 0.0
+) -> Float[np.ndarray, "*k 3 3"]:
+    """Return the matrices that turn a pose's error and carry it to a place at a lever from it.
+
+    `lever` [m]: in the turned axes. `turn` [rad].
+
+    >>> carrying(np.array([10.0, 0.0])) @ [0.0, 0.0, 0.1]
+    array([0. , 1. , 0.1])
+    """
+    matrix = np.zeros((*lever.shape[:-1], 3, 3))
+    matrix[..., 0, 0] = matrix[..., 1, 1] = np.cos(turn)
+    matrix[..., 0, 1], matrix[..., 1, 0] = -np.sin(turn), np.sin(turn)
+    matrix[..., 0, 2], matrix[..., 1, 2], matrix[..., 2, 2] = -lever[..., 1], lever[..., 0], 1.0
+    return matrix
+
+
 def range_and_bearing(
     pose: Float[np.ndarray, "3"], points: Float[np.ndarray, "n 2"]
 ) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"]]:

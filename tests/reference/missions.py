@@ -15,6 +15,9 @@ from pipistrelle.geometry import range_and_bearing, wrap
 
 STEP = 0.125
 STEPS_PER_FRAME = 4
+ROBOT = {"motion": "unicycle", "velocity_std": 0.1, "angular_rate_std": 0.1, "range_std": 0.1}
+ROBOT |= {"bearing_std": 0.02, "range_bounds": [0.5, 20.0]}
+"""A vehicle of `Slam`."""
 BICYCLE = Motion(model="bicycle", control_std=(0.1, 0.03), wheelbase=0.2)
 START = Gaussian(
     mean=np.array([0.0, -7.408, 0.0]), covariance=np.diag([0.05**2, 0.05**2, 0.0436**2])

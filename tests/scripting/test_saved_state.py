@@ -10,15 +10,8 @@ import pytest
 from pipistrelle import InputError, Slam
 from pipistrelle.estimation.catalogue import CATALOGUE
 from pipistrelle.scripting.saved_state import DEEPEST, HEAD, RECORDS
+from reference.missions import ROBOT
 
-ROBOT = {
-    "motion": "unicycle",
-    "velocity_std": 0.1,
-    "angular_rate_std": 0.1,
-    "range_std": 0.1,
-    "bearing_std": 0.02,
-    "range_bounds": [0.5, 20.0],
-}
 PLACES = np.random.default_rng(3).uniform(-8.0, 8.0, (12, 2))
 METHODS = ("known", "nearest", "marginal")
 OWN = """

@@ -319,26 +319,27 @@ def test_a_link_to_itself_is_refused_in_place_of_any_folder(refused, undrawn):
     assert "loop: found no such folder" in refused("compare", "one", "loop")
 
 
-@pytest.mark.parametrize(
-    ("flag", "name"),
-    [(flag, name) for flag, names in SAVED.items() for name in (*names, "README.md")],
-)
+@pytest.mark.parametrize("flag", SAVED)
 def test_logs_and_recordings_are_saved_over_ours_and_over_nothing_of_the_users(
-    obey, refused, undrawn, flag, name
+    obey, refused, undrawn, flag
 ):
     line = ("run", *SHORT, "--receiver.elements", "2", flag, "log", "--quiet")
     words = (*line, "--overwrite", "-o")
-    Path("log").mkdir()
-    Path("log", name).write_text("mine")
-    assert "log: is not empty and holds no " in refused(*words, "one")
     assert "is that of --output" in refused("run", flag, "new", "-o", "./new")
-    Path("log", name).unlink()
+    Path("log").mkdir()
+    for path in (saved := [Path("log", name) for name in (*SAVED[flag], "README.md")]):
+        path.write_text("mine")
+        assert "log: is not empty and holds no " in refused(*words, "one")
+        path.unlink()
     assert obey(*words, "two")[0] == 0
     assert "log: is not empty; name a new folder" in refused(*line, "-o", "three")
     assert obey(*words, "three")[0] == 0
-    Path("log", name).write_text("mine")
-    assert f"{name}: was changed since Pipistrelle wrote it" in refused(*words, "four")
-    assert Path("log", name).read_text() == "mine"
+    for path in saved:
+        ours = path.read_bytes()
+        path.write_text("mine")
+        assert f"{path.name}: was changed since Pipistrelle wrote it" in refused(*words, "four")
+        assert path.read_text() == "mine"
+        path.write_bytes(ours)
     assert not Path("four").exists()
 
 

@@ -51,6 +51,7 @@ from pipistrelle.estimation.smoother.records import (
     write,
     write_identity,
 )
+from pipistrelle.geometry import carrying
 from pipistrelle.jit import Whole, no_alloc, optimised_once
 
 IN_ONE_WORLD = "The bound holds for means over worlds; in a single world an error can be smaller."
@@ -271,9 +272,7 @@ def bound_of_drawn_start(
     >>> float(bound_of_drawn_start(np.zeros((2, 3, 3)), path, turned)[1, 1, 1])
     1.0
     """
-    G = np.tile(np.eye(3), (len(path), 1, 1))
-    G[:, 0, 2] = path[0, 1] - path[:, 1]
-    G[:, 1, 2] = path[:, 0] - path[0, 0]
+    G = carrying(path[:, :2] - path[0, :2])
     return bound + G @ start_covariance @ np.swapaxes(G, 1, 2)
 
 

@@ -12,7 +12,7 @@ from pipistrelle.estimation.motion import SMALLEST_STD
 from pipistrelle.estimation.observations.range import NEAREST
 from pipistrelle.estimation.rays import gate_bounds
 from pipistrelle.evaluation.accuracy import pose_error
-from pipistrelle.geometry import wrap
+from pipistrelle.geometry import carrying, wrap
 
 
 def nees(
@@ -102,8 +102,7 @@ def _right_invariant(
     x, y = shift[:, 0] - c * true_x + s * true_y, shift[:, 1] - s * true_x - c * true_y
     along = np.where(np.abs(half) > 1e-4, half / np.tan(np.where(half == 0.0, 1.0, half)), 1.0)
     xi = np.column_stack([along * x + half * y, along * y - half * x, turn])
-    T = np.tile(np.eye(3), (len(turn), 1, 1))
-    T[:, 0, 2], T[:, 1, 2] = shift[:, 1], -shift[:, 0]
+    T = carrying(-shift)
     return xi, T @ pose.covariance @ np.swapaxes(T, 1, 2)
 
 

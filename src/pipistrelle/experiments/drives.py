@@ -10,7 +10,7 @@ from pipistrelle.detection.logs.poses import poses_along
 from pipistrelle.detection.scans import NO_CALLERS, Scan
 from pipistrelle.estimation.beliefs import Gaussian, Landmarks, Track, no_landmarks
 from pipistrelle.estimation.motion import Motion, relative_motions
-from pipistrelle.geometry import path_at, points_at, wrap
+from pipistrelle.geometry import carrying, path_at, points_at, wrap
 
 LabelledPoints = tuple[Int[np.ndarray, " n"], Float[np.ndarray, "n 2"]]
 """Labels and positions [m] of landmarks."""
@@ -58,10 +58,11 @@ class Drive:
     """Pose of the sensor in the vehicle's axes: ahead, left [m], counter-clockwise [rad]."""
 
 
-def reckoned(drive: Drive) -> Float[np.ndarray, "t 3"]:
-    """Return the poses of the vehicle by its odometry only, from the mean of its start."""
+def reckoned(drive: Drive) -> Gaussian:
+    """Return the path by the odometry only, from the mean of the start, with zero covariance."""
     ways, _ = relative_motions(drive.motion, drive.controls, np.diff(drive.time))
-    return poses_along(ways, drive.start.mean.tolist())
+    poses = poses_along(ways, drive.start.mean.tolist())
+    return Gaussian(mean=poses, covariance=np.zeros((len(poses), 3, 3)))
 
 
 def split_at(drive: Drive, times: Sequence[float]) -> tuple[Drive, Int[np.ndarray, " t"]]:
@@ -82,9 +83,7 @@ def split_at(drive: Drive, times: Sequence[float]) -> tuple[Drive, Int[np.ndarra
     begin, end = (fine[:-1] - time[step]) / length, (fine[1:] - time[step]) / length
     way, covariance = relative_motions(drive.motion, controls, np.diff(time))
     before, after = begin[:, np.newaxis] * way[step], end[:, np.newaxis] * way[step]
-    c, s = np.cos(before[:, 2]), np.sin(before[:, 2])
-    turn = np.zeros((step.size, 3, 3))  # into the axes at the part's begin
-    turn[:, 0, 0], turn[:, 0, 1], turn[:, 1, 0], turn[:, 1, 1], turn[:, 2, 2] = c, s, -s, c, 1.0
+    turn = carrying(np.zeros((step.size, 2)), -before[:, 2])  # into the axes at the part's begin
     moved = np.einsum("kij,kj->ki", turn, after - before)
     share = (end - begin)[:, np.newaxis, np.newaxis]
     spread = share * turn @ covariance[step] @ turn.transpose(0, 2, 1)
@@ -125,8 +124,7 @@ def at_sensor(drive: Drive) -> Drive:
         return drive
     way, covariance = relative_motions(drive.motion, drive.controls, np.diff(drive.time))
     moved = carried(Gaussian(mean=way, covariance=covariance), drive.sensor)
-    c, s = np.cos(drive.sensor[2]), np.sin(drive.sensor[2])
-    back = np.array([[c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, 1.0]])
+    back = carrying(np.zeros(2), -drive.sensor[2])
     ways = np.einsum("ij,kj->ki", back, moved.mean - np.array(drive.sensor))
     ways[:, 2] = way[:, 2]  # turns are not wrapped
     spread = np.einsum("ij,kjl,ml->kim", back, moved.covariance, back)
@@ -172,7 +170,6 @@ def carried(path: Gaussian, place: Pose) -> Gaussian:
     offset = np.stack((c * x - s * y, s * x + c * y, np.full_like(c, turned)), axis=-1)
     mean = path.mean + offset
     mean[..., 2] = wrap(mean[..., 2])
-    slopes = np.broadcast_to(np.eye(3), path.covariance.shape).copy()
-    slopes[..., 0, 2], slopes[..., 1, 2] = -offset[..., 1], offset[..., 0]
+    slopes = carrying(offset[..., :2])
     spread = np.einsum("...ij,...jk,...lk->...il", slopes, path.covariance, slopes)
     return replace(path, mean=mean, covariance=0.5 * (spread + np.swapaxes(spread, -1, -2)))

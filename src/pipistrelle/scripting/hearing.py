@@ -274,14 +274,17 @@ def look_by(door: Door) -> Look:
 def _log(place: Path, recorded: "Log", truth: "Truth") -> Look:
     """Describe a recorded log."""
     from pipistrelle.detection.scans import columns_of
+    from pipistrelle.experiments.drives import reckoned
+    from pipistrelle.experiments.runs.replay import drive_of
     from pipistrelle.figures.sound import draw_log
-    from pipistrelle.scripting.log_warnings import dead_reckoned, early_warnings
+    from pipistrelle.scripting.log_warnings import early_warnings
 
     rows, gaps = columns_of(recorded.scans), long_gaps(recorded)
+    path = reckoned(drive_of(recorded, truth)).mean
     return Look(
         lines=(*recorded.notes, *_numbers(recorded, truth, rows, gaps)),
         odd=tuple(early_warnings(recorded, truth, place)),
-        figure=lambda: draw_log(recorded, truth, dead_reckoned(recorded), rows, gaps),
+        figure=lambda: draw_log(recorded, truth, path, rows, gaps),
     )
 
 

@@ -13,6 +13,7 @@ that the earlier scan lacks the landmark, and :math:`p_0` is uniform over the re
 """
 
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from math import ceil, floor, hypot, inf, log10, pi, radians, sqrt, tau
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
@@ -22,14 +23,14 @@ from jaxtyping import Float, Int
 from scipy.special import bdtrc
 
 from pipistrelle.config import Config
-from pipistrelle.detection.logs.poses import poses_along
 from pipistrelle.detection.scans import OWN, UNLABELLED, WIDEST, columns_of
 from pipistrelle.estimation.catalogue import GATE, gate_of, short_name
 from pipistrelle.estimation.data_association.watch import POSE
 from pipistrelle.estimation.motion import relative_motions
+from pipistrelle.experiments.drives import NO_TRUTH, at_sensor, reckoned
 from pipistrelle.experiments.named_settings import own_config
-from pipistrelle.experiments.runs.replay import log_motion
-from pipistrelle.geometry import wrap
+from pipistrelle.experiments.runs.replay import drive_of
+from pipistrelle.geometry import carrying, wrap
 from pipistrelle.scripting.arguments import has_excess_paths
 
 if TYPE_CHECKING:
@@ -178,11 +179,6 @@ def early_warnings(recorded: "Log", truth: "Truth", log: Path) -> list[str]:
     lines, odd = log_warnings(recorded, truth, log), fit_warnings(recorded, (), log, Config())
     mistake = "" if odd else misreading(recorded)[0]
     return [*lines, *odd, *([f"{log}: {mistake}"] if mistake else [])]
-
-
-def dead_reckoned(recorded: "Log") -> Float[np.ndarray, "t 3"]:
-    """Return the poses of the vehicle by its odometry only, from the log's initial pose."""
-    return _path(recorded, NONE.rate)[1] + [*recorded.initial_pose[:2], 0.0]
 
 
 def _units(recorded: "Log") -> str:
@@ -503,24 +499,18 @@ def _path(recorded: "Log", rate: float) -> _Path:
     controls = recorded.controls.copy()
     if recorded.motion != "poses":
         controls[:, 1] *= rate
-    steps, noise = relative_motions(log_motion(recorded), controls, recorded.dt)
-    poses = poses_along(steps, (0.0, 0.0, recorded.initial_pose[2]))
-    heading = poses[:, 2]
-    c, s = np.cos(heading), np.sin(heading)
-    ahead = np.array([[c[:-1], -s[:-1]], [s[:-1], c[:-1]]])
-    axes = np.zeros((len(steps), 3, 3))
-    axes[:, :2, :2], axes[:, 2, 2] = ahead.transpose(2, 0, 1), 1.0
-    x, y, turn = recorded.sensor_pose
-    sensor = poses + np.column_stack((c * x - s * y, s * x + c * y, np.full(len(poses), turn)))
-    return sensor, poses, axes @ noise @ axes.transpose(0, 2, 1)
+    drive = replace(drive_of(recorded, NO_TRUTH), controls=controls)
+    vehicle, sensor = (reckoned(one).mean for one in (drive, at_sensor(drive)))
+    _, noise = relative_motions(drive.motion, controls, recorded.dt)
+    axes = carrying(np.zeros((len(noise), 2)), vehicle[:-1, 2])
+    return sensor, vehicle, axes @ noise @ axes.transpose(0, 2, 1)
 
 
 def _drift(path: _Path, begin: int, step: int) -> Float[np.ndarray, "3 3"]:
     """Return the covariance of the sensor's motion between two steps, in the axes of the map."""
     sensor, vehicle, noise = path
     lever = sensor[step, :2] - vehicle[begin + 1 : step + 1, :2]
-    J = np.tile(np.eye(3), (len(lever), 1, 1))
-    J[:, 0, 2], J[:, 1, 2] = -lever[:, 1], lever[:, 0]
+    J = carrying(lever)
     return np.tensordot(J @ noise[begin:step], J, axes=((0, 2), (0, 2)))
 
 

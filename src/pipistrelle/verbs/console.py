@@ -128,13 +128,15 @@ def closing_table(mission: "Mission", names: Mapping[str, str]) -> str:
     headings of strategies.
     """
     from pipistrelle.evaluation.bound import IN_ONE_WORLD
-    from pipistrelle.experiments.results.scores import odometry_errors
+    from pipistrelle.experiments.drives import reckoned
+    from pipistrelle.experiments.results.scores import score_path
     from pipistrelle.scripting.log_warnings import distance_driven
 
     trials, landmarks = mission.trials, mission.drive.truth.landmarks
     count = None if landmarks is None else len(landmarks[0])
     driven = None if mission.log is None else distance_driven(mission.log)
-    raw, aligned = (number(error, 3) for error in odometry_errors(mission.drive))
+    odometry = score_path(reckoned(mission.drive), mission.drive.truth.path)
+    raw, aligned = (number(odometry[name], 3) for name in ("position_rmse_m", POSITION_ALIGNED))
     columns = [dict(_cells(trial, count, driven)) for trial in trials]
     filters = [short_name(trial.filter) for trial in trials]
     heads = [names.get(trial.strategy, trial.strategy) for trial in trials]

@@ -66,10 +66,7 @@ def test_channels_that_are_swapped_are_named(tape):
 
 
 def test_swapped_channels_of_a_circular_array_are_named_from_sweeps(tmp_path):
-    circle = (
-        "--receiver.array",
-        str(Path(__file__).parents[3] / "examples" / "arrays" / "circle.csv"),
-    )
+    circle = ("--receiver.array", str(Path(__file__).parents[3] / "examples/arrays/circle.csv"))
     tape = record(tmp_path / "tape", *SWEEPS, *circle, "--sound-bits", "16", drive=DRIVE)
     assert checked(tape) == []
     with_rows(tape, "array.csv", lambda rows: exchanged(rows, [(3, 7)]))

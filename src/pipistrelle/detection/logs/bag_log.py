@@ -323,6 +323,7 @@ def read_bag(
         remarks.notes += _converted(topic, rows, mounts, base)
         remarks.doubts += _alike(topic, rows)
     rows = _merged(f"{path}, topic {', '.join(heard)}", measured)
+    widest = max((std for std in rows.column["bearing_std"] if std <= WIDEST), default=0.0)
     motion = "unicycle" if settings.motion == "twist" else "poses"
     same = "initial_pose_std", "range_std", "bearing_std", "range_bounds"
     return assemble(
@@ -334,7 +335,7 @@ def read_bag(
         ignored_rows=dict(remarks.ignored),
         name=path.resolve().name,
         initial_pose=tuple(sound[0][2:5]),
-        association=_widest_beam(rows.column["bearing_std"]),
+        association={"max_angle_std": widest} if widest > AssociationConfig().max_angle_std else {},
         notes=tuple(remarks.notes),
         doubts=tuple(remarks.doubts),
         motion=motion,
@@ -496,16 +497,6 @@ def _clock(topic: str, lags: list[float], settings: BagConfig) -> list[str]:
     when = "after" if late > 0.0 else "before"
     told = f"{topic}: times are of headers; messages were received {abs(late):.3g} s {when} them"
     return [told] if abs(late) > _LATE else []
-
-
-def _widest_beam(std: Float[np.ndarray, " n"]) -> dict[str, float]:
-    """Return the bearing-std limit that association needs for the widest beam, if above default.
-
-    In a beam the std follows from its width, for weak and loud echoes, so no beam may be discarded
-    as likely noise for it.
-    """
-    widest = float(std[std <= WIDEST].max(initial=0.0))
-    return {"max_angle_std": widest} if widest > AssociationConfig().max_angle_std else {}
 
 
 def _alike(topic: str, rows: TopicEchoes) -> list[str]:

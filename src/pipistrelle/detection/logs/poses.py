@@ -19,7 +19,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from pipistrelle.config import FARTHEST
-from pipistrelle.geometry import wrap
+from pipistrelle.geometry import carrying, wrap
 from pipistrelle.refusals import refusal
 from pipistrelle.text_tables import Table, place_of, points_of
 
@@ -61,11 +61,7 @@ def motions_between(odometry: Table, time: Float[np.ndarray, " t"]) -> Float[np.
 
 
 def turns_in_degrees(odometry: Table) -> bool:
-    r"""Return whether headings beyond a turn, read as degrees, are nearer to the way it drove.
-
-    Nearness is that of the axes of motion, :math:`|\sum d^2 e^{-2 i \theta}|` over the motions d
-    between rows, so that it drives forwards, backwards or at a fixed angle.
-    """
+    """Return whether headings beyond a turn, read as degrees, fit the axis of motion better."""
     heading = odometry.column["heading"]
     d = np.diff(odometry.column["x"] + 1j * odometry.column["y"])
     units = np.array([[1.0], [np.pi / 180.0]])
@@ -173,13 +169,8 @@ def _step_covariances(
     used = (step >= 0) & (step < len(time) - 1)
     step, start, end = step[used], at[:-1][used], at[1:][used]
     first = there[step]
-    A = np.tile(np.eye(3), (len(step), 1, 1))
-    turn = start[:, 2] - first[:, 2]
-    A[:, 0, 0] = A[:, 1, 1] = np.cos(turn)
-    A[:, 1, 0] = np.sin(turn)
-    A[:, 0, 1] = -A[:, 1, 0]
     lever = _turned(there[step + 1, :2] - end[:, :2], -first[:, 2])
-    A[:, 0, 2], A[:, 1, 2] = -lever[:, 1], lever[:, 0]
+    A = carrying(lever, start[:, 2] - first[:, 2])
     parts = A @ (share[used, None, None] * stated[way[used]]) @ np.swapaxes(A, 1, 2)
     total = np.zeros((len(time) - 1, 3, 3))
     np.add.at(total, step, parts)

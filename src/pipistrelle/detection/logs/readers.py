@@ -138,8 +138,7 @@ def _mrclam_robots(folder: Path) -> list[Robot]:
     """List the robots with odometry in a MRCLAM set, by number if the file name has one."""
     files = sorted(path.name for path in folder.glob("Robot*_Odometry.dat"))
     names = [name.removeprefix("Robot").removesuffix("_Odometry.dat") for name in files]
-    numbers = {str(number): number for number in range(1, 6)}
-    return [numbers.get(name, name) for name in names]
+    return [int(name) if name in {*"12345"} else name for name in names]
 
 
 LOG_FOLDER = Reader(

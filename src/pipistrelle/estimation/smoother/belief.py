@@ -26,7 +26,7 @@ from pipistrelle.estimation.smoother.sweep import (
     eliminated,
     smoothed,
 )
-from pipistrelle.geometry import wrap
+from pipistrelle.geometry import carrying, wrap
 from pipistrelle.jit import kernel
 
 
@@ -366,10 +366,8 @@ def _placed(
     by_chain[:3, :3], by_border[3:, 1 : 1 + parameters] = np.eye(3), np.eye(parameters)
     about = joint(solution.front, solution.factor, n, by_chain, by_border)
     # The poses' covariance due to the parameters, and to their correlation with the start.
-    (x, y, heading) = at.mean
-    c, s = np.cos(heading), np.sin(heading)
-    by_start, by = np.tile(np.eye(3), (len(slopes), 1, 1)), slopes.copy()
-    by_start[:, 0, 2], by_start[:, 1, 2] = y - poses.mean[:, 1], poses.mean[:, 0] - x
+    c, s = np.cos(at.mean[2]), np.sin(at.mean[2])
+    by_start, by = carrying(poses.mean[:, :2] - at.mean[:2]), slopes.copy()
     by[:, 0], by[:, 1] = c * slopes[:, 0] - s * slopes[:, 1], s * slopes[:, 0] + c * slopes[:, 1]
     mixed = np.einsum("mae,ef,mbf->mab", by, about[3:, :3], by_start)
     own = np.einsum("mae,ef,mbf->mab", by, about[3:, 3:], by)

@@ -259,9 +259,8 @@ def position_floor(drive: Drive, scans: Sequence[Scan]) -> float | None:
         return None
     true, steps = drive.truth.path, len(drive.controls)
     heard = [scan.time for scan in scans if len(scan.landmark)]
-    first = int(np.searchsorted(drive.time, heard[0] - 1e-9)) if heard else steps
-    first = min(first, steps)
-    before = reckoned(drive)[: first + 1]
+    first = min(int(np.searchsorted(drive.time, heard[0] - 1e-9)), steps) if heard else steps
+    before = reckoned(drive).mean[: first + 1]
     lost, was = before[first], true[first]
     if heard and not np.isfinite(was).all():
         return None
@@ -344,15 +343,6 @@ def score_path(pose: Gaussian, true_path: Float[np.ndarray, "k 3"] | None) -> Pa
         "nees_mean": float(np.mean(epsilon)) if len(epsilon) else None,
         "nees_max": float(np.max(epsilon)) if len(epsilon) else None,
     }
-
-
-def odometry_errors(drive: Drive) -> tuple[float | None, float | None]:
-    """Return the position RMSE [m] by the odometry only, raw and aligned, as in `score_path`."""
-    if drive.truth.path is None:
-        return None, None
-    rows = np.isfinite(drive.truth.path).all(axis=1) & (np.arange(len(drive.time)) > 0)
-    path, truth = reckoned(drive)[rows, :2], drive.truth.path[rows, :2]
-    return _rmse(position_error(path, truth)), _aligned_rmse(path, truth)
 
 
 def _rmse(error: Float[np.ndarray, " n"]) -> float | None:
