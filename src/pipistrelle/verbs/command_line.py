@@ -27,6 +27,8 @@ SPELLINGS = (
 )
 
 FILMS, EVERYTHING = ("gif", "mp4"), "--help-all"
+NAMED: set[str] = set()
+"""What the options of the present command line begin with, up to a dot."""
 SHORT = {"scenario.steps": "duration", "emitter.radius": "beamwidth"}
 """Settings with a short option of another meaning."""
 
@@ -69,15 +71,9 @@ def obey(words: Sequence[str], heard: Sequence[int] = ()) -> int:
 
     `heard` collects signals to end; after the first, an error is not a mistake of the user.
     """
-    if EVERYTHING in words:
-        from pipistrelle.verbs import options
-
-        words = ["--help" if word == EVERYTHING else word for word in words]
-        options.EVERYTHING.value = True
-        try:
-            return obey(words, heard)
-        finally:
-            options.EVERYTHING.value = False
+    NAMED.clear()
+    NAMED.update(word.lstrip("-").partition(".")[0] for word in words if word[:1] == "-")
+    words = ["--help" if word == EVERYTHING else word for word in words]
     try:
         _refuse_empty(words)
         _refuse_sections(words)
@@ -118,23 +114,13 @@ def _refuse_sections(words: Sequence[str]) -> None:
     if not names or {"--help", "--version"} & {*names}:  # these load no settings
         return
     from pipistrelle.config import InputError
-
-    sections = _sections()
-    for name in names:
-        if name[2:] in sections:
-            first = next(iter(sections[name[2:]]))
-            raise InputError(f"{name}: is a section of settings; name one of it, as {name}.{first}")
-
-
-def _sections() -> dict[str, list[str]]:
-    """Return the names of the settings in each section, except the section `filter`."""
     from pipistrelle.settings import known_settings
 
-    sections: dict[str, list[str]] = {}
-    for section, *rest in known_settings():
-        if rest and section != "filter":
-            sections.setdefault(section, []).append(rest[0].replace("_", "-"))
-    return sections
+    for name in names:
+        leaves = [key[1] for key in known_settings() if key[0] == name[2:] and key[1:]]
+        if leaves and name != "--filter":
+            first = f"{name}.{leaves[0].replace('_', '-')}"
+            raise InputError(f"{name}: is a section of settings; name one of it, as {first}")
 
 
 def _explained(error: Exception, words: Sequence[str]) -> str | None:
@@ -168,11 +154,14 @@ def _explained(error: Exception, words: Sequence[str]) -> str | None:
 def _unknown(error: UnknownOptionError) -> str:
     """Return the message for an unknown option, with the most similar known option."""
     from pipistrelle.refusals import meant
-    from pipistrelle.settings import RENAMED
+    from pipistrelle.settings import RENAMED, known_settings
 
     word = (error.token.keyword or error.token.value).partition("=")[0]
     names = {name[2:] for argument in error.argument_collection for name in argument.names}
-    known, wanted = sorted(names - _sections().keys()), word.lstrip("-").replace("_", "-")
+    keys = (*map(".".join, known_settings()), *RENAMED)
+    names |= {key.replace("_", "-") for key in keys}
+    names -= {key[0] for key in known_settings() if key[1:] and key[0] != "filter"}
+    known, wanted = sorted(names), word.lstrip("-").replace("_", "-")
     same = [name for name in known if wanted in (name.partition(".")[2], SHORT.get(name))]
     near = same[0] if same else meant(wanted, known) or ""
     near = RENAMED.get(near.replace("-", "_"), near).replace("_", "-")

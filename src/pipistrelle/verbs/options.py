@@ -27,6 +27,7 @@ from pipistrelle.settings import (
     from_text,
     known_settings,
 )
+from pipistrelle.verbs.command_line import EVERYTHING, NAMED
 from pipistrelle.verbs.console import announced, command_line
 from pipistrelle.verbs.streams import say, warn
 
@@ -66,19 +67,27 @@ _METAVARS = {CALLERS: "TABLES", OWN: "TABLES", ARRAY_KEY: "FILE"}
 class _Everything:
     """A truth value that can change: whether the help lists all settings."""
 
-    value = False
-
     def __bool__(self) -> bool:
         """Return whether the help lists all settings."""
-        return self.value
+        return EVERYTHING.lstrip("-") in NAMED
 
     def __xor__(self, other: bool) -> bool:
         """Return whether the value differs from a wanted value, as cyclopts asks."""
-        return self.value ^ other
+        return bool(self) ^ other
 
 
-EVERYTHING: Any = _Everything()
-"""Set by ``--help-all``, read when the help is printed."""
+SHOWN: Any = _Everything()
+"""Read when the help is printed."""
+
+
+class _Named(dict[str, Any]):
+    """Flags, and sections of them, of which cyclopts sees those that are named, for help all."""
+
+    def items(self) -> Any:
+        """Return the flags without a section, and the sections to parse; all take 0.1 s."""
+        named = {*self} if {"help", "help-all", "h"} & NAMED else NAMED
+        return [one for one in super().items() if one[0] in named or not isinstance(one[1], type)]
+
 
 _LITERAL: Any = Literal
 NamedSettings = Annotated[
@@ -220,7 +229,7 @@ def setting_flags(
         texts = [str(item).lower() if isinstance(item, bool) else str(item) for item in default]
         settled = "" if value in (None, ()) else f"[default: {' '.join(texts)}]"
         words = " ".join(f"{field.description or ''} {settled}".split())
-        show = shown(key) and (key == ("seed",) or EVERYTHING)
+        show = shown(key) and (key == ("seed",) or SHOWN)
         kind: Any = Whole if field.annotation is int else _unbounded(field.annotation)
         if metavar := "true|false" if field.annotation is bool else _METAVARS.get(key):
             as_written = Parameter(
@@ -240,7 +249,9 @@ def setting_flags(
         panel = Parameter(group=Group(f"Settings: {name}", help=meaning, sort_key=place))
         table = {leaf: Annotated[flag, panel] for leaf, flag in table.items()}
         flags[name] = record(name, table, total=False)
-    return record("Settings", flags, total=False)
+    whole: Any = record("Settings", flags, total=False)
+    whole.__annotations__ = _Named(whole.__annotations__)
+    return whole
 
 
 def _unbounded(kind: Any) -> Any:
