@@ -72,8 +72,6 @@ TEXT_COLUMNS: Mapping[str, Column] = MappingProxyType(
     }
 )
 """The known columns, by name; others are numbers without a unit."""
-FORMER_NAMES = MappingProxyType({"detour": "excess_path", "detour_std": "excess_path_std"})
-"""Former names of columns and keys of logs, and their present names."""
 _LABEL_IT = (
     "number your landmarks, the same number in all rows of one, and clutter -1; or leave the field "
     "empty, for --association.method to decide"
@@ -92,8 +90,6 @@ class Table:
     """The noun of `line` in errors."""
     column: dict[str, np.ndarray]
     """Values by column; labels are integers, words text, missing numbers NaN."""
-    former: tuple[str, ...] = ()
-    """Former names of columns in the file (`FORMER_NAMES`)."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -165,12 +161,10 @@ def read_table(
     (array([4, 7]), array([ 1.5, -2. ]), array([2, 3]))
     """
     rows = fields_in(path, separator)
-    former: tuple[str, ...] = ()
     names = columns
     if rows and separator:
         line, found = rows.pop(0)
-        former = tuple(name for name in found if name in FORMER_NAMES)
-        names = tuple(FORMER_NAMES.get(name, name) for name in found)
+        names = tuple(found)
         more, extra = [n for n in optional if n not in columns], names[len(columns) :]
         if names[: len(columns)] != columns or {*extra} - {*more} or len({*extra}) < len(extra):
             expected = f"the header {','.join(columns)!r}"
@@ -183,7 +177,7 @@ def read_table(
             raise refusal(f"{path}, line {line}", repr(header[:80]), expected, fix)
     if not rows:
         raise refusal(path, "no rows", f"rows of {','.join(columns)}", "add them")
-    return table_of(path, names, rows, optional, words, former)
+    return table_of(path, names, rows, optional, words)
 
 
 def table_of(
@@ -192,7 +186,6 @@ def table_of(
     rows: Sequence[tuple[int, Sequence[str]]],
     optional: tuple[str, ...] = (),
     words: Mapping[str, Sequence[str]] = MappingProxyType({}),
-    former: tuple[str, ...] = (),
 ) -> Table:
     """Check and convert rows of text fields, each with its line, to a table (`read_table`)."""
     for line, fields in rows:
@@ -202,7 +195,7 @@ def table_of(
             raise refusal(f"{path}, line {line}", found, expected, "correct the row")
     column = dict(zip(names, zip(*(fields for _, fields in rows), strict=True), strict=True))
     lines = np.array([line for line, _ in rows])
-    table = Table(path=path, line=lines, column={}, former=former)
+    table = Table(path=path, line=lines, column={})
     table.column.update(_values(table, column, optional, words))
     for name in optional:
         table.column.setdefault(name, np.full(len(rows), "" if name in words else np.nan))

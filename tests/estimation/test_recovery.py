@@ -10,7 +10,7 @@ from pipistrelle.detection.scans import make_scan, with_columns
 from pipistrelle.estimation.beliefs import Gaussian
 from pipistrelle.estimation.ekf.filter import EkfSlam, InvariantEkfSlam
 from pipistrelle.estimation.motion import Motion, motion_step
-from pipistrelle.estimation.recovery import odometry_bound, recovered
+from pipistrelle.estimation.recovery import correction, odometry_bound, recovered
 from pipistrelle.estimation.smoother.filter import Smoother
 from pipistrelle.geometry import range_and_bearing, wrap
 
@@ -170,3 +170,20 @@ def test_the_joint_gaussian_of_some_landmarks_is_a_marginal(kind):
     at = np.concatenate([[0, 1, 2], *([i, i + 1] for i in places)])
     np.testing.assert_array_equal(part.mean, whole.mean[at])
     np.testing.assert_allclose(part.covariance, whole.covariance[np.ix_(at, at)], atol=1e-15)
+
+
+def test_a_correction_counts_the_directions_that_a_scan_narrows():
+    e, narrow = np.array([1.0, 1.0, 0.0]), np.diag([0.75, 0.999, 1.0])
+    assert correction(np.zeros(3), np.eye(3), e, narrow) == (4.0, 1.0)
+    A = np.random.default_rng(4).normal(size=(3, 3))
+    P, Q = A @ A.T + np.eye(3), 0.5 * np.eye(3)
+    assert correction(e, P, np.zeros(3), Q) == pytest.approx((e @ np.linalg.inv(P - Q) @ e, 3.0))
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_corrections_exceed_their_expectation_only_if_odometry_noise_is_understated(kind):
+    for share, understated in ((1.0, False), (0.3, True)):
+        motion = replace(MOTION, control_std=(0.05 * share, 0.05 * share))
+        *_, (_, after) = followed(kind(motion=motion, rays=RayConfig()), driven(120)[1])
+        squared, degrees = after.corrections
+        assert (squared / degrees > 1.0 + 3.0 * np.sqrt(2.0 / degrees)) == understated

@@ -35,6 +35,7 @@ def trial_of(scan, gated, labels=(), **more):
         labels=labels,
         landmarks=map_with([1, 1]),
         report={},
+        corrections=(0.0, 0.0),
     )
     scores = SimpleNamespace(gated=gated, nis_mean=None)
     return SimpleNamespace(

@@ -334,13 +334,6 @@ def test_excess_paths_in_seconds_or_millimetres_are_asked_about(obey, timed, fac
     assert re.search(said, obey("slam", "log", "-o", "three", "--quiet")[2])
 
 
-def test_a_former_name_of_excess_paths_is_reported(obey, timed, undrawn):
-    table = timed / "measurements.csv"
-    table.write_text(table.read_text().replace("excess_path", "detour"))
-    words = "slam", "log", "-o", "two", "--quiet"
-    assert "log: detour is read as excess_path, as it is called now\n" in obey(*words)[2]
-
-
 def test_a_caller_that_no_row_measures_is_named_unless_its_place_is(obey, timed, undrawn):
     path = timed / "log.toml"
     wrong = path.read_text().replace("landmark = 12", "landmark = 99")

@@ -315,22 +315,16 @@ def resolve(
             if not moved:
                 break
         energy = _settle(x, found, count, place)
-        if count > 1 and not _are_apart(found, count):
+        apart = 0  # sources whose direction has a std of at most the limit
+        for k in range(count):
+            apart += 0.5 * found.inverse[k, k] <= UNSURE * UNSURE
+        if count > 1 and apart < count:
             for k in range(count - 1):
                 found.u[k] = found.fewer[k]
             return count - 1, _settle(x, found, count - 1, place)
         if energy <= most_left[count - 1]:
             return count, energy
     return most_left.size, energy
-
-
-@no_alloc
-def _are_apart(found: Sources, count: Whole) -> bool:
-    """Return whether all sources are resolved: the std of each direction is at most the limit."""
-    apart = 0
-    for k in range(count):
-        apart += 0.5 * found.inverse[k, k] <= UNSURE * UNSURE
-    return apart == count
 
 
 @no_alloc

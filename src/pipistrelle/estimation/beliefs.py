@@ -149,7 +149,8 @@ class Track:
     gated: int
     """Number of gated measurements."""
     innovations: Innovations = NO_INNOVATIONS
-    """Sums of innovations, zero if the estimator does not provide them."""
+    corrections: Innovations = NO_INNOVATIONS
+    """Sums of innovations and of corrections, zero if the estimator does not provide them."""
     cloud: Float[np.ndarray, "p 3"] | None = None
     """Final poses of the particles [m, m, rad], if any."""
     full: float | None = None
@@ -194,6 +195,7 @@ class Belief(ABC):
     gated: int = 0
     """Number of gated measurements so far."""
     innovations: Innovations = NO_INNOVATIONS
+    corrections: Innovations = NO_INNOVATIONS
     full: float | None = None
     """Weighted mean number of fully initialised landmarks over particles."""
 

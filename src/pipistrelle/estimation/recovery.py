@@ -22,6 +22,8 @@ always fits, are no evidence. The gain :math:`c(\hat x) - c_1` over the filter's
 discarded if the sum exceeds the bound for three degrees of freedom. The minimum is found by
 graduated non-convexity.
 
+Smaller errors of the odometry show in the sum of all corrections of the pose (`correction`).
+
 Page, Biometrika 41 (1954); Yang, Antonante, Tzoumas & Carlone, IEEE Robotics and Automation Letters
 5 (2020).
 """
@@ -97,11 +99,37 @@ def odometry_bound(gate: float) -> float:
     return float(2.0 * gammaincinv(1.5, gate))
 
 
+@kernel
+def correction(
+    pose: Pose, P: PoseCovariance, after: Pose, P_after: PoseCovariance
+) -> tuple[float, float]:
+    r"""Return the squared normalised correction of a pose by a scan, and its degrees of freedom.
+
+    .. math:: (x^+ - x)^T (P - P^+)^{-1} (x^+ - x)
+
+    over directions whose variance the scan reduces by a hundredth; chi-square if consistent.
+    """
+    e, D = after - pose, P - P_after
+    e[2] = wrap_angle(e[2])
+    squared = degrees = 0.0
+    for i in range(3):
+        if D[i, i] > 0.01 * P[i, i]:
+            squared += e[i] * e[i] / D[i, i]
+            degrees += 1.0
+            share = D[:, i] / D[i, i]
+            e -= share * e[i]
+            D -= np.outer(share, D[i])
+    return squared, degrees
+
+
 def recovering(
     correct: Callable[[B, Scan], B], belief: B, scan: Scan, gate: float, reach: float
 ) -> B:
     """Update a belief by a scan; discard the odometry before it if the scan refutes it."""
     after: Any = correct(belief, scan)
+    x, y = belief.pose(), after.pose()
+    further = correction(x.mean, x.covariance, y.mean, y.covariance)
+    after = replace(after, corrections=belief.corrections.plus(*further))
     if gate >= 1.0 or (after.gated == belief.gated and after.doubt == 0.0):
         return after
     found = recovered(belief, after, scan, gate, reach)

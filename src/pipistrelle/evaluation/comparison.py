@@ -49,9 +49,8 @@ if TYPE_CHECKING:
 
 Relation = Literal["above", "within"]
 INTERVALS = (
-    "Intervals hold together, at 95 %, for all differences that are judged as one family; a "
-    "difference of half an interval's width would have been shown in any case. Holm's correction "
-    "decides what is shown, now and then one whose interval just reaches zero."
+    "The 95 % intervals of a family hold together. Holm's correction decides what is shown, "
+    "always a difference of half an interval's width, rarely one whose interval reaches zero."
 )
 """Explanation to be printed wherever `Finding.family` is."""
 

@@ -54,8 +54,6 @@ SIGNIFICANCE = 0.05
 """Differences with a smaller p, corrected for all cases, are marked as shown."""
 ROUNDING = 1e-6
 """Paths that differ by less are of the same drive [m, rad]."""
-NOT_SCORES = ("strategy", "filter", "ignored_rows", "online")
-"""Other entries of an estimate in ``summary.json``."""
 MISSIONS = (
     "a row for each estimate, folder and score",
     "the paths, as they are and each after the rigid motion that brings it nearest to its truth "
@@ -272,7 +270,9 @@ def _compared(missions: Sequence[StoredMission], estimates: Sequence[Estimate]) 
     scores = []
     for mission, estimate in chosen:
         run = mission.scores[estimate]
-        numbers = {name: value for name, value in run.items() if name not in NOT_SCORES}
+        numbers = {
+            name: value for name, value in run.items() if isinstance(value, int | float | None)
+        }
         numbers |= {f"online_{name}": value for name, value in (run.get("online") or {}).items()}
         scores.append({n: None if v is None else float(v) for n, v in numbers.items()})
     return ComparedEstimate(
@@ -615,7 +615,7 @@ def write_comparison(
     text = shipped_text("experiments/comparison_readme.md").format(
         command=command,
         version=__version__,
-        folders="\n".join(f"- {x}: {_quoted(spelt(f))}" for x, f in compared.folders.items()),
+        folders="\n".join(f"- {x}: `{spelt(f)}`" for x, f in compared.folders.items()),
         notes="\n".join(f"- {note}" for note in notes),
         table=content,
         figure=figure,
@@ -629,10 +629,3 @@ def write_comparison(
             "README.md": text,
         }
     )
-
-
-def _quoted(text: str) -> str:
-    """Format text as inline Markdown code, also if it contains backticks."""
-    ticks = "`" * (1 + max(map(len, re.findall("`+", text)), default=0))
-    pad = " " if "`" in text else ""
-    return f"{ticks}{pad}{text}{pad}{ticks}"

@@ -479,5 +479,5 @@ def _shown_by(study: Study, group: Sequence[Effect]) -> str:
             names = [f"{len(names)} of {len(group)} filters and strategies"]
         parts += [f"{verb} with {listed(names)}"] if names else []
     if not parts:
-        return "With no filter and strategy by itself an effect is shown."
+        return "No single case shows it by itself."
     return f"It is shown to {listed(parts)}."

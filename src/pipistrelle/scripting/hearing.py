@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Iterator
 from contextlib import nullcontext
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from math import log
 from os.path import lexists
 from pathlib import Path
@@ -229,7 +229,7 @@ class Look:
     """What it contains, a line each."""
     odd: tuple[str, ...]
     """Warnings, a line each."""
-    figure: "Callable[[], Figure]"
+    figure: "Callable[[], Figure]" = field(repr=False)
     """Draws its content."""
 
 
@@ -316,7 +316,9 @@ def _numbers(
     yield f"rows         {count} in {scans} scans, {count / max(scans, 1):.3g} in each"
     labels, seen = np.unique(rows["landmark"], return_counts=True)
     known = labels != UNLABELLED
-    more = ", for --association.method marginal (with ranges or excess paths)" * int((~known).any())
+    more = ", for --association.method marginal (bearing and range, or excess paths)" * int(
+        (~known).any()
+    )
     yield f"labels       {seen[known].sum()} rows with a label, {seen[~known].sum()} without{more}"
     if known.any():
         spread = np.quantile(seen[known], (0.0, 0.25, 0.5, 0.75, 1.0))

@@ -349,7 +349,6 @@ class Slam:
         state = DriveState(
             name=self._log.name,
             start=float(self._log.time[0]),
-            former=self._log.former_names,
             vehicle=self._vehicle.model_dump(),
             settings=self._config.model_dump(mode="json"),
             kept=self._kept,
@@ -405,8 +404,7 @@ class Slam:
         if method != association or particles not in (False, config.fastslam.particles):
             raise ValueError("settings")
         log, _, vehicle = _log_of(state.vehicle, finite(state.start, "start"))
-        log = replace(log, name=state.name, former_names=state.former)
-        self._begin(log, vehicle, config, name, state.kept)
+        self._begin(replace(log, name=state.name), vehicle, config, name, state.kept)
         check_going_on(self._session.state(), state.session, own=names_class(name))
         self._session.go_on_from(state.session)
         parts = zip(state.times.tolist(), state.means, state.covariances, strict=True)
@@ -480,15 +478,15 @@ def _fault(pose: Gaussian) -> tuple[str, str] | None:
 def _log_of(vehicle: Vehicle, time: float) -> tuple[Log, Path, VehicleKeys]:
     """Return an empty log of a vehicle, the path of its description, and its parsed keys."""
     if isinstance(vehicle, Mapping):
-        where, former = Path("vehicle"), ()
+        where = Path("vehicle")
         told = vehicle_of(OF_ITSELF | dict(vehicle), where)
     elif isinstance(vehicle, (str, Path)):
         where = Path(vehicle)
-        told, former = read_vehicle(Path(vehicle))
+        told = read_vehicle(Path(vehicle))
     else:
         fix = "see docs/log_format.md"
         raise refusal("vehicle", shown(vehicle), "the path of a log.toml, or its keys", fix)
-    none = {"scans": (), "ignored_rows": {}, "dt": np.empty(0), "former_names": former}
+    none = {"scans": (), "ignored_rows": {}, "dt": np.empty(0)}
     controls, start = np.empty((0, len(NOISY[told.motion]))), np.array([time])
     log = Log(name=str(where), time=start, controls=controls, **none, **told.told())
     return log, where, told

@@ -20,7 +20,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from jaxtyping import Float, Int
-from scipy.special import bdtrc
+from scipy.special import bdtrc, gammaincc
 
 from pipistrelle.config import Config
 from pipistrelle.detection.scans import OWN, UNLABELLED, WIDEST, columns_of
@@ -82,14 +82,10 @@ def log_warnings(recorded: "Log", truth: "Truth", log: Path) -> list[str]:
 
 def _doubts(recorded: "Log", truth: "Truth") -> Iterator[str]:
     """Yield the warnings about a log before it is solved, without the log's path."""
-    from pipistrelle.text_tables import FORMER_NAMES
-
     yield from recorded.doubts
     if ignored := recorded.ignored_rows:
         reasons = (f"{count} {reason.replace('_', ' ')}" for reason, count in ignored.items())
         yield f"rows left out: {', '.join(reasons)}"
-    for name in dict.fromkeys(recorded.former_names):
-        yield f"{name} is read as {FORMER_NAMES[name]}, as it is called now"
     for name in ("initial_pose", "sensor_pose"):
         heading = getattr(recorded, name)[2]
         if abs(heading) > tau:
@@ -164,6 +160,7 @@ def fit_warnings(
                 case = f"{trial.strategy} {short_name(trial.filter)}"
                 unmapped.append((f"{found} ({case})", _units(recorded)))
             wide += [*_refuted(trial, recorded)]
+        wide += [*_corrected(trial)]
     if questions or unmapped:
         mistake, fits = misreading(recorded)
         questions += [] if fits else unmapped
@@ -250,6 +247,16 @@ def _refuted(trial: "TrialResult", recorded: "Log") -> Iterator[Question]:
             then, asked = "it was searched for again", "was it moved, or its name given to another?"
         then = then if repaired else "path and map are not to be trusted from then on"
         yield f"{since}, {found} ({who}); {then}", asked
+
+
+def _corrected(trial: "TrialResult") -> Iterator[Question]:
+    """Yield a warning if scans correct the pose by more than the estimator expects."""
+    squared, degrees = trial.track.corrections
+    times = f"{sqrt(squared / max(degrees, 1.0)):.1f}"
+    if float(times) > 1.0 and gammaincc(0.5 * degrees, 0.5 * squared) < CHANCE:
+        found = f"scans correct the pose {times} times as much as the estimator expects"
+        why = "is the odometry or a measurement less precise than stated, or a label wrong?"
+        yield f"{found} ({trial.strategy} {short_name(trial.filter)})", why
 
 
 def _unsure(trials: "Sequence[TrialResult]", config: Config) -> Iterator[str]:

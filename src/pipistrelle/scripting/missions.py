@@ -134,7 +134,8 @@ def prepare_slam(
     rows = columns_of(recorded.scans)
     aimed, ranged = ~np.isnan([rows["bearing"], rows["range"]])
     if "fastslam" in filters and (ranged & ~aimed).any() and {*strategies} != {"passive"}:
-        found, fix = "ranges without bearings", f"take {door.option('filters', 'smoother')}"
+        fix = f"take {door.option('filters', 'ekf,iekf,smoother')}"
+        found = "ranges without bearings"
         raise refusal(place, found, "none with FastSLAM, which does not use them", fix)
     if not aimed.any() and not {"ekf", "iekf"}.isdisjoint(filters):
         fix = f"{door.option('filters', 'smoother')} is more accurate than EKFs"

@@ -98,8 +98,6 @@ class DriveState(NamedTuple):
     """Name of the vehicle in messages."""
     start: float
     """Time of the start [s]."""
-    former: tuple[str, ...]
-    """Keys of the vehicle under former names."""
     vehicle: dict[str, Any]
     """Keys of ``log.toml``."""
     settings: dict[str, Any]

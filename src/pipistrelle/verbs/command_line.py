@@ -180,4 +180,7 @@ def _too_many(error: UnusedCliTokensError, word: str, words: Sequence[str]) -> s
         if kind_of(Path(word)):
             return str(wrong_kind(Path(word), "no argument, as run simulates a drive", ""))
     most = "no arguments" if not takes else "one argument" if takes == 1 else f"{takes} arguments"
-    return f"{verb}: found {word!r}, but {verb} takes {most}; options begin with --"
+    return f"{verb}: found {word!r}, but {verb} takes {most}; options begin with --" + (
+        ", and commas join their values"
+        * any(one.startswith(("--filter", "--str")) for one in words)
+    )

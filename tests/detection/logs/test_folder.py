@@ -577,18 +577,6 @@ def test_rows_may_state_an_excess_path_and_its_caller(tmp_path):
     assert [(c.place, c.place_std) for c in log.callers] == [(None, None), ((1, 2.5), (0.1, 0.2))]
 
 
-def test_former_names_of_excess_path_columns_are_read_and_listed(tmp_path):
-    row, settings = "0.1,7,0.5,4.0,3.25,0.01,mate", UNICYCLE + "detour_std = 0.05\n" + CALLERS
-    former = ",detour,detour_std,caller"
-    log = read_log(timed(tmp_path / "former", row, settings=settings, stated=former))
-    now = read_log(timed(tmp_path / "now", row))
-    assert log.scans[0].numbers.tobytes() == now.scans[0].numbers.tobytes()
-    assert log.excess_path_std == 0.05
-    assert (log.former_names, now.former_names) == (("detour", "detour_std", "detour_std"), ())
-    both = settings + "excess_path_std = 0.05\n"
-    refused(timed(tmp_path / "both", row, settings=both.replace(CALLERS, "") + CALLERS), "log.toml")
-
-
 def test_a_log_without_callers_has_no_caller_columns(folder):
     log = read_log(folder)
     assert log.callers == ()

@@ -121,9 +121,8 @@ def odometry_of(bag: Bag, settings: BagConfig) -> str:
     if len(there) == 1:
         return there[0]
     found = f"several topics of odometry: {', '.join(there)}" if there else "no odometry"
-    fix = "--topics lists what there is"
-    if there:
-        fix = f"name one, --bag.odometry {there[0]}, or the truth, --truth {there[-1]}"
+    fix = "name it, --bag.odometry TOPIC, and the truth if there is one, --truth TOPIC"
+    fix = fix if there else "--topics lists what there is"
     raise refusal(bag.path, found, f"one topic of {ODOMETRY}", fix)
 
 

@@ -119,7 +119,7 @@ def read_log(folder: Path) -> Log:
     >>> log.scans[0].time, log.scans[0].landmark, log.scans[0].range
     (0.3, array([7]), array([nan]))
     """
-    vehicle, former = read_vehicle(folder / "log.toml")
+    vehicle = read_vehicle(folder / "log.toml")
     names = [caller.name for caller in vehicle.callers]
     known = names or ["a name that [[callers]] of log.toml have"]
     measured = MEASUREMENTS.read(folder / MEASUREMENTS.file, words={CALLER: known})
@@ -133,7 +133,6 @@ def read_log(folder: Path) -> Log:
         step=vehicle.step,
         time_offset=vehicle.time_offset,
         name=folder.resolve().name,
-        former_names=(*measured.former, *former),
         **vehicle.told(),
     )
 
@@ -265,7 +264,7 @@ class RowsHeard:
         column = begin | {"bearing": np.zeros(1)} | nothing
         one = Table(path=self._odometry, line=np.ones(1, dtype=np.int64), column=column)
         step, told = self._vehicle.step, self._vehicle.told()
-        log = assemble(odometry, one, step=step, name="", former_names=(), **told)  # may raise
+        log = assemble(odometry, one, step=step, name="", **told)  # may raise
         self.time = log.time
         self.rows = self.inside = 0
         """Rows written, and rows within the time span of the odometry."""

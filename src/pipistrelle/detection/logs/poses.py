@@ -32,7 +32,7 @@ RESOLUTION = 1e-6  # [s], within which a step ends with a row
 _INDEFINITE = 1e-6  # largest negative eigenvalue, relative, by rounding of a file's numbers
 _FULL = ([0, 0, 0, 1, 1, 2], [0, 1, 2, 1, 2, 2])
 _JUMP_RATIO = 10.0  # ratio to the usual speed
-_MIN_JUMP = (0.5, 0.5)  # [m], [rad]: smallest motion in a step that is a jump
+_MIN_JUMP = 0.5  # [m] or [rad], smallest motion in a step that is a jump
 
 
 def motions_between(odometry: Table, time: Float[np.ndarray, " t"]) -> Float[np.ndarray, "t-1 c"]:
@@ -112,11 +112,10 @@ def jumps(motions: Float[np.ndarray, "k _"], dt: Float[np.ndarray, " k"]) -> Int
     angular rate, exceeds ten times the 90th percentile of the moving steps.
     """
     found = np.zeros(len(dt), dtype=bool)
-    sizes = np.hypot(*motions.T[:2]), np.abs(motions[:, 2])
-    for size, least in zip(sizes, _MIN_JUMP, strict=True):
+    for size in (np.hypot(*motions.T[:2]), np.abs(motions[:, 2])):
         speed = size / dt
         usual = np.percentile(speed[size > 0.0], 90.0) if np.any(size > 0.0) else 0.0
-        found |= (size >= least) & (speed > _JUMP_RATIO * usual)
+        found |= (size >= _MIN_JUMP) & (speed > _JUMP_RATIO * usual)
     return np.flatnonzero(found)
 
 

@@ -131,8 +131,6 @@ class Log:
     """Number of dropped rows, by reason."""
     bearings: Float[np.ndarray, " n"] | None = None
     """Bearings of all scans before they were wrapped; None if the scans' are unchanged."""
-    former_names: tuple[str, ...] = ()
-    """Columns and keys that the log calls by former names (`text_tables.FORMER_NAMES`)."""
     notes: tuple[str, ...] = ()
     """Choices and conversions of the reader, for the user, a line each."""
     doubts: tuple[str, ...] = ()

@@ -24,7 +24,7 @@ from pipistrelle.detection.logs.recording import LogCaller
 from pipistrelle.files import read_text
 from pipistrelle.refusals import table_refusal
 from pipistrelle.settings import RENAMED, parse_toml
-from pipistrelle.text_tables import FORMER_NAMES, Schema
+from pipistrelle.text_tables import Schema
 
 _Triple = Annotated[tuple[Real, Real, Real], Field(strict=False)]
 _Triple_std = Annotated[tuple[NonNegative, NonNegative, NonNegative], Field(strict=False)]
@@ -167,12 +167,9 @@ SHARED = tuple(
 """Keys of all logs that do not only affect how the tables are read."""
 
 
-def read_vehicle(path: Path) -> tuple[Vehicle, tuple[str, ...]]:
-    """Read a ``log.toml``; return its values and the former names of keys in it."""
-    raw = parse_toml(read_text(path), path)
-    former = tuple(key for key in raw if FORMER_NAMES.get(key, key) not in raw)
-    raw |= {FORMER_NAMES[key]: raw.pop(key) for key in former}
-    return vehicle_of(raw, path), former
+def read_vehicle(path: Path) -> Vehicle:
+    """Read the values of a ``log.toml``."""
+    return vehicle_of(parse_toml(read_text(path), path), path)
 
 
 def vehicle_of(table: Mapping[str, Any], where: object) -> Vehicle:

@@ -212,7 +212,11 @@ def _judge(
             _lower(known, n, log_ratio(missed[n]), scan)
         if known.odds[n] >= CONFIRMED:
             known.confirmed[n] = True
-    _count_together(known.together, place, caller)
+    for a in range(place.size):  # pairs of landmarks that one caller detects together
+        for b in range(place.size):
+            i, j = place[a], place[b]
+            if 0 <= i != j >= 0 and caller[a] == caller[b] and known.together[i, j] < OFTEN:
+                known.together[i, j] += 1
 
 
 @no_alloc
@@ -234,18 +238,6 @@ def _lower(known: Known, n: Whole, fall: float, scan: Whole) -> None:
             known.odds[n], known.confirmed[n] = GONE, False
     elif not known.confirmed[n] and scan - known.heard[n] > PATIENCE:
         known.odds[n] = -MOST
-
-
-@no_alloc
-def _count_together(
-    together: UInt8[np.ndarray, "l l"], place: Int[np.ndarray, " m"], caller: Int[np.ndarray, " m"]
-) -> None:
-    """Increase the number of joint detections of each pair of landmarks by the same caller."""
-    for a in range(place.size):
-        for b in range(place.size):
-            i, j = place[a], place[b]
-            if 0 <= i != j >= 0 and caller[a] == caller[b] and together[i, j] < OFTEN:
-                together[i, j] += 1
 
 
 @no_alloc
@@ -430,7 +422,9 @@ def grown(
         pairs[size, 0], pairs[size, 1] = a, b
         size += 1
         _equate(mean, P, at[a], at[b])
-        _take_over(apart, a, b)
+        for k in range(at.size):  # landmark a has the forbidden pairs of both, b none else
+            apart[a, k] = apart[k, a] = apart[a, k] or apart[b, k]
+        apart[b] = apart[:, b] = True
         cost = 0.0
         for i in range(at.size):
             for j in range(i):
@@ -471,12 +465,3 @@ def _equate(mean: Float[np.ndarray, " d"], P: Float[np.ndarray, "d d"], i: Whole
         mean[k] -= by_x * dx + by_y * dy
         for m in range(mean.size):
             P[k, m] -= by_x * u[m] + by_y * v[m]
-
-
-@no_alloc
-def _take_over(apart: Bool[np.ndarray, "l l"], a: Whole, b: Whole) -> None:
-    """Give landmark a the forbidden pairs of two merged landmarks; forbid all pairs with b."""
-    for k in range(apart.shape[0]):
-        apart[a, k] = apart[k, a] = apart[a, k] or apart[b, k]
-    for k in range(apart.shape[0]):
-        apart[b, k] = apart[k, b] = True

@@ -138,11 +138,11 @@ def is_placed(trial: TrialResult) -> bool:
 
 
 def judged(scans: Sequence[Scan]) -> int:
-    """Count the measurements that the gate tests: bearings, with their ranges, and excess paths.
+    """Count the measurements that the gate tests: bearings and ranges together, and excess paths.
 
-    `Scores.gated` counts bearing and excess path of a row separately.
+    `Scores.gated` counts them separately.
     """
-    numbers = ([scan.bearing, scan.excess_path] for scan in scans)
+    numbers = ([np.fmax(scan.bearing, scan.range), scan.excess_path] for scan in scans)
     return sum(int(np.count_nonzero(~np.isnan(both))) for both in numbers)
 
 

@@ -252,7 +252,7 @@ def check_calibrated(log: Log, config: Config) -> None:
 
 
 LABELS = "labels of landmarks, or an association"
-UNKNOWN = "add --association.method marginal"
+UNKNOWN = 'add --association.method marginal, in Python association__method="marginal"'
 """Expected labels of a log, and the fix if it has none."""
 
 

@@ -385,6 +385,7 @@ def _track_of(
         landmarks=belief.landmarks(),
         gated=belief.gated,
         innovations=sums if isinstance(sums, Innovations) else NO_INNOVATIONS,
+        corrections=belief.corrections,
         cloud=cloud,
         full=None if cloud is None else belief.full,
         online=online if revised else None,
