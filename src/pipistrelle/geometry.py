@@ -14,7 +14,7 @@ from pipistrelle.jit import substituted
 
 @substituted
 def wrap_angle(angle: float) -> float:
-    """Wrap one angle to [-pi, pi) [rad]; for compiled functions (see `wrap`)."""
+    """Wrap an angle to [-pi, pi) [rad]; for compiled functions (see `wrap`)."""
     if -math.pi <= angle < math.pi:
         return angle
     wrapped = angle - 2.0 * math.pi * math.floor((angle + math.pi) / (2.0 * math.pi))

@@ -66,7 +66,7 @@ _ON_WINDOWS = {
     "big5": "cp950",
     "euc_kr": "cp949",
 }
-"""Encodings to which Windows adds characters under the same name."""
+"""Encodings that Windows extends under the same name."""
 _OF_PYTHON = ("idna", "punycode", "undefined", "unicode-escape", "unicode_escape",
               "raw-unicode-escape", "raw_unicode_escape")  # fmt: skip
 """Python codecs that are not encodings of files."""

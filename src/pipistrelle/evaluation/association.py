@@ -20,7 +20,7 @@ Causes = Sequence[Int[np.ndarray, " m"]]
 OFTEN = 3
 """Fewest scans with a landmark for it to count as missed."""
 CUTOFF = 2.0
-"""Distance from which a landmark counts as missed and another as false [m]."""
+"""Smallest distance of a missed landmark from a false one [m]."""
 STAY = np.zeros(3)
 """The motion that leaves points unchanged."""
 

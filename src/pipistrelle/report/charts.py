@@ -82,7 +82,7 @@ class Line:
 
 
 Facet = tuple[str, list[Line]]
-"""Title and lines of one panel."""
+"""Title and lines of a panel."""
 
 
 def facets_of(study: Study, variable: Variable | None, axis: Axis) -> tuple[list[Facet], bool]:

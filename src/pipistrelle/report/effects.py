@@ -64,7 +64,7 @@ class Measure:
     ratio: bool = False
     """Whether cases are compared by the ratio of their numbers."""
     over: str = ""
-    """For a gain, the strategy from whose score the case's score is subtracted."""
+    """For a gain, the strategy with the score that the case's score is subtracted from."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

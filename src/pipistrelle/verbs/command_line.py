@@ -28,7 +28,7 @@ SPELLINGS = (
 
 FILMS, EVERYTHING = ("gif", "mp4"), "--help-all"
 NAMED: set[str] = set()
-"""What the options of the present command line begin with, up to a dot."""
+"""First part of each option of the current command line, up to a dot."""
 SHORT = {"scenario.steps": "duration", "emitter.radius": "beamwidth"}
 """Settings with a short option of another meaning."""
 

@@ -81,10 +81,10 @@ SHOWN: Any = _Everything()
 
 
 class _Named(dict[str, Any]):
-    """Flags, and sections of them, of which cyclopts sees those that are named, for help all."""
+    """Flags and sections of flags; cyclopts parses only the sections that the user names."""
 
     def items(self) -> Any:
-        """Return the flags without a section, and the sections to parse; all take 0.1 s."""
+        """Return flags without a section, and named sections or, for help, all (0.1 s)."""
         named = {*self} if {"help", "help-all", "h"} & NAMED else NAMED
         return [one for one in super().items() if one[0] in named or not isinstance(one[1], type)]
 

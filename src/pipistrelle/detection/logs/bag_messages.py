@@ -215,7 +215,7 @@ ECHOES: dict[str, Callable[[Any, float | None], Echoes]] = {
 }
 """Message types of echoes; a function takes the speed of sound for a ping without one."""
 ANGLES = f"{_PINGS}SonarDetections"
-"""The type whose angles are about its sensor's axis, positive to starboard."""
+"""Type with angles about its sensor's axis, positive to starboard."""
 CONES = "sensor_msgs/msg/Range"
 
 

@@ -43,7 +43,7 @@ _USES = {
     AUDIO: "name its folder, or describe it for `pipistrelle hear` (docs/sound.md)",
     WORLD.title: "drive through it: `pipistrelle run --world {}`",
 }
-"""What to do with a folder of each kind."""
+"""Hint for a folder of another kind."""
 Robot = int | str
 """A robot of a log of several, by number or by name, as the format has it."""
 
