@@ -47,7 +47,7 @@ class SlamNode(Node):
         said = {
             name: self.declare_parameter(name, given).value for name, given in PARAMETERS.items()
         }
-        motion = live.odometry_use(read_vehicle(Path(said["vehicle"]))[0].motion)
+        motion = live.odometry_use(read_vehicle(Path(said["vehicle"])).motion)
         self.settings = BagConfig(motion=motion, speed_of_sound=said["speed_of_sound"] or None)
         self.begin = partial(Slam, said["vehicle"], filter=said["estimator"],
                              association__method=said["association"])  # fmt: skip

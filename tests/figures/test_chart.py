@@ -47,11 +47,6 @@ def fused(**given):
     return Series(**(plain | given))
 
 
-def test_a_chart_without_panels_is_refused():
-    with pytest.raises(ValueError, match="at least one panel"):
-        draw_chart(chart_of())
-
-
 def test_lines_and_bands_have_the_values_of_the_series():
     series = fused(low=np.full(3, 0.1), high=np.full(3, 0.9), style="dots")
     (axes,) = draw_chart(chart_of(panel_of(series))).axes

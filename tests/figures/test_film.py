@@ -188,11 +188,6 @@ def test_a_file_that_cannot_be_written_is_refused(snapshots, tmp_path, monkeypat
         animate_mission(frames, tmp_path / name)
 
 
-def test_a_film_without_frames_is_an_error(tmp_path):
-    with pytest.raises(ValueError, match="at least one frame"):
-        animate_mission({}, tmp_path / "mission.gif")
-
-
 def test_the_legend_of_a_film_names_the_symbols_of_its_frames(snapshots, scene):
     full, heard = "placed landmark, 95 %", ["range and bearing", "bearing without range"]
     rays = ["unresolved ray, 1σ, darker: likelier", "just pruned"]

@@ -52,6 +52,13 @@ def rows(printed):
     return {line[0]: line[1:] for line in lines}
 
 
+def test_estimates_without_labels_and_with_calibration_are_compared(obey, undrawn):
+    run = ("run", *SHORT, "--strategy", "fused", "--filter", "smoother", "--quiet")
+    obey(*run, "--association.method", "marginal", "-o", "one")
+    obey(*run, "--filter.calibrate", "turn_bias", "-o", "two")
+    assert obey("compare", "one", "two")[0] == 0
+
+
 def test_scores_are_printed_side_by_side_with_their_differences(obey, missions):
     status, printed, said = obey("compare", "one", "two")
     assert (status, said) == (0, "")

@@ -454,7 +454,7 @@ def test_topics_of_a_bag_are_listed_with_their_roles(obey, refused):
     assert rows["/odom"] == ["nav_msgs/msg/Odometry", "40", "0.500", "4.400", "10", "odometry"]
     assert rows["/true"][-1] == "truth"
     assert rows["/seen"][-1] == "echoes"
-    assert refused("slam", "walk", "-o", "one").endswith("odom, or the truth, --truth /true")
+    assert refused("slam", "walk", "-o", "one").endswith("if there is one, --truth TOPIC")
     assert "--bag.odometry or --truth names it" in obey("slam", "walk", "--topics")[1]
 
 

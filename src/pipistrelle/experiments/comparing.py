@@ -615,7 +615,7 @@ def write_comparison(
     text = shipped_text("experiments/comparison_readme.md").format(
         command=command,
         version=__version__,
-        folders="\n".join(f"- {x}: `{spelt(f)}`" for x, f in compared.folders.items()),
+        folders="\n".join(f"- {x}: {_quoted(spelt(f))}" for x, f in compared.folders.items()),
         notes="\n".join(f"- {note}" for note in notes),
         table=content,
         figure=figure,
@@ -629,3 +629,10 @@ def write_comparison(
             "README.md": text,
         }
     )
+
+
+def _quoted(text: str) -> str:
+    """Format text as inline Markdown code, also if it contains backticks."""
+    ticks = "`" * (1 + max(map(len, re.findall("`+", text)), default=0))
+    pad = " " if "`" in text else ""
+    return f"{ticks}{pad}{text}{pad}{ticks}"

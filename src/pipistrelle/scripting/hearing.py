@@ -316,9 +316,8 @@ def _numbers(
     yield f"rows         {count} in {scans} scans, {count / max(scans, 1):.3g} in each"
     labels, seen = np.unique(rows["landmark"], return_counts=True)
     known = labels != UNLABELLED
-    more = ", for --association.method marginal (bearing and range, or excess paths)" * int(
-        (~known).any()
-    )
+    more = ", for --association.method marginal (bearing and range, or excess paths)"
+    more *= int((~known).any())
     yield f"labels       {seen[known].sum()} rows with a label, {seen[~known].sum()} without{more}"
     if known.any():
         spread = np.quantile(seen[known], (0.0, 0.25, 0.5, 0.75, 1.0))

@@ -572,9 +572,7 @@ def table_of(columns: Mapping[str, Any], callers: Sequence[LogCaller], *, labell
     (size,) = next(iter(shapes.values()), (0,))
     column = {name: column.get(name, np.full(size, nan)) for name in COLUMNS}
     if (far := column["bearing"][np.abs(column["bearing"]) > tau]).size:
-        raise refusal(
-            "hear, bearing", f"{far[0]:g}", "radians, within a turn", "wrap or convert it"
-        )
+        raise refusal("hear, bearing", f"{far[0]:g}", "radians, within a turn", "convert it")
     if labelled and np.isnan(column["landmark"]).any():
         raise refusal("hear", "no landmark", LABELS, 'give association__method="marginal"')
     return Table(path="hear", line=np.arange(1, size + 1), unit="row", column=column)

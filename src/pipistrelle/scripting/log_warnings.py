@@ -151,7 +151,8 @@ def fit_warnings(
         if not any(len(scan.landmark) for scan in trial.scans)
     ]
     for trial in () if odd["bearings"] else trials:
-        questions += _rejected(trial, recorded, config)
+        misfits = _rejected(trial, recorded, config)
+        questions += misfits
         if trial.track.labels:
             labels = np.concatenate(trial.track.labels)
             mapped = np.count_nonzero(np.isin(labels, trial.track.landmarks.landmark))
@@ -160,7 +161,7 @@ def fit_warnings(
                 case = f"{trial.strategy} {short_name(trial.filter)}"
                 unmapped.append((f"{found} ({case})", _units(recorded)))
             wide += [*_refuted(trial, recorded)]
-        wide += [*_corrected(trial)]
+        wide += [] if misfits else [*_corrected(trial)]
     if questions or unmapped:
         mistake, fits = misreading(recorded)
         questions += [] if fits else unmapped

@@ -135,8 +135,7 @@ def prepare_slam(
     aimed, ranged = ~np.isnan([rows["bearing"], rows["range"]])
     if "fastslam" in filters and (ranged & ~aimed).any() and {*strategies} != {"passive"}:
         fix = f"take {door.option('filters', 'ekf,iekf,smoother')}"
-        found = "ranges without bearings"
-        raise refusal(place, found, "none with FastSLAM, which does not use them", fix)
+        raise refusal(place, "ranges without bearings", "none with FastSLAM, which omits them", fix)
     if not aimed.any() and not {"ekf", "iekf"}.isdisjoint(filters):
         fix = f"{door.option('filters', 'smoother')} is more accurate than EKFs"
         door.warn(f"{place}: no row has a bearing; with ranges only, {fix}")

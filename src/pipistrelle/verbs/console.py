@@ -165,7 +165,7 @@ def closing_table(mission: "Mission", names: Mapping[str, str]) -> str:
         )
     ]
     notes = [
-        *[f"By the odometry alone: position RMSE {raw} m, aligned {aligned} m."] * bool(aligned),
+        *[f"By odometry only: position RMSE {raw} m, aligned {aligned} m."] * bool(aligned),
         *[IN_ONE_WORLD] * bounded,
         *[f"Most of the raw {' and '.join(turned)} error is one rigid motion."] * bool(turned),
         *[NIS] * weighed,
