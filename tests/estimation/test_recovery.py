@@ -174,10 +174,12 @@ def test_the_joint_gaussian_of_some_landmarks_is_a_marginal(kind):
 
 def test_a_correction_counts_the_directions_that_a_scan_narrows():
     e, narrow = np.array([1.0, 1.0, 0.0]), np.diag([0.75, 0.999, 1.0])
-    assert correction(np.zeros(3), np.eye(3), e, narrow) == (4.0, 1.0)
+    assert correction(np.zeros(3), np.eye(3), e, narrow, 1.0) == (4.0, 1.0)
     A = np.random.default_rng(4).normal(size=(3, 3))
     P, Q = A @ A.T + np.eye(3), 0.5 * np.eye(3)
-    assert correction(e, P, np.zeros(3), Q) == pytest.approx((e @ np.linalg.inv(P - Q) @ e, 3.0))
+    assert correction(e, P, np.zeros(3), Q, 1.0) == pytest.approx(
+        (e @ np.linalg.inv(P - Q) @ e, 3.0)
+    )
 
 
 @pytest.mark.parametrize("kind", KINDS)

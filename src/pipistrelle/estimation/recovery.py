@@ -22,8 +22,6 @@ always fits, are no evidence. The gain :math:`c(\hat x) - c_1` over the filter's
 discarded if the sum exceeds the bound for three degrees of freedom. The minimum is found by
 graduated non-convexity.
 
-Smaller errors of the odometry show in the sum of all corrections of the pose (`correction`).
-
 Page, Biometrika 41 (1954); Yang, Antonante, Tzoumas & Carlone, IEEE Robotics and Automation Letters
 5 (2020).
 """
@@ -83,6 +81,7 @@ class Recoverable(Belief):
 
 
 B = TypeVar("B", bound=Recoverable)
+Vector, Matrix = Float[np.ndarray, " d"], Float[np.ndarray, "d d"]
 Fit = tuple[Pose, float, Bool[np.ndarray, "2 m"]]
 """A pose, its cost, and inlier masks of bearings with ranges and of excess paths."""
 
@@ -101,16 +100,19 @@ def odometry_bound(gate: float) -> float:
 
 @kernel
 def correction(
-    pose: Pose, P: PoseCovariance, after: Pose, P_after: PoseCovariance
+    mean: Vector, P: Matrix, after: Vector, P_after: Matrix, turns: float
 ) -> tuple[float, float]:
     r"""Return the squared normalised correction of a pose by a scan, and its degrees of freedom.
 
     .. math:: (x^+ - x)^T (P - P^+)^{-1} (x^+ - x)
 
     over directions whose variance the scan reduces by a hundredth; chi-square if consistent.
+    ``turns``: 1, or 0 for covariances of the invariant error. Landmarks are ignored.
     """
-    e, D = after - pose, P - P_after
+    e, D = after[:3] - mean[:3], P[:3, :3] - P_after[:3, :3]
     e[2] = wrap_angle(e[2])
+    e[0] += (1.0 - turns) * mean[1] * e[2]
+    e[1] -= (1.0 - turns) * mean[0] * e[2]
     squared = degrees = 0.0
     for i in range(3):
         if D[i, i] > 0.01 * P[i, i]:
@@ -127,9 +129,6 @@ def recovering(
 ) -> B:
     """Update a belief by a scan; discard the odometry before it if the scan refutes it."""
     after: Any = correct(belief, scan)
-    x, y = belief.pose(), after.pose()
-    further = correction(x.mean, x.covariance, y.mean, y.covariance)
-    after = replace(after, corrections=belief.corrections.plus(*further))
     if gate >= 1.0 or (after.gated == belief.gated and after.doubt == 0.0):
         return after
     found = recovered(belief, after, scan, gate, reach)

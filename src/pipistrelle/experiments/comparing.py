@@ -270,9 +270,7 @@ def _compared(missions: Sequence[StoredMission], estimates: Sequence[Estimate]) 
     scores = []
     for mission, estimate in chosen:
         run = mission.scores[estimate]
-        numbers = {
-            name: value for name, value in run.items() if isinstance(value, int | float | None)
-        }
+        numbers = {n: v for n, v in run.items() if isinstance(v, int | float | None)}
         numbers |= {f"online_{name}": value for name, value in (run.get("online") or {}).items()}
         scores.append({n: None if v is None else float(v) for n, v in numbers.items()})
     return ComparedEstimate(

@@ -482,7 +482,12 @@ class _Idl:
                 name, kind = self._declared()
                 self._named["/".join([*self._scope, name])] = kind
             elif word == "struct":
-                self._struct("/".join([*self._scope, self._next()]))
+                fields = self.records[_full("/".join([*self._scope, self._next()]))] = []
+                self._expect("{")
+                while self._left and self._left[-1] != "}":
+                    fields.append(self._declared())
+                self._expect("}")
+                self._expect(";")
             else:
                 raise InputError(f"found {shown(word)} in IDL, expected a module or a struct")
 
@@ -494,14 +499,6 @@ class _Idl:
     def _expect(self, word: str) -> None:
         if (found := self._next()) != word:
             raise InputError(f"found {shown(found)} in IDL, expected {word!r}")
-
-    def _struct(self, name: str) -> None:
-        self._expect("{")
-        fields = self.records[_full(name)] = []
-        while self._left and self._left[-1] != "}":
-            fields.append(self._declared())
-        self._expect("}")
-        self._expect(";")
 
     def _declared(self) -> tuple[str, Any]:
         """Parse a field's declaration in IDL; return its name and type."""

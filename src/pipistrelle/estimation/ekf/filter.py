@@ -71,7 +71,7 @@ from pipistrelle.estimation.ekf.gaussian import (
 from pipistrelle.estimation.motion import Controls, Durations, Motion, Pose, motion_numbers
 from pipistrelle.estimation.observations.rows import LOSSES, scan_columns, timings_of
 from pipistrelle.estimation.rays import update_params
-from pipistrelle.estimation.recovery import Recoverable, recovering
+from pipistrelle.estimation.recovery import Recoverable, correction, recovering
 from pipistrelle.jit import Whole, kernel
 
 _SUM = UNLABELLED - 1
@@ -529,6 +529,7 @@ class EkfSlam:
             update_params(self.rays, self.gate, loss=LOSSES.index(self.robust)),
             belief.error,
         )
+        further = correction(belief.mean, belief.covariance, mean, covariance, belief.error)
         after = replace(
             belief,
             mean=mean,
@@ -537,6 +538,7 @@ class EkfSlam:
             weight=weight,
             gated=belief.gated + gated,
             innovations=belief.innovations.plus(squared, degrees),
+            corrections=belief.corrections.plus(*further),
         )
         return _with_velocities(after, scan.moving, self.speed_std)
 

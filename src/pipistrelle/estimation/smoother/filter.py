@@ -55,7 +55,7 @@ from pipistrelle.estimation.observations.excess_path import unscented_range
 from pipistrelle.estimation.observations.range import is_certain
 from pipistrelle.estimation.observations.rows import LOSSES
 from pipistrelle.estimation.rays import gate_bounds
-from pipistrelle.estimation.recovery import recovering
+from pipistrelle.estimation.recovery import correction, recovering
 from pipistrelle.estimation.smoother.belief import SmootherBelief
 from pipistrelle.estimation.smoother.elimination import joint
 from pipistrelle.estimation.smoother.history import (
@@ -425,6 +425,8 @@ class Smoother:
             gated, innovations = gated + dropped, innovations.plus(squared, degrees)
         history, solution = self._heard(history, here, solution)
         pose = Gaussian(mean=solution.state[:3], covariance=solution.covariance[:3, :3])
+        ahead = belief.ahead
+        further = correction(ahead.mean, ahead.covariance, pose.mean, pose.covariance, 1.0)
         return replace(
             belief,
             at=pose,
@@ -434,6 +436,7 @@ class Smoother:
             solution=solution,
             gated=gated,
             innovations=innovations,
+            corrections=belief.corrections.plus(*further),
         )
 
     def _awake(
