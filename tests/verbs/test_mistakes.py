@@ -66,6 +66,7 @@ import pytest
         ("run --animate gif extra", "run: found 'extra', but run takes no arguments"),
         ("run extra", "run: found 'extra', but run takes no arguments"),
         ("slam one two", "slam: found 'two', but slam takes one argument"),
+        ("slam one --filter ekf two", "options begin with --, and commas join their values"),
         ("config show extra", "config show: found 'extra', but config show takes no arguments"),
         ("run --scenario.start 0 0", "--scenario.start: found 2 values, expected 3"),
         ("run --scenario.start {a=1}", "--scenario.start: Incorrect number of arguments"),

@@ -27,6 +27,8 @@ SPELLINGS = (
 )
 
 FILMS, EVERYTHING = ("gif", "mp4"), "--help-all"
+SEVERAL = ("--filter", "--estimator", "--strategy")
+"""Options that may have several values."""
 NAMED: set[str] = set()
 """First part of each option of the current command line, up to a dot."""
 SHORT = {"scenario.steps": "duration", "emitter.radius": "beamwidth"}
@@ -180,7 +182,5 @@ def _too_many(error: UnusedCliTokensError, word: str, words: Sequence[str]) -> s
         if kind_of(Path(word)):
             return str(wrong_kind(Path(word), "no argument, as run simulates a drive", ""))
     most = "no arguments" if not takes else "one argument" if takes == 1 else f"{takes} arguments"
-    return f"{verb}: found {word!r}, but {verb} takes {most}; options begin with --" + (
-        ", and commas join their values"
-        * any(one.startswith(("--filter", "--str")) for one in words)
-    )
+    joined = ", and commas join their values" * any(one in SEVERAL for one in words)
+    return f"{verb}: found {word!r}, but {verb} takes {most}; options begin with --{joined}"
