@@ -376,7 +376,8 @@ def _track_of(
     """Return a drive's track, from the final belief and the estimates made at each time."""
     belief = completed(belief, Belief)
     online = replace(path, invariant=belief.pose().invariant)
-    revised, cloud, sums = belief.path(), belief.cloud(), belief.innovations
+    revised, cloud, sums = belief.path(), belief.cloud(), (belief.innovations, belief.corrections)
+    innovations, corrections = (x if isinstance(x, Innovations) else NO_INNOVATIONS for x in sums)
     if revised is not None:
         check_poses("path", revised, time.size)
     return Track(
@@ -384,8 +385,8 @@ def _track_of(
         pose=revised or online,
         landmarks=belief.landmarks(),
         gated=belief.gated,
-        innovations=sums if isinstance(sums, Innovations) else NO_INNOVATIONS,
-        corrections=belief.corrections,
+        innovations=innovations,
+        corrections=corrections,
         cloud=cloud,
         full=None if cloud is None else belief.full,
         online=online if revised else None,
